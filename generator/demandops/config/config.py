@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 
 from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Service
-from demandops.config.client_settings import DEFAULT_SETTINGS, ClientsFile
 from demandops.config.inventory import Broker, Cluster, Node
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
-from demandops.config.registry import Chart, Image
+from demandops.config.registry import DEFAULT_SETTINGS, Chart, ClientsFile, Image
 from demandops.config.repo_settings import RepoSettings
 from demandops.errors import Refused
 

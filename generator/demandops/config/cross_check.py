@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from demandops import strict_yaml
 from demandops.config.appdef import Service
-from demandops.config.client_settings import patched
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -18,7 +17,7 @@ from demandops.config.config import (
     Config,
 )
 from demandops.config.config_reader import ConfigReader
-from demandops.config.override import Override
+from demandops.config.override import Override, patched_settings
 from demandops.config.override_conflicts import check_override_conflicts
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
@@ -172,7 +171,9 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             _check_moved_to(override.node, override, config, reader)
         if override.values and override.patches_clients():
             try:
-                patched(config.clients.mqtt, override.values, override.path)  # it has every field
+                patched_settings(
+                    config.clients.mqtt, override.values, override.path
+                )  # it has every field
             except InvalidInput as error:
                 reader.faults += error.faults
         versions = _versions_for(override, config)

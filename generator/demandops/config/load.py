@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from demandops.config.appdef import ApplicationDefinition
-from demandops.config.client_settings import DEFAULT_SETTINGS, ClientsFile
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -26,7 +25,14 @@ from demandops.config.cross_check import cross_check
 from demandops.config.inventory import Broker, BrokersFile, Cluster, ClustersFile, Node, NodesFile
 from demandops.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.config.policy import AccessDomain, AccessDomainsFile, matches
-from demandops.config.registry import Chart, ChartsFile, Image, ImagesFile
+from demandops.config.registry import (
+    DEFAULT_SETTINGS,
+    Chart,
+    ChartsFile,
+    ClientsFile,
+    Image,
+    ImagesFile,
+)
 from demandops.config.repo_settings import ROOT_FILE, Flux, RepoSettings
 from demandops.errors import InvalidInput
 from demandops.settings import API_VERSION, RENDER_VERSION

@@ -11,9 +11,9 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import AfterValidator, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, ValidationError, model_validator
 
 from demandops.config.base_model import (
     DnsLabel,
@@ -22,12 +22,21 @@ from demandops.config.base_model import (
     Items,
     Text,
     Visible,
+    faults_of,
     readable_by,
     without,
 )
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.policy import matches
-from demandops.config.registry import Digest, Image, Repository, Tag
+from demandops.config.registry import (
+    ClientSettings,
+    Digest,
+    Image,
+    MqttClientSettings,
+    Repository,
+    Tag,
+)
+from demandops.errors import InvalidInput
 from demandops.identifiers import id_problem
 from demandops.quoting import quoted
 
@@ -315,6 +324,27 @@ def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
         else:
             result[key] = merge_patch(result.get(key), value)
     return result
+
+
+Settings = TypeVar("Settings", bound=ClientSettings)
+
+
+def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
+    """Return settings with the ``values`` of an override; fields of other types do not count.
+
+    Raises:
+        InvalidInput: if the result is not valid, naming the override's ``file``.
+    """
+    data = merge_patch(settings.model_dump(by_alias=True), patch)
+    of_others = {*_fields(MqttClientSettings)} - {*_fields(type(settings))}
+    try:
+        return settings.model_validate({k: v for k, v in data.items() if k not in of_others})
+    except ValidationError as error:
+        raise InvalidInput(faults_of(error, type(settings), file, ("values",))) from None
+
+
+def _fields(model: type[ClientSettings]) -> list[str]:
+    return [str(field.alias) for field in model.model_fields.values()]
 
 
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:

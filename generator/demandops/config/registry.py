@@ -1,4 +1,4 @@
-"""The registry: the source and version of each chart and image.
+"""The registry: the source and version of each chart and image, and how clients run.
 
 A chart is in a folder of the state repo (the default), an OCI registry or an HTTP chart repository.
 """
@@ -6,11 +6,21 @@ A chart is in a folder of the state repo (the default), an OCI registry or an HT
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, Visible, Word
+from demandops.config.base_model import (
+    CamelModel,
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    Items,
+    Text,
+    Visible,
+    Word,
+)
+from demandops.config.inventory import Rmw
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
@@ -130,3 +140,71 @@ class ImagesFile(FileModel):
     kind: Literal["Images"]
     registry: Repository | None = None
     images: dict[DnsLabel, Image]
+
+
+_EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+_Quantity = Annotated[str, StringConstraints(pattern=r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$")]
+_Resource = Annotated[str, StringConstraints(pattern=r"^[a-z0-9./-]+$")]
+_LaunchFile = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
+_Package = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$")]
+
+_OF_NODES = ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION")
+
+
+def _free(env: dict[str, str]) -> dict[str, str]:
+    for name in _OF_NODES:
+        if name in env:
+            raise ValueError(f"{name} follows from ros of the node; set it in inventory/nodes.yaml")
+    return env
+
+
+class Resources(FrozenModel):
+    """What a container requests, and its limits (Kubernetes core/v1 ResourceRequirements)."""
+
+    requests: dict[_Resource, _Quantity] = Field(
+        default_factory=lambda: {"cpu": "50m", "memory": "64Mi"}
+    )
+    limits: dict[_Resource, _Quantity] = Field(default_factory=lambda: {"memory": "256Mi"})
+
+
+class ClientSettings(CamelModel):
+    """How the containers of one connection type's clients run.
+
+    ``host_network`` is that of the node if not given. A probe is a Kubernetes core/v1 Probe.
+    """
+
+    env: Annotated[dict[_EnvName, Text], AfterValidator(_free)] = Field(default_factory=dict)
+    resources: Resources = Resources()
+    host_network: bool | None = None
+    startup_probe: dict[str, Any] = Field(default_factory=dict)
+    readiness_probe: dict[str, Any] = Field(default_factory=dict)
+    liveness_probe: dict[str, Any] = Field(default_factory=dict)
+
+
+class MqttClientSettings(ClientSettings):
+    """The settings of MQTT clients, which are ROS nodes.
+
+    ``rmw`` is that of the node if not given; ``image`` leaves it to the image. ``messages`` are the
+    packages whose messages the image can carry; if empty, that is not known.
+    """
+
+    launch_file: _LaunchFile = "standalone.launch.xml"
+    rmw: Rmw | Literal["image"] | None = None
+    messages: Items[_Package] = ()
+
+
+class ClientsFile(FileModel):
+    """``registry/clients.yaml``, which a state repo may leave out."""
+
+    kind: Literal["Clients"]
+    mqtt: MqttClientSettings = MqttClientSettings()
+    zenoh: ClientSettings = ClientSettings()
+    ros: ClientSettings = ClientSettings()
+
+    def of(self, connection_type: str) -> ClientSettings:
+        """Return the settings of a connection type, by its word in files."""
+        known: ClientSettings = getattr(self, connection_type, ClientSettings())
+        return known
+
+
+DEFAULT_SETTINGS = ClientsFile(apiVersion="demandops/v1", kind="Clients")

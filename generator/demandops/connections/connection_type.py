@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 from demandops import naming, strict_yaml
-from demandops.config.client_settings import DEFAULT_SETTINGS, ClientSettings, patched
 from demandops.config.config import CLIENTS_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
-from demandops.config.override import UNSHAPED, Shaping
+from demandops.config.override import UNSHAPED, Shaping, patched_settings
 from demandops.config.policy import AccessDomain
+from demandops.config.registry import DEFAULT_SETTINGS, ClientSettings
 from demandops.connections.connection import Connection
 from demandops.connections.route import Route
 from demandops.errors import Fault
@@ -87,7 +87,7 @@ class Client(ABC):
         """
         found = config.clients.of(self.type.word)
         for file, patch in self.shaping.patches:
-            found = patched(found, patch, file)
+            found = patched_settings(found, patch, file)
         return found
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from demandops import naming
-from demandops.config.client_settings import ClientSettings, MqttClientSettings
 from demandops.config.config import BROKERS_FILE, CLIENTS_FILE, IMAGES_FILE, Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Broker
+from demandops.config.registry import ClientSettings, MqttClientSettings
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,

@@ -12,11 +12,10 @@ from pydantic import BaseModel
 from demandops.cli.output import console
 from demandops.cluster.access import AccessFile
 from demandops.config.appdef import ApplicationDefinition
-from demandops.config.client_settings import ClientsFile
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
-from demandops.config.registry import ChartsFile, ImagesFile
+from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile
 from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
