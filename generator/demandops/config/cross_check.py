@@ -171,9 +171,8 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             _check_moved_to(override.node, override, config, reader)
         if override.values and override.patches_clients():
             try:
-                patched_settings(
-                    config.clients.mqtt, override.values, override.path
-                )  # it has every field
+                # those of MQTT have every field
+                patched_settings(config.clients.mqtt, override.values, override.path)
             except InvalidInput as error:
                 reader.faults += error.faults
         versions = _versions_for(override, config)
