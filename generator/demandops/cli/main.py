@@ -9,6 +9,7 @@ import logging
 import sys
 from enum import IntEnum
 from importlib import import_module
+from keyword import iskeyword
 
 import click
 
@@ -23,6 +24,7 @@ COMMANDS = {
     "decommission": ("actions", "Release all claims of a node or a requester."),
     "demand": ("demandops_ros", "Send a demand to a running node."),
     "diff": ("views", "Show the differences between two commits."),
+    "import": ("actions", "Book what the reference runs."),
     "init": ("repo", "Create a state repo."),
     "journal": ("repo", "List the accepted demands that are not published."),
     "log": ("views", "List the commits of the state repo, newest first."),
@@ -54,9 +56,10 @@ def load(name: str) -> click.Command:
     """Import a command; raise a ClickException if a package that it needs is not installed."""
     room = COMMANDS[name][0]
     ros = room == "demandops_ros"
-    module = f"demandops_ros.{name}_command" if ros else f"demandops.cli.{room}.{name}"
+    word = f"{name}_" if iskeyword(name) else name
+    module = f"demandops_ros.{name}_command" if ros else f"demandops.cli.{room}.{word}"
     try:
-        command: click.Command = getattr(import_module(module), name)
+        command: click.Command = getattr(import_module(module), word)
     except ModuleNotFoundError as error:
         if str(error.name).split(".")[0] in ("demandops", "demandops_ros"):
             raise

@@ -29,12 +29,15 @@ from demandops.staterepo import reader
 
 
 @dataclass(frozen=True, slots=True)
-class _Document:
+class Document:
+    """A goal, and the file that it comes from."""
+
     file: str
     goal: Any
 
     @property
     def request_id(self) -> str:
+        """Return the id by which a person knows it."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
@@ -74,6 +77,22 @@ def request(
     documents = [document for file in files for document in _documents(file)]
     if not documents:
         raise InvalidInput([fault("", "no request in " + ", ".join(files))])
+    book_or_show(documents, state_repo, dry_run, wait, signing_key, output)
+
+
+def book_or_show(
+    documents: list[Document],
+    state_repo: str,
+    dry_run: bool,
+    wait: bool,
+    signing_key: Path | None,
+    output: str,
+) -> None:
+    """Book requests, or show the consequences; print what became of each.
+
+    Raises:
+        click.Abort, click.exceptions.Exit: if some have no answer, or were refused.
+    """
     if any(form_faults(document.goal) for document in documents):
         rows = _unbooked(documents, state_repo)
     elif dry_run:
@@ -92,9 +111,9 @@ def request(
         raise click.exceptions.Exit(1)
 
 
-def _documents(file: str) -> Iterable[_Document]:
+def _documents(file: str) -> Iterable[Document]:
     name, text = read_input(file)
-    return [_Document(name, goal) for goal in strict_yaml.load_all(text, name) if goal is not None]
+    return [Document(name, goal) for goal in strict_yaml.load_all(text, name) if goal is not None]
 
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
@@ -109,7 +128,7 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
     } | more
 
 
-def _unbooked(documents: list[_Document], state_repo: str) -> list[dict[str, Any]]:
+def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
     """Return a refusal for each document because at least one does not parse."""
     with reader.opened(state_repo) as repo:
         state = repo.snapshot().state
@@ -126,12 +145,12 @@ def _unbooked(documents: list[_Document], state_repo: str) -> list[dict[str, Any
     return rows
 
 
-def _refused(index: int, document: _Document, error: DemandOpsError) -> dict[str, Any]:
+def _refused(index: int, document: Document, error: DemandOpsError) -> dict[str, Any]:
     return _row(index, document.request_id, "refused", faults=faults_of(error))
 
 
 def _book(
-    documents: list[_Document], state_repo: str, wait: bool, signing_key: Path | None
+    documents: list[Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[dict[str, Any]]:
     answers: list[_Answer] = []
     try:
@@ -152,7 +171,7 @@ def _book(
     return [_answered(index, document, answer) for index, (document, answer) in pairs]
 
 
-def _answered(index: int, document: _Document, answer: _Answer) -> dict[str, Any]:
+def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]:
     """Return the row of a request.
 
     Raises:
@@ -172,7 +191,7 @@ def _answered(index: int, document: _Document, answer: _Answer) -> dict[str, Any
     return _row(index, result.request_id, result.outcome, **told)
 
 
-def _submitted(generator: Generator, document: _Document, wait: bool) -> _Answer:
+def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
     """Submit a request; return a future of its receipt, or of the proposal that awaits approval."""
     answer = _Answer()
     name = document.request_id
@@ -198,7 +217,7 @@ def _submitted(generator: Generator, document: _Document, wait: bool) -> _Answer
     return answer
 
 
-def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[dict[str, Any]]:
+def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
     """Decide the requests one after the other, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
@@ -229,7 +248,7 @@ def _dry_run(documents: list[_Document], state_repo: str, output: str) -> list[d
     return rows
 
 
-def _print(rows: list[dict[str, Any]], documents: list[_Document], dry_run: bool) -> None:
+def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"

@@ -19,6 +19,7 @@ from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile
 from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
+from demandops.migration.reference_map import ReferenceMap
 
 SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "access-domains": (AccessDomainsFile, "policy/access-domains.yaml"),
@@ -33,6 +34,7 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "clients": (ClientsFile, "registry/clients.yaml"),
     "nodes": (NodesFile, "inventory/nodes.yaml"),
     "override": (OverrideFile, "overrides/<name>.yaml"),
+    "reference-map": (ReferenceMap, "the file of `demandops import --map`"),
     "state-repo": (RepoSettings, "demandops.yaml"),
 }
 

@@ -1,0 +1,141 @@
+"""``demandops import``: book what the reference runs, as demands like any other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from demandops import strict_yaml
+from demandops.cli.actions.request import Document, book_or_show
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import errors, signing_option, state_repo_option
+from demandops.cluster import access
+from demandops.cluster.health.release_health import ObjectSelector
+from demandops.cluster.object_cache import ObjectCache
+from demandops.config.base_model import parse_file
+from demandops.errors import InvalidInput, fault
+from demandops.input_file import read_input
+from demandops.migration import imported_goals, reference_files, reference_map
+from demandops.migration.remaining_joins import Join
+from demandops.staterepo import reader
+
+
+@click.command("import")
+@click.argument("files", nargs=-1, metavar="[FILE…]")
+@state_repo_option
+@click.option(
+    "--map",
+    "map_file",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="What the resources are as applications and connections. If the file does not exist, a "
+    "proposal is written to it, and nothing is booked.",
+)
+@click.option("--dry-run", is_flag=True, help="Show the consequences and book nothing.")
+@click.option(
+    "--cluster", metavar="NAME", help="Read the custom resources from this cluster of --clusters."
+)
+@click.option(
+    "--namespace",
+    default="default",
+    show_default=True,
+    metavar="NAME",
+    help="The namespace of the custom resources in the cluster.",
+)
+@click.option(
+    "--clusters",
+    "access_file",
+    envvar="DEMANDOPS_CLUSTERS",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="How to reach the clusters; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+)
+@signing_option
+@output_option
+def import_(  # noqa: PLR0913, PLR0917 - each is an option
+    files: tuple[str, ...],
+    state_repo: str,
+    map_file: Path,
+    dry_run: bool,
+    cluster: str | None,
+    namespace: str,
+    access_file: Path | None,
+    signing_key: Path | None,
+    output: str,
+) -> None:
+    """Book what the reference runs.
+
+    FILE is a bookkeeping or a versioning file of one of its operators, or its custom resources as
+    `kubectl get -o yaml` prints them; - for standard input. docs/migration.md goes through it step
+    by step. Importing the same files again books nothing more.
+    """
+    documents = [(name, data) for file in files for name, data in _documents(file)]
+    if cluster:
+        documents += _resources(access_file, cluster, namespace)
+    if not documents:
+        raise click.UsageError("nothing to import: give FILE or --cluster")
+    found = reference_files.read(documents)
+    joins, warnings = imported_goals.held(found)
+    for warning in warnings:
+        errors.print(f"warning: {warning}")
+    if not joins:
+        raise InvalidInput([fault("", "nothing is held in what was given")])
+    if not map_file.exists():
+        _propose(joins, found, map_file, state_repo, output)
+        return
+    name, text = read_input(map_file)
+    mapped = parse_file(reference_map.ReferenceMap, text, name)
+    goals = [Document(name, goal) for goal in imported_goals.goals(joins, mapped, name)]
+    book_or_show(goals, state_repo, dry_run, False, signing_key, output)
+
+
+def _documents(file: str) -> Iterator[tuple[str, object]]:
+    name, text = read_input(file)
+    documents = list(strict_yaml.load_all(text, name))
+    yield from ((name, data) for data in documents or [None])
+
+
+def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
+    """Return the custom resources of a cluster."""
+    clusters = access.read(access_file).clusters if access_file else {}
+    reachable = clusters.get(name)
+    if reachable is None or not reachable.kubeconfig:
+        known = ", ".join(one for one, way in clusters.items() if way.kubeconfig) or "none"
+        message = f"'{name}' has no kubeconfig in --clusters; known: {known}"
+        raise click.UsageError(f"--cluster: {message}")
+    cache = ObjectCache(name, reachable, lambda: None)
+    wanted = [ObjectSelector(kind, namespace) for kind in reference_files.KINDS]
+    cache.read_once(wanted)
+    if problem := cache.why_unknown(wanted):
+        raise InvalidInput([fault("", f"cannot be read: {problem}").within(f"cluster {name}")])
+    items = [{"kind": key[0], **item} for key, item in sorted(cache.objects().items())]
+    return [(f"cluster {name}", {"kind": "List", "items": items})]
+
+
+def _propose(
+    joins: dict[str, list[Join]],
+    found: reference_files.ReferenceFiles,
+    map_file: Path,
+    state_repo: str,
+    output: str,
+) -> None:
+    with reader.opened(state_repo) as repo:
+        config = repo.snapshot().state.config
+    data, warnings = reference_map.propose(joins, found, config)
+    for warning in warnings:
+        errors.print(f"warning: {warning}")
+    map_file.write_text(strict_yaml.dump(data))
+    rows = [
+        f"  {name}: {one['id'] or '?'}"
+        for kind in ("applications", "connections")
+        for name, one in data[kind].items()
+    ]
+    text = [f"wrote {map_file}; nothing is booked", *rows]
+    text.append(
+        "The reference does not record these ids. Compare each with what your clients send, fill "
+        "in what is empty, then run the same command with --dry-run."
+    )
+    show(output, {"map": str(map_file), "proposed": data}, text)

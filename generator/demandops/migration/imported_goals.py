@@ -1,0 +1,165 @@
+"""Goals of the reference's action that book what the reference still holds."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from demandops.errors import Fault, InvalidInput, fault
+from demandops.migration.reference_files import (
+    CONNECTION,
+    DETECTION,
+    FUSION,
+    ObjectDetection,
+    ReferenceFiles,
+)
+from demandops.migration.reference_map import ReferenceMap
+from demandops.migration.remaining_joins import Join, remaining, replayed
+
+_MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # numbers in the messages
+
+
+def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
+    """Return the joins that are still held, by resource, and warnings.
+
+    A detection has none of its own: an application holds it by the object list that it makes.
+
+    Raises:
+        InvalidInput: if the files do not say who holds a resource.
+    """
+    joins, warnings, faults = dict[str, list[Join]](), list[str](), list[Fault]()
+    for name in files.names():
+        spec, requests = files.specs.get(name), files.versions.get(name, {})
+        if name.startswith(DETECTION):
+            continue
+        book = files.books.get(name)
+        if book is None and any(name.startswith(prefix) for prefix in files.booked) and not spec:
+            continue  # its operator forgot it when it was deleted, but never its requests
+        if book is None and requests:
+            if name.startswith(CONNECTION) and len(requests) > 1:
+                faults.append(_rewritten(name))
+                continue
+            book = replayed(requests)
+        elif book is None and spec:
+            book = Counter() if spec.operator.shutdown else spec.operator.holds()
+            warnings.append(_last_request_only(name, spec.operator.shutdown))
+        joins[name] = remaining(book or Counter(), requests)
+    if faults:
+        raise InvalidInput(faults)
+    warnings += _unused(files, joins)
+    return {name: found for name, found in joins.items() if found}, warnings
+
+
+def _rewritten(name: str) -> Fault:
+    message = (
+        "has requests, but no bookkeeping. The requests alone do not tell who holds it, because "
+        "the operator adds later requesters to the first one. Give mqtt_bookkeeping.yml too. If it "
+        f"is lost, write a file with who holds it, each as often as it joined: {name}: [vehicle00]"
+    )
+    return fault(name, message)
+
+
+def _last_request_only(name: str, shutdown: bool) -> str:
+    if shutdown:
+        return (
+            f"{name}: is not imported: its last request was a shutdown, and no bookkeeping says "
+            "who still holds it"
+        )
+    return (
+        f"{name}: no bookkeeping says who holds it; only the requesters of its last request are "
+        "imported, once each"
+    )
+
+
+def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
+    """Return a warning for each detection whose object list no application holds."""
+    topics = {topic for found in joins.values() for join in found for topic in join.topics}
+    return [
+        f"{name}: is not imported: no application holds its object list"
+        for name, spec in files.specs_of(ObjectDetection).items()
+        if f"/{spec.source}_local_objectlist" not in topics
+    ]
+
+
+def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list[dict[str, Any]]:
+    """Return goals, oldest first: one for each set of requesters, with all that they hold.
+
+    What the same requesters hold a second time gets a goal with another id, for the ledger counts a
+    repeated goal once.
+
+    Raises:
+        InvalidInput: if the map, which is in ``file``, has no entry for a resource or a topic.
+    """
+    found: dict[tuple[int, frozenset[str]], dict[str, Any]] = {}
+    faults = list[Fault]()
+    ordered = sorted(
+        ((join.version, name, join) for name, theirs in joins.items() for join in theirs),
+        key=lambda one: one[0],
+    )
+    times = Counter[tuple[str, frozenset[str]]]()
+    for _, name, join in ordered:
+        requesters = frozenset(join.requesters)
+        times[name, requesters] += 1
+        time = times[name, requesters]
+        goal = found.setdefault(
+            (time, requesters),
+            {"id": f"{mapped.request}#{time}" if time > 1 else mapped.request}
+            | {"apps": [], "connections": []},
+        )
+        try:
+            if name.startswith(FUSION):
+                goal["apps"].append(_application(name, join, mapped))
+            else:
+                goal["connections"].append(_connection(name, join, mapped))
+        except InvalidInput as error:
+            faults += (each.within(file) for each in error.faults)
+    if faults:
+        raise InvalidInput(dict.fromkeys(faults))
+    return list(found.values())
+
+
+def _application(name: str, join: Join, mapped: ReferenceMap) -> dict[str, Any]:
+    app = mapped.applications.get(name)
+    if app is None:
+        raise InvalidInput.at(f"applications.{name}", _MISSING)
+    missing = [
+        one for one in join.topics if one not in app.ego_data and one not in app.point_clouds
+    ]
+    if missing:
+        where = f"applications.{name}.egoData"
+        raise InvalidInput([fault(f"{where}.{topic}", _MISSING) for topic in missing])
+    clouds = [app.point_clouds[topic] for topic in join.topics if topic in app.point_clouds]
+    ego_data = {topic: app.ego_data[topic] for topic in join.topics if topic in app.ego_data}
+    return {
+        "header": {"id": app.id, "node_id": app.node},
+        "type": _OBJECT_DETECTION_FUSION,
+        "object_detection_fusion_app": {
+            "requester_ids": list(join.requesters),
+            "ego_data_topics": [
+                {"topic_name": topic, "source_node_id": source}
+                for topic, source in ego_data.items()
+            ],
+            "pointcloud_topics": [
+                {"topic_name": cloud.topic, "source_node_id": cloud.source} for cloud in clouds
+            ],
+        },
+    }
+
+
+def _connection(name: str, join: Join, mapped: ReferenceMap) -> dict[str, Any]:
+    connection = mapped.connections.get(name)
+    if connection is None:
+        raise InvalidInput.at(f"connections.{name}", _MISSING)
+    return {
+        "id": connection.id,
+        "broker_node_id": connection.broker,
+        "requester_ids": list(join.requesters),
+        "source_node_id": connection.source,
+        "source_topics": [topic.source for topic in connection.topics],
+        "target_node_id": connection.target,
+        "target_topics": [topic.target for topic in connection.topics],
+        "type": _MQTT,
+    }
+
+
+_MISSING = "is missing; add it, or remove the map so that import proposes a new one"

@@ -1,0 +1,250 @@
+"""The files of the reference's operators, and its custom resources.
+
+Each of its operators keeps two files. The bookkeeping maps a resource to the requesters that hold
+it, each as often as it joined; for a fusion, it does so for each topic. The versioning file maps a
+resource to the requests that reached it, by the version of the resource.
+
+A file is known by its content, so that it may have any name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any, TypeAlias, TypeVar
+
+from pydantic import AliasPath, BaseModel, ConfigDict, Field
+
+from demandops.config.base_model import parse
+from demandops.errors import Fault, InvalidInput, fault
+from demandops.quoting import quoted
+
+CONNECTION, DETECTION, FUSION = "mqtt-connection-", "od-", "of-"
+"""The prefixes of the resources' names; what follows is made of ids."""
+
+_BOOKS = {
+    "mqtt_bookkeeping": CONNECTION,
+    "object_detection_bookkeeping": DETECTION,
+    "object_fusion_bookkeeping": FUSION,
+}
+"""The names of the bookkeeping files: an empty one says that nothing is left."""
+
+_CLOUD = re.compile(r"\bpoint_cloud_topic:=(\S+)")
+
+Hold: TypeAlias = "tuple[str, str]"
+"""A topic and a requester that holds it; in a connection and a detection the topic is ``""``."""
+
+
+class _Part(BaseModel):
+    """A part of a file, of which only some fields matter."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
+
+
+class Request(_Part):
+    """What an operator reads of a request."""
+
+    requester: list[str]
+    shutdown: bool
+    topics_ego_data: list[str] = Field(default_factory=list, alias="topicsEgoData")
+    topics_objectlist: list[str] = Field(default_factory=list, alias="topicsObjectlist")
+
+    def holds(self) -> Counter[Hold]:
+        """Return the holds that it gives or takes."""
+        topics = [*self.topics_ego_data, *self.topics_objectlist] or [""]
+        return Counter((topic, who) for who in self.requester for topic in topics)
+
+
+_BRIDGE = ("configMQTT", "bridge")
+
+
+class MqttConnection(_Part):
+    """The spec of a connection. An end has nothing if the initial deployment carries its topics."""
+
+    operator: Request
+    host: str = Field(validation_alias=AliasPath("configCommon", "broker", "host"))
+    port: int = Field(validation_alias=AliasPath("configCommon", "broker", "port"))
+    source: str = Field("", validation_alias=AliasPath("configSource", "nodeSelector", "node_id"))
+    target: str = Field("", validation_alias=AliasPath("configTarget", "nodeSelector", "node_id"))
+    ros2mqtt: dict[str, Any] = Field(
+        default_factory=dict, validation_alias=AliasPath("configSource", *_BRIDGE, "ros2mqtt")
+    )
+    mqtt2ros: dict[str, Any] = Field(
+        default_factory=dict, validation_alias=AliasPath("configTarget", *_BRIDGE, "mqtt2ros")
+    )
+
+    def topics(self) -> list[tuple[str, str]]:
+        """Return the topics of the last request, each with its name at both ends."""
+        sources = self.ros2mqtt.get("ros_topics", [])
+        targets = [
+            self.mqtt2ros[name]["ros_topic"] for name in self.mqtt2ros.get("mqtt_topics", ())
+        ]
+        return list(zip(sources, targets, strict=False))
+
+    def other_topics(self) -> list[str]:
+        """Return the topics that only earlier requests listed."""
+        last = self.ros2mqtt.get("ros_topics", [])
+        return sorted(set(self.ros2mqtt) - {"ros_topics", *last})
+
+
+class ObjectDetection(_Part):
+    """The spec of a detection: one for each node and each source of a point cloud."""
+
+    operator: Request
+    node: str = Field(validation_alias=AliasPath("nodeSelector", "node_id"))
+    ros_name: str = Field(validation_alias=AliasPath("configDetection", "ros_node_name"))
+    command: list[str] = Field(alias="commandOverride")
+
+    @property
+    def source(self) -> str:
+        """The node that publishes its point cloud."""
+        return self.ros_name.removeprefix("pcod_")
+
+    @property
+    def topic(self) -> str:
+        """The topic of the point cloud, which only its command names."""
+        found = _CLOUD.search(" ".join(self.command))
+        return found[1] if found else ""
+
+
+class ObjectFusion(_Part):
+    """The spec of a fusion: one for each application."""
+
+    operator: Request
+    node: str = Field(validation_alias=AliasPath("fusion", "nodeSelector", "node_id"))
+
+
+Spec: TypeAlias = MqttConnection | ObjectDetection | ObjectFusion
+SpecType = TypeVar("SpecType", MqttConnection, ObjectDetection, ObjectFusion)
+
+KINDS: dict[str, type[Spec]] = {
+    "MqttConnection": MqttConnection,
+    "ObjectDetection": ObjectDetection,
+    "ObjectFusion": ObjectFusion,
+}
+"""The kinds of custom resources, and their specs."""
+
+
+class _Metadata(_Part):
+    name: str = Field(validation_alias=AliasPath("metadata", "name"))
+
+
+class _Book(_Part):
+    requesters: list[str]
+
+
+class _FusionBook(_Part):
+    topics_ego_data: dict[str, list[str]] = Field(alias="topicsEgoData")
+    topics_objectlist: dict[str, list[str]] = Field(alias="topicsObjectlist")
+
+
+@dataclass
+class ReferenceFiles:
+    """What all files together say: of each resource its spec, its books and its versions."""
+
+    specs: dict[str, Spec] = field(default_factory=dict)
+    books: dict[str, Counter[Hold]] = field(default_factory=dict)
+    versions: dict[str, dict[int, Request]] = field(default_factory=dict)
+    booked: set[str] = field(default_factory=set)
+    """The prefixes of the resources whose bookkeeping is here, also if it is empty."""
+
+    def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
+        """Return the specs of one kind, by resource."""
+        return {name: spec for name, spec in sorted(self.specs.items()) if isinstance(spec, kind)}
+
+    def names(self) -> list[str]:
+        """Return the names of all resources."""
+        return sorted({*self.specs, *self.books, *self.versions})
+
+
+def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
+    """Return what documents say; each comes with the name of its file.
+
+    Raises:
+        InvalidInput: with the faults of all files.
+    """
+    found, faults = ReferenceFiles(), list[Fault]()
+    for file, document in documents:
+        try:
+            _read(found, file, document)
+        except InvalidInput as error:
+            faults += error.faults
+    if faults:
+        raise InvalidInput(faults)
+    return found
+
+
+def _read(found: ReferenceFiles, file: str, document: object) -> None:
+    if document is None:
+        message = (
+            "is empty: an operator was stopped while it wrote it; leave the file out, or write in "
+            "it who holds what, such as 'mqtt-connection-vehicle00-edge: [vehicle00]'"
+        )
+        raise InvalidInput.at("", message, file=file)
+    if not isinstance(document, dict):
+        raise InvalidInput.at("", _UNKNOWN, file=file)
+    if "kind" in document:
+        listed = document.get("items")
+        items = listed if isinstance(listed, list) else [document]
+        for index, item in enumerate(items):
+            _read_resource(found, file, f"items[{index}]" if items is listed else "", item)
+        return
+    if not document and (prefix := _BOOKS.get(PurePath(file).stem)):
+        found.booked.add(prefix)
+    for name, value in document.items():
+        _read_entry(found, file, name, value)
+
+
+_UNKNOWN = (
+    "is no file of the reference; give its operators' bookkeeping and versioning files, and its "
+    "custom resources as `kubectl get -o yaml` prints them"
+)
+
+
+def _read_resource(found: ReferenceFiles, file: str, where: str, item: Any) -> None:  # noqa: ANN401
+    kind = item.get("kind") if isinstance(item, dict) else None
+    spec = KINDS.get(str(kind))
+    if spec is None:
+        message = f"{quoted(str(kind))} is not a kind of the reference: {', '.join(KINDS)}"
+        raise InvalidInput.at(f"{where}.kind".lstrip("."), message, file=file)
+    name = parse(_Metadata, item, file).name
+    _add(found.specs, name, parse(spec, item.get("spec"), f"{file}: {name}"), file)
+
+
+def _read_entry(found: ReferenceFiles, file: str, name: str, value: object) -> None:
+    prefix = next((one for one in (CONNECTION, DETECTION, FUSION) if name.startswith(one)), None)
+    if prefix is None:
+        raise InvalidInput([fault(name, _UNKNOWN).within(file)])
+    if isinstance(value, list):
+        book = parse(_Book, {"requesters": value}, f"{file}: {name}")
+        _add(found.books, name, Counter(("", who) for who in book.requesters), file)
+    elif isinstance(value, dict) and "topicsEgoData" in value:
+        fusion = parse(_FusionBook, value, f"{file}: {name}")
+        topics = [*fusion.topics_ego_data.items(), *fusion.topics_objectlist.items()]
+        holds = Counter((topic, who) for topic, requesters in topics for who in requesters)
+        _add(found.books, name, holds, file)
+    elif isinstance(value, dict):
+        entries = {}
+        for version, request in value.items():
+            if not version.isdecimal():
+                message = "is not the version of a resource, which is a number"
+                raise InvalidInput([fault(f"{name}.{version}", message).within(file)])
+            entries[int(version)] = parse(Request, request, f"{file}: {name}: {version}")
+        _add(found.versions, name, dict(sorted(entries.items())), file)
+        return
+    else:
+        raise InvalidInput([fault(name, _UNKNOWN).within(file)])
+    found.booked.add(prefix)
+
+
+Value = TypeVar("Value")
+
+
+def _add(known: dict[str, Value], name: str, value: Value, file: str) -> None:
+    if name in known:
+        message = "is in two files, which may be of different times; give one of them"
+        raise InvalidInput([fault(name, message).within(file)])
+    known[name] = value

@@ -1,0 +1,184 @@
+"""The map from the reference's resources to the applications and connections of demands.
+
+The names of its resources are made of ids, but not the other way round: ``/``, ``_`` and ``-`` all
+become ``-``. So :func:`propose` only proposes a map, and a person checks it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints
+
+from demandops.config.base_model import CamelModel, FileModel, Items
+from demandops.config.config import BROKERS_FILE, Config
+from demandops.migration.reference_files import (
+    CONNECTION,
+    FUSION,
+    MqttConnection,
+    ObjectDetection,
+    ObjectFusion,
+    ReferenceFiles,
+)
+from demandops.migration.remaining_joins import Join
+from demandops.settings import API_VERSION
+
+_Filled = Annotated[str, StringConstraints(min_length=1)]
+_REQUEST = "imported"
+_OBJECT_LIST = "_local_objectlist"
+
+
+class PointCloud(CamelModel):
+    """The point cloud from which a detection makes an object list, and the node it comes from."""
+
+    topic: _Filled
+    source: _Filled
+
+
+class MappedApplication(CamelModel):
+    """An application of the reference's only type.
+
+    ``egoData`` maps each topic to the node that it comes from, ``pointClouds`` each topic with an
+    object list to the point cloud behind it.
+    """
+
+    id: _Filled
+    node: _Filled
+    ego_data: dict[str, _Filled] = Field(default_factory=dict)
+    point_clouds: dict[str, PointCloud] = Field(default_factory=dict)
+
+
+class MappedTopic(CamelModel):
+    """A topic of a connection, by its name at both ends."""
+
+    source: _Filled
+    target: _Filled
+
+
+class MappedConnection(CamelModel):
+    """An MQTT connection. Without a ``broker`` the program chooses it."""
+
+    id: _Filled
+    source: _Filled
+    target: _Filled
+    broker: str = ""
+    topics: Items[MappedTopic]
+
+
+class ReferenceMap(FileModel):
+    """What each resource is. ``request`` is the id of the demands, which nothing records."""
+
+    kind: Literal["ReferenceMap"]
+    request: _Filled
+    applications: dict[str, MappedApplication] = Field(default_factory=dict)
+    connections: dict[str, MappedConnection] = Field(default_factory=dict)
+
+
+def slug(id: str) -> str:
+    """Return an id as it stands in the name of a resource of the reference."""
+    return id.replace("_", "-").replace("/", "-")
+
+
+def propose(
+    joins: Mapping[str, list[Join]], files: ReferenceFiles, config: Config
+) -> tuple[dict[str, Any], list[str]]:
+    """Return a map as plain data, and warnings.
+
+    What is not known is empty, and a person fills it in.
+
+    Args:
+        joins: the joins that are still held, by resource.
+        files: has the resources' specs.
+        config: its inventory knows nodes and brokers.
+    """
+    inventory = _Inventory(files, config)
+    fusions = [name for name in joins if name.startswith(FUSION)]
+    connections = [name for name in joins if name.startswith(CONNECTION)]
+    data = {
+        "apiVersion": API_VERSION,
+        "kind": "ReferenceMap",
+        "request": _REQUEST,
+        "applications": {name: inventory.application(name, joins[name]) for name in fusions},
+        "connections": {name: inventory.connection(name) for name in connections},
+    }
+    return data, inventory.warnings
+
+
+class _Inventory:
+    """Finds what the resources say, and guesses the rest from the inventory."""
+
+    def __init__(self, files: ReferenceFiles, config: Config) -> None:
+        self._connections = files.specs_of(MqttConnection)
+        self._detections = files.specs_of(ObjectDetection).values()
+        self._fusions = files.specs_of(ObjectFusion)
+        self._nodes, self._brokers = config.nodes.values(), config.brokers.values()
+        self.warnings: list[str] = []
+
+    def application(self, name: str, joins: list[Join]) -> dict[str, Any]:
+        id, spec = name.removeprefix(FUSION), self._fusions.get(name)
+        named = [one.id for one in self._nodes if id.startswith(f"{slug(one.id)}-")]
+        node = spec.node if spec else max(named, key=len, default="")
+        rest = id.removeprefix(f"{slug(node)}-")
+        topics = dict.fromkeys(topic for join in joins for topic in join.topics)
+        clouds = [topic for topic in topics if topic.endswith(_OBJECT_LIST)]
+        return {
+            "id": f"{node}/{rest.replace('-', '_')}" if node and rest != id else "",
+            "node": node,
+            "egoData": {
+                topic: self._source(topic, node) for topic in topics if topic not in clouds
+            },
+            "pointClouds": {topic: self._point_cloud(topic, node) for topic in clouds},
+        }
+
+    def _point_cloud(self, object_list: str, node: str) -> dict[str, str]:
+        source = object_list.removeprefix("/").removesuffix(_OBJECT_LIST)
+        topics = [one.topic for one in self._detections if (one.node, one.source) == (node, source)]
+        return {"topic": topics[0] if topics else "", "source": source}
+
+    def _source(self, topic: str, node: str) -> str:
+        """Return where a topic comes from: over a connection, else from the node that has it."""
+        over = [
+            spec.source
+            for spec in self._connections.values()
+            if spec.target == node and topic in (target for _, target in spec.topics())
+        ]
+        usual = [one.id for one in self._nodes if topic in one.topics.values()]
+        return next(iter([*over, *usual]), "")
+
+    def connection(self, name: str) -> dict[str, Any]:
+        id, spec = name.removeprefix(CONNECTION), self._connections.get(name)
+        if spec is None:
+            ends = [
+                (one.id, other.id)
+                for one in self._nodes
+                for other in self._nodes
+                if slug(f"{one.id}/{other.id}") == id
+            ]
+            source, target = ends[0] if ends else ("", "")
+            topics, broker = [("", "")], ""
+        else:
+            source, target, topics = spec.source, spec.target, spec.topics() or [("", "")]
+            broker = self._broker(name, spec)
+            if more := spec.other_topics():
+                self.warnings.append(
+                    f"{name}: earlier requests also listed {', '.join(more)}; its clients may "
+                    "carry them, so add to the map what is still needed"
+                )
+        return {
+            "id": f"{source}/{target}" if source and slug(f"{source}/{target}") == id else "",
+            "source": source,
+            "target": target,
+            "broker": broker,
+            "topics": [{"source": one, "target": other} for one, other in topics],
+        }
+
+    def _broker(self, name: str, spec: MqttConnection) -> str:
+        for broker in self._brokers:
+            if (broker.host, broker.port) == (spec.host, spec.port):
+                return broker.node
+        self.warnings.append(
+            f"{name}: its broker {spec.host}:{spec.port} is not in {BROKERS_FILE}; add it there, "
+            "or leave it to the program to choose one"
+        )
+        return ""

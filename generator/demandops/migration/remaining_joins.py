@@ -1,0 +1,91 @@
+"""The joins that are still held, from what the reference's operators recorded.
+
+The bookkeeping says who holds what, and how often. The versioning file says which requests led to
+it. But in the files of connections and detections the first request is not what was asked: the
+operator adds later requesters to the same list, and removes them. So the counts are always those of
+the bookkeeping, and the requests only tell which requesters joined together.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from demandops.migration.reference_files import Hold, Request
+
+
+@dataclass(frozen=True, slots=True)
+class Join:
+    """Requesters that hold the same topics of a resource, once each.
+
+    ``version`` orders joins over all resources; it is 0 if it is not known.
+    """
+
+    version: int
+    requesters: tuple[str, ...]
+    topics: tuple[str, ...]
+
+
+def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join]:
+    """Return the joins whose holds add up to ``book``, oldest first.
+
+    The requests are undone from the newest to the one that created the resource. What is left then
+    is what that one asked for. From there they are done again, each as a join of its own.
+
+    Args:
+        book: how often each hold is held.
+        requests: the requests by version, in order; they may be incomplete.
+    """
+    left, undone, created = Counter(book), list[tuple[int, Request]](), 0
+    for version, request in reversed([*requests.items()]):
+        if request.shutdown:
+            left += request.holds()
+        elif request.holds() < left:
+            left -= request.holds()
+        else:
+            created = version
+            break
+        undone.append((version, request))
+    joins = [(created, left)]
+    for version, request in reversed(undone):
+        if request.shutdown:
+            _take(joins, request)
+        else:
+            joins.append((version, request.holds()))
+    return [join for version, holds in joins for join in _each_once(version, holds)]
+
+
+def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
+    """Take holds from the join of the same requesters, else from the oldest that has them."""
+    named = set(shutdown.requester)
+    same_first = sorted(joins, key=lambda join: {who for _, who in join[1]} != named)
+    for hold in shutdown.holds().elements():
+        _, holds = next(join for join in same_first if join[1][hold])
+        holds[hold] -= 1
+    joins[:] = [(version, +holds) for version, holds in joins if +holds]
+
+
+def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
+    """Yield joins that hold nothing twice, for a demand of the ledger counts once."""
+    for count in range(1, max(holds.values(), default=0) + 1):
+        topics: dict[str, list[str]] = {}
+        for (topic, who), held in holds.items():
+            if held >= count:
+                topics.setdefault(who, []).append(topic)
+        together: dict[tuple[str, ...], list[str]] = {}
+        for who, theirs in topics.items():
+            together.setdefault(tuple(theirs), []).append(who)
+        for theirs_too, requesters in together.items():
+            yield Join(version, tuple(requesters), theirs_too)
+
+
+def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
+    """Return the bookkeeping that requests lead to; right only if none was rewritten."""
+    book = Counter[Hold]()
+    for request in requests.values():
+        if request.shutdown:
+            book -= request.holds()
+        else:
+            book += request.holds()
+    return book

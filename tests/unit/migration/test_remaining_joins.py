@@ -1,0 +1,151 @@
+"""The joins that import finds in the operators' files: their counts, and who joined together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from random import Random
+from typing import Any
+
+import pytest
+import yaml
+from demandops.errors import InvalidInput
+from demandops.migration import imported_goals, reference_files
+from demandops.migration.reference_files import Hold, ReferenceFiles
+from demandops.migration.remaining_joins import Join
+from hypothesis import given
+
+from tests.kit.chance import chances, examples
+from tests.kit.goals import EXPERIMENT, application, connection
+from tests.kit.reference import Reference
+
+CONNECTION, FUSION = "mqtt-connection-station00-edge", "of-edge-object-detection-fusion"
+
+
+def after(*goals: dict[str, Any]) -> Reference:
+    reference = Reference()
+    for goal in goals:
+        reference.send(goal)
+    return reference
+
+
+def read(reference: Reference, *wanted: str) -> ReferenceFiles:
+    """Read the files whose names hold one of these words."""
+    texts = {
+        name: text for name, text in reference.texts().items() if any(w in name for w in wanted)
+    }
+    return reference_files.read((name, yaml.safe_load(text)) for name, text in texts.items())
+
+
+def experiment(steps: int) -> Reference:
+    return after(*(yaml.safe_load(path.read_text()) for path in EXPERIMENT[:steps]))
+
+
+def holds(joins: list[Join]) -> Counter[Hold]:
+    return Counter(
+        (topic, who) for join in joins for who in join.requesters for topic in join.topics
+    )
+
+
+def who(joins: list[Join]) -> list[tuple[str, ...]]:
+    return [join.requesters for join in joins]
+
+
+def test_the_versioning_files_tell_who_joined_together() -> None:
+    joins, warnings = imported_goals.held(read(experiment(6), ".yml"))
+    pairs = [("vehicle03", "station00"), ("vehicle02", "station00")]
+    assert who(joins[CONNECTION]) == who(joins[FUSION]) == pairs
+    assert warnings == []
+
+
+def test_without_them_the_counts_are_kept() -> None:
+    joins, _ = imported_goals.held(read(experiment(6), "bookkeeping"))
+    assert who(joins[CONNECTION]) == [("vehicle03", "station00", "vehicle02"), ("station00",)]
+
+
+@examples(30)
+@given(chances)
+def test_after_any_goals_the_holds_are_those_of_the_bookkeeping(chance: Random) -> None:
+    reference = after(*_goals(chance))
+    books = read(reference, "bookkeeping").books
+    for wanted in ("bookkeeping", ".yml", ""):
+        joins, warnings = imported_goals.held(read(reference, wanted))
+        assert {name: holds(joins[name]) for name in joins} == {
+            name: book for name, book in books.items() if not name.startswith("od-")
+        }
+        assert all(
+            count == 1
+            for theirs in joins.values()
+            for join in theirs
+            for count in holds([join]).values()
+        )
+        assert warnings == []
+
+
+def _goals(chance: Random) -> list[dict[str, Any]]:
+    """Return joins, and shutdowns of some of them, all or in part."""
+    goals, open_ = list[dict[str, Any]](), list[dict[str, Any]]()
+    for number in range(chance.randrange(1, 15)):
+        if open_ and chance.random() < 0.4:
+            goals.append(open_.pop(chance.randrange(len(open_))) | {"shutdown": True})
+            continue
+        # a goal of its own each time: the cluster reports no change if one comes twice in a row
+        requesters = [f"r{number}", *chance.sample(["v0", "v1", "s0"], chance.randrange(3))]
+        ego = chance.sample([("/e0", "v0"), ("/e1", "v1")], chance.randrange(3))
+        ends = chance.sample(["vehicle00", "station00"], chance.randrange(3))
+        goal = {
+            "id": str(number),
+            "apps": [application(who=requesters, ego=ego)] if ego else [],
+            "connections": [
+                connection(f"{end}/edge", who=requesters, ends=(end, "edge"), topics=["/t"])
+                for end in ends
+            ],
+        }
+        goals.append(goal)
+        open_.append(goal)
+    return goals
+
+
+def test_the_versioning_of_a_fusion_is_enough() -> None:
+    joins, _ = imported_goals.held(read(experiment(6), "object_fusion_versioning"))
+    assert who(joins[FUSION]) == [("vehicle03", "station00"), ("vehicle02", "station00")]
+
+
+def test_the_versioning_of_a_connection_is_not() -> None:
+    """Its first request shows who held it when the file was last written."""
+    files = read(experiment(3), "mqtt_versioning")
+    first, *_ = files.versions[CONNECTION].values()
+    assert first.requester == ["vehicle00", "station00", "vehicle01", "station00"]
+    with pytest.raises(InvalidInput) as refused:
+        imported_goals.held(files)
+    assert str(refused.value) == (
+        f"{CONNECTION}: has requests, but no bookkeeping. The requests alone do not tell who holds "
+        "it, because the operator adds later requesters to the first one. Give "
+        "mqtt_bookkeeping.yml too. If it is lost, write a file with who holds it, each as often as "
+        f"it joined: {CONNECTION}: [vehicle00]"
+    )
+
+
+def test_what_was_deleted_is_forgotten_although_its_versions_are_kept() -> None:
+    reference = experiment(8)
+    files = read(reference, "")
+    assert FUSION in files.versions
+    assert imported_goals.held(files) == ({}, [])
+
+
+def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
+    joins, warnings = imported_goals.held(read(experiment(5), "resources"))
+    assert {name: who(found) for name, found in joins.items()} == {
+        f"mqtt-connection-vehicle0{number}-edge": [(f"vehicle0{number}", "station00")]
+        for number in (1, 2, 3)
+    }
+    assert warnings[0] == (
+        f"{CONNECTION}: is not imported: its last request was a shutdown, and no bookkeeping says "
+        "who still holds it"
+    )
+    assert warnings[1] == (
+        "mqtt-connection-vehicle01-edge: no bookkeeping says who holds it; only the requesters of "
+        "its last request are imported, once each"
+    )
+    assert warnings[-1] == (
+        "od-edge-station00: is not imported: no application holds its object list"
+    )
