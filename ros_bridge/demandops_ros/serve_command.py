@@ -22,21 +22,14 @@ from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
-from demandops.settings import (
-    DEFAULT_ACTION_NAME,
-    DEFAULT_DEMAND_ACTION_NAME,
-    REQUESTER_QUEUE_LIMIT,
-)
-from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros.messages import ANSWER_LEVELS
+from demandops_ros import parameters, reference_parameters
 from demandops_ros.node import DemandNode
 
-_LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 _POLL_S = 0.02
 _TASK_S = 5.0
 _FLUSH_S = 0.3
@@ -116,7 +109,8 @@ def serve(
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
     fetch_interval, requester_queue_limit (how many demands of one requester may wait), log_level
-    (debug, info, warn, error or fatal). Stop it with Ctrl-C or SIGTERM: it finishes what it can
+    (debug, info, warn, error or fatal). The parameter file of the reference's node is understood
+    too: docs/migration.md. Stop it with Ctrl-C or SIGTERM: it finishes what it can
     within seconds, and the journal keeps the rest.
     """
     ros_args = list(ctx.args)
@@ -129,7 +123,14 @@ def serve(
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        settings = _read_parameters(state_repo, fetch_interval)
+        of_reference = reference_parameters.read(ros_args)
+        settings = parameters.read(
+            {
+                "action_name": of_reference.get(reference_parameters.ACTION_NAME),
+                "state_repo": state_repo,
+                "fetch_interval": fetch_interval,
+            }
+        )
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
@@ -141,6 +142,8 @@ def serve(
                 fetch_interval=parse_interval(settings["fetch_interval"]),
                 signing_key=signing_key,
             )
+        for warning in reference_parameters.warnings(of_reference, generator.snapshot.state.config):
+            errors.print(f"warning: {warning}")
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
@@ -150,54 +153,6 @@ def serve(
         trigger.close()
     finally:
         rclpy.try_shutdown()
-
-
-def _read_parameters(state_repo: str | None, fetch_interval: str | None) -> dict[str, Any]:
-    """Read the node's parameters with a probe, because the generator starts before the node."""
-    defaults = {
-        "action_name": DEFAULT_ACTION_NAME,
-        "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
-        "answer": ANSWER_LEVELS[0],
-        "answer_timeout": 120.0,
-        "state_repo": state_repo or "",
-        "fetch_interval": fetch_interval or DEFAULT_INTERVAL,
-        "requester_queue_limit": REQUESTER_QUEUE_LIMIT,
-        "log_level": "info",
-    }
-    probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
-    try:
-        values = {
-            name: probe.declare_parameter(name, default, _descriptor(name)).value
-            for name, default in defaults.items()
-        }
-    finally:
-        probe.destroy_node()
-    values["fetch_interval"] = _as_text(values["fetch_interval"])
-    if not values["state_repo"]:
-        raise click.UsageError(
-            "no state repo given; use --state-repo URL_OR_DIR, DEMANDOPS_STATE_REPO or the ROS "
-            "parameter state_repo"
-        )
-    try:
-        parse_interval(values["fetch_interval"])
-    except ValueError as error:
-        raise click.UsageError(f"fetch interval: {error}") from None
-    for name, choices in (("answer", ANSWER_LEVELS), ("log_level", _LOG_LEVELS)):
-        if values[name] not in choices:
-            raise click.UsageError(
-                f"parameter {name} is '{values[name]}'; it takes {', '.join(choices)}"
-            )
-    return values
-
-
-def _descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
-    """Return a parameter's descriptor; a fetch interval may be of any type."""
-    return ParameterDescriptor(read_only=read_only, dynamic_typing=name == "fetch_interval")
-
-
-def _as_text(value: object) -> str:
-    """Return a parameter as text: ROS reads 30 as a number and 30s as text."""
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _run(
@@ -217,7 +172,7 @@ def _run(
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read only, because the parameters are read at the start
-        node.declare_parameter(name, shown, _descriptor(name, read_only=True))
+        node.declare_parameter(name, shown, parameters.descriptor(name, read_only=True))
     set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [RosLogHandler(node)], False

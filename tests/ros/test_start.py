@@ -17,6 +17,16 @@ LOG_LEVEL = "parameter log_level is 'loud'; it takes debug, info, warn, error, f
         (["--fetch-interval", "often"], 2, "fetch interval: 'often' is not a duration; write one"),
         (["--ros-args", "-p", "fetch_interval:=-3"], 2, "fetch interval: '-3' is not a duration"),
         (["--ros-args", "-p", "log_level:=loud"], 2, LOG_LEVEL),
+        (
+            ["--ros-args", "-p", "answer_timeout:=120"],
+            2,
+            "Trying to set parameter 'answer_timeout' to '120' of type 'INTEGER', expecting type",
+        ),
+        (
+            ["--ros-args", "-p", "requester_queue_limit:=0"],
+            2,
+            "Parameter requester_queue_limit out of range. Min: 1, Max: 10000, value: 0",
+        ),
         (["--webhook", "0.0.0.0:0"], 1, "error: --webhook: '0.0.0.0:0' can be reached from other"),
         (
             ["--webhook", "127.0.0.1:0", "--webhook-secret-file", "/nowhere/secret"],

@@ -13,6 +13,7 @@ from pydantic import Field, StringConstraints
 
 from demandops.config.base_model import CamelModel, FileModel, Items
 from demandops.config.config import BROKERS_FILE, Config
+from demandops.config.inventory import Broker
 from demandops.migration.reference_files import (
     CONNECTION,
     FUSION,
@@ -78,6 +79,11 @@ class ReferenceMap(FileModel):
 def slug(id: str) -> str:
     """Return an id as it stands in the name of a resource of the reference."""
     return id.replace("_", "-").replace("/", "-")
+
+
+def is_host(broker: Broker, host: str, port: object) -> bool:
+    """Return whether a broker is at an address; its host may also name the namespace."""
+    return port == broker.port and f"{broker.host}.".startswith(f"{host}.")
 
 
 def propose(
@@ -175,7 +181,7 @@ class _Inventory:
 
     def _broker(self, name: str, spec: MqttConnection) -> str:
         for broker in self._brokers:
-            if (broker.host, broker.port) == (spec.host, spec.port):
+            if is_host(broker, spec.host, spec.port):
                 return broker.node
         self.warnings.append(
             f"{name}: its broker {spec.host}:{spec.port} is not in {BROKERS_FILE}; add it there, "

@@ -1,0 +1,92 @@
+"""The parameters of the reference's node, and what replaces them here.
+
+A fleet may start our node with the parameter file of the reference's. Its entries are for the node
+``application_manager``. The name of the action is taken from there. Brokers, topics and namespaces
+are in the state repo; a value that is not there gets a warning.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from demandops.config.config import BROKERS_FILE, DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
+from demandops.migration.reference_map import is_host
+from demandops.quoting import quoted
+from rclpy.node import Node
+
+_NODE = "application_manager"
+ACTION_NAME = "deployment_action_name"
+_RENAMES = re.compile(r".*__(node|name):=.*")
+_BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?\.host")
+
+_REPLACED = {
+    "cluster_config": "a GitOps controller applies what is committed; --clusters gives access for "
+    "answers at reconciled or healthy",
+    "k3d_image_registry": f"{IMAGES_FILE} names the registry of each image",
+    "helm_release_tag": "the GitOps controller removes releases that are no longer demanded",
+    "url_application_registry": "registry/charts.yaml names where each chart comes from",
+    "applications": "values of services are in the application definitions, appdefs/",
+}
+
+
+def read(ros_args: Sequence[str]) -> dict[str, Any]:
+    """Return the parameters that ROS arguments and their files have for the reference's node."""
+    renames = {
+        at
+        for at, word in enumerate(ros_args)
+        if _RENAMES.fullmatch(word) and ros_args[at - 1] in ("-r", "--remap")
+    }
+    args = [word for at, word in enumerate(ros_args) if not {at, at + 1} & renames]
+    probe = Node(
+        _NODE,
+        cli_args=args,
+        use_global_arguments=False,
+        start_parameter_services=False,
+        enable_rosout=False,
+        automatically_declare_parameters_from_overrides=True,
+    )
+    try:
+        found = probe.get_parameters_by_prefix("")
+        return {name: parameter.value for name, parameter in found.items()}
+    finally:
+        probe.destroy_node()
+
+
+def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
+    """Yield a warning for each parameter that has no effect, and what replaces it."""
+    for name in dict.fromkeys(each.partition(".")[0] for each in values):
+        if name in _REPLACED:
+            yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"
+    namespaces = {domain.namespace for domain in config.domains.values()}
+    if values.get("namespace") not in (None, *namespaces):
+        yield (
+            f"parameter namespace of the reference is not used: {quoted(values['namespace'])} is "
+            f"not a namespace in {DOMAINS_FILE}; services run in that of their access domain"
+        )
+    yield from _brokers(values, config)
+    topics = values.get("connections.init_comm_topics") or ()
+    known = {
+        topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
+    }
+    if missing := [topic for topic in topics if topic not in known]:
+        yield (
+            "parameter connections.init_comm_topics of the reference is not used: add "
+            f"{', '.join(missing)} to bridged of the source's node in {NODES_FILE}"
+        )
+
+
+def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
+    for name, host in values.items():
+        match = _BROKER.fullmatch(name)
+        if match is None:
+            continue
+        port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
+        brokers = [broker for one, broker in config.brokers.items() if node in (None, one)]
+        if not any(is_host(broker, host, port) for broker in brokers):
+            place = f"of node {quoted(node)} " if node else ""
+            yield (
+                f"parameter {name} of the reference is not used: the broker {place}at "
+                f"{host}:{port} is not in {BROKERS_FILE}; add it there"
+            )
