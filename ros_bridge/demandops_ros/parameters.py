@@ -23,7 +23,7 @@ _CHOICES = {
     "answer": ANSWER_LEVELS,
     "log_level": ("debug", "info", "warn", "error", "fatal"),
 }
-_DEFAULTS: dict[str, Any] = {
+DEFAULTS: dict[str, Any] = {
     "action_name": DEFAULT_ACTION_NAME,
     "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
     "answer": ANSWER_LEVELS[0],
@@ -43,7 +43,7 @@ _DESCRIPTIONS = {
     "requester_queue_limit": "Most demands of one requester that may wait; more are refused.",
     "log_level": "Lowest level of messages in the log.",
 }
-NAMES = tuple(_DEFAULTS)
+
 _RANGES = {
     "answer_timeout": {
         "floating_point_range": [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
@@ -63,7 +63,7 @@ def read(given: Mapping[str, str | None]) -> dict[str, Any]:
     Raises:
         click.UsageError: if a value is not valid.
     """
-    defaults = _DEFAULTS | {name: value for name, value in given.items() if value}
+    defaults = DEFAULTS | {name: value for name, value in given.items() if value}
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:
         values = {

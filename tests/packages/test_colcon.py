@@ -1,6 +1,7 @@
-"""The interface packages build in a colcon workspace, as they do in a ROS 2 installation.
+"""The ROS packages build in a colcon workspace, as they do in a ROS 2 installation.
 
-Here the workspace lies over the wheels of PyPI, which colcon takes for an underlay.
+Here the workspace lies over the wheels of PyPI, which colcon takes for an underlay. There are no
+wheels of ros2run and ros2launch: what these look up is looked up, and nothing is launched.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-INTERFACES = Path(__file__).resolve().parents[2] / "ros_bridge" / "interfaces"
+BRIDGE = Path(__file__).resolve().parents[2] / "ros_bridge"
 COLCON = shutil.which("colcon", path=str(Path(sys.executable).parent))
 
 pytestmark = [
@@ -40,12 +41,32 @@ print(demandops_interfaces.__file__)
 """
 
 
+LOOK_UP = (
+    sys.executable,
+    "-c",
+    """
+import demandops, demandops_ros
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
+
+print(demandops.__file__, demandops_ros.__file__, sep="\\n")
+print(get_package_share_directory("demandops_ros"))
+print(get_package_prefix("demandops_ros") + "/lib/demandops_ros/serve")
+""",
+)
+SITE = Path("lib", f"python{sys.version_info[0]}.{sys.version_info[1]}", "site-packages")
+SKELETON = ("skeleton", "state-repo-skeleton")
+
+
+def files_of(folder: Path) -> set[Path]:
+    return {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
+
+
 def run(command: list[str], folder: Path) -> str:
     environ = {
         "AMENT_PREFIX_PATH": sys.prefix,
         "COLCON_HOME": str(folder / "colcon"),
         "HOME": str(folder),
-        "PATH": os.environ["PATH"],
+        "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
     }
     result = subprocess.run(
         command, cwd=folder, env=environ, capture_output=True, text=True, check=False, timeout=900
@@ -54,17 +75,20 @@ def run(command: list[str], folder: Path) -> str:
     return result.stdout
 
 
-def test_the_packages_build_with_colcon_and_import_from_its_install_space(tmp_path: Path) -> None:
-    shutil.copytree(INTERFACES, tmp_path / "src")
+def build(folder: Path) -> None:
     assert COLCON is not None
     prefix = f"-DCMAKE_PREFIX_PATH={sys.prefix}"
     python = f"-DPython3_EXECUTABLE={sys.executable}"
-    run([COLCON, "build", "--cmake-args", prefix, python, "-DBUILD_TESTING=OFF"], tmp_path)
+    run([COLCON, "build", "--cmake-args", prefix, python, "-DBUILD_TESTING=OFF"], folder)
+
+
+def test_the_packages_build_with_colcon_and_import_from_its_install_space(tmp_path: Path) -> None:
+    shutil.copytree(BRIDGE / "interfaces", tmp_path / "src")
+    build(tmp_path)
     script = f". install/setup.sh && {shlex.join([sys.executable, '-c', IMPORT])}"
     places = run(["sh", "-c", script], tmp_path).splitlines()
-    site = Path("lib", f"python{sys.version_info[0]}.{sys.version_info[1]}", "site-packages")
     assert places == [
-        str(tmp_path / "install" / package / site / package / "__init__.py")
+        str(tmp_path / "install" / package / SITE / package / "__init__.py")
         for package in ("application_manager_interfaces", "demandops_interfaces")
     ]
     # Here nothing is left out: a C++ node may use the interfaces too.
@@ -72,3 +96,28 @@ def test_the_packages_build_with_colcon_and_import_from_its_install_space(tmp_pa
     assert (
         tmp_path / "install" / "demandops_interfaces" / header / "get_bookkeeping.hpp"
     ).is_file()
+
+
+def test_the_package_of_the_node_brings_its_code_its_data_and_its_launch_file(
+    tmp_path: Path,
+) -> None:
+    tmp_path.joinpath("src").mkdir()
+    tmp_path.joinpath("src", "demandops_ros").symlink_to(BRIDGE / "ros_package")
+    build(tmp_path)
+    installed = tmp_path / "install" / "demandops_ros"
+    found = run(["sh", "-c", f". install/setup.sh && {shlex.join([*LOOK_UP])}"], tmp_path)
+    assert found.splitlines() == [
+        str(installed / SITE / "demandops" / "__init__.py"),
+        str(installed / SITE / "demandops_ros" / "__init__.py"),
+        str(installed / "share" / "demandops_ros"),
+        str(installed / "lib" / "demandops_ros" / "serve"),
+    ]
+    data = installed / SITE / "demandops" / "_data"
+    for name, folder in (("templates", "templates"), ("appdefs", "appdefs"), SKELETON):
+        assert files_of(data / name) == files_of(BRIDGE.parent / folder)
+    assert files_of(installed / "share" / "demandops_ros") >= {
+        Path("launch/demandops.launch.xml"),
+        Path("config/params.yaml"),
+    }
+    served = run(["sh", "-c", f". install/setup.sh && {found.splitlines()[-1]} --help"], tmp_path)
+    assert served.startswith("Usage: demandops serve [OPTIONS]")

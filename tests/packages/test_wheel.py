@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -49,6 +50,23 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
         prefix = f"demandops/_data/{packaged}/"
         assert {n.removeprefix(prefix) for n in names if n.startswith(prefix)} == files
     assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
+
+
+def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
+    """What `ros2 run` and `ros2 launch` look up; there are no wheels of these to run here."""
+    packages = pytest.importorskip("ament_index_python.packages")
+    options = ["-q", "--no-deps", "--no-index", "--prefix", str(tmp_path)]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+        assert packages.get_package_prefix("demandops_ros") == str(tmp_path)
+        share = Path(packages.get_package_share_directory("demandops_ros"))
+    assert {path.relative_to(share).as_posix() for path in share.rglob("*.*")} == {
+        "package.xml",
+        "config/params.yaml",
+        "launch/demandops.launch.xml",
+    }
+    assert os.access(tmp_path / "lib" / "demandops_ros" / "serve", os.X_OK)
 
 
 def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: i
         assert client.call({"id": "a", "apps": [application()]}).status == "succeeded"
         service = client.node.create_client(DescribeParameters, "/demandops/describe_parameters")
         client.wait(service.service_is_ready)
-        future = service.call_async(DescribeParameters.Request(names=list(parameters.NAMES)))
+        future = service.call_async(DescribeParameters.Request(names=list(parameters.DEFAULTS)))
         client.wait(future.done)
         described = {one.name: one for one in future.result().descriptors}
     finally:
