@@ -193,6 +193,10 @@ UNKNOWN = (
             "ObjectFusion",
         ),
         ("od-a: {'1x': {}}", "od-a.1x: is not the version of a resource, which is a number"),
+        (
+            f"od-a: {{'{'9' * 30}': {{}}}}",
+            f"od-a.{'9' * 30}: is not the version of a resource, which is a number",
+        ),
         ("od-a: {'1': {requester: [a]}}", "od-a: 1: shutdown: is missing; add it"),
         ("of-a: {topicsEgoData: {}}", "of-a: topicsObjectlist: is missing; add it"),
         (

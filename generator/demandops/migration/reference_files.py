@@ -32,6 +32,7 @@ _BOOKS = {
 }
 """The names of the bookkeeping files: an empty one says that nothing is left."""
 
+_NUMBER = re.compile(r"[0-9]{1,20}")
 _CLOUD = re.compile(r"\bpoint_cloud_topic:=(\S+)")
 
 Hold: TypeAlias = "tuple[str, str]"
@@ -58,6 +59,30 @@ class Request(_Part):
         return Counter((topic, who) for who in self.requester for topic in topics)
 
 
+class _MqttTopic(_Part):
+    mqtt_topic: str
+
+
+class _RosTopic(_Part):
+    ros_topic: str
+
+
+class _Ros2Mqtt(_Part):
+    """The topics of the last request, and as further fields all that were ever listed."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, _MqttTopic] = Field(init=False)
+    ros_topics: list[str] = Field(default_factory=list)
+
+
+class _Mqtt2Ros(_Part):
+    """The same for the other end, where the fields are topics of MQTT."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, _RosTopic] = Field(init=False)
+    mqtt_topics: list[str] = Field(default_factory=list)
+
+
 _BRIDGE = ("configMQTT", "bridge")
 
 
@@ -69,25 +94,22 @@ class MqttConnection(_Part):
     port: int = Field(validation_alias=AliasPath("configCommon", "broker", "port"))
     source: str = Field("", validation_alias=AliasPath("configSource", "nodeSelector", "node_id"))
     target: str = Field("", validation_alias=AliasPath("configTarget", "nodeSelector", "node_id"))
-    ros2mqtt: dict[str, Any] = Field(
-        default_factory=dict, validation_alias=AliasPath("configSource", *_BRIDGE, "ros2mqtt")
+    ros2mqtt: _Ros2Mqtt = Field(
+        _Ros2Mqtt(), validation_alias=AliasPath("configSource", *_BRIDGE, "ros2mqtt")
     )
-    mqtt2ros: dict[str, Any] = Field(
-        default_factory=dict, validation_alias=AliasPath("configTarget", *_BRIDGE, "mqtt2ros")
+    mqtt2ros: _Mqtt2Ros = Field(
+        _Mqtt2Ros(), validation_alias=AliasPath("configTarget", *_BRIDGE, "mqtt2ros")
     )
 
     def topics(self) -> list[tuple[str, str]]:
         """Return the topics of the last request, each with its name at both ends."""
-        sources = self.ros2mqtt.get("ros_topics", [])
-        targets = [
-            self.mqtt2ros[name]["ros_topic"] for name in self.mqtt2ros.get("mqtt_topics", ())
-        ]
-        return list(zip(sources, targets, strict=False))
+        targets = self.mqtt2ros.__pydantic_extra__
+        names = [targets[one].ros_topic for one in self.mqtt2ros.mqtt_topics if one in targets]
+        return list(zip(self.ros2mqtt.ros_topics, names, strict=False))
 
     def other_topics(self) -> list[str]:
         """Return the topics that only earlier requests listed."""
-        last = self.ros2mqtt.get("ros_topics", [])
-        return sorted(set(self.ros2mqtt) - {"ros_topics", *last})
+        return sorted(set(self.ros2mqtt.__pydantic_extra__) - {*self.ros2mqtt.ros_topics})
 
 
 class ObjectDetection(_Part):
@@ -229,7 +251,7 @@ def _read_entry(found: ReferenceFiles, file: str, name: str, value: object) -> N
     elif isinstance(value, dict):
         entries = {}
         for version, request in value.items():
-            if not version.isdecimal():
+            if not _NUMBER.fullmatch(version):
                 message = "is not the version of a resource, which is a number"
                 raise InvalidInput([fault(f"{name}.{version}", message).within(file)])
             entries[int(version)] = parse(Request, request, f"{file}: {name}: {version}")
