@@ -24,7 +24,6 @@ _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?
 _REPLACED = {
     "cluster_config": "a GitOps controller applies what is committed; --clusters gives access for "
     "answers at reconciled or healthy",
-    "k3d_image_registry": f"{IMAGES_FILE} names the registry of each image",
     "helm_release_tag": "the GitOps controller removes releases that are no longer demanded",
     "url_application_registry": "registry/charts.yaml names where each chart comes from",
     "applications": "values of services are in the application definitions, appdefs/",
@@ -64,6 +63,13 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
         yield (
             f"parameter namespace of the reference is not used: {quoted(values['namespace'])} is "
             f"not a namespace in {DOMAINS_FILE}; services run in that of their access domain"
+        )
+    registry = values.get("k3d_image_registry")
+    images = config.images.values()
+    if registry and not all(image.repository.startswith(f"{registry}/") for image in images):
+        yield (
+            "parameter k3d_image_registry of the reference is not used: set registry: "
+            f"{registry} in {IMAGES_FILE}"
         )
     yield from _brokers(values, config)
     topics = values.get("connections.init_comm_topics") or ()

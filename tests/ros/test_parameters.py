@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import rclpy
 from demandops.config.load import load
+from demandops.staterepo import skeleton
 from demandops_ros import parameters, reference_parameters
 from rcl_interfaces.srv import DescribeParameters
 
@@ -50,20 +51,21 @@ def ros() -> Iterator[None]:
     rclpy.try_shutdown()
 
 
-def told(folder: Path, text: str) -> list[str]:
+def told(folder: Path, text: str, **files: str) -> list[str]:
     file = folder / "params.yml"
     file.write_text(text)
     # the way that a launch file starts a node: under a name that it gives
     args = ["--ros-args", "-r", "__node:=demandops", "--params-file", str(file)]
     values = reference_parameters.read(args)
     assert values["deployment_action_name"] == "/fleet/deployment_request"
-    return list(reference_parameters.warnings(values, load(configuration({}))))
+    return list(reference_parameters.warnings(values, load(configuration(files))))
 
 
 REPLACED = [
     f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; --clusters "
     "gives access for answers at reconciled or healthy",
-    f"parameter k3d_image_registry {UNUSED} registry/images.yaml names the registry of each image",
+    f"parameter k3d_image_registry {UNUSED} set registry: k3d-registry.localhost:41671 in "
+    "registry/images.yaml",
 ]
 
 
@@ -72,12 +74,20 @@ def test_a_file_whose_brokers_are_in_the_inventory(ros: None, tmp_path: Path) ->
     assert told(tmp_path, text) == REPLACED
 
 
+def test_a_registry_that_is_set_needs_no_warning(ros: None, tmp_path: Path) -> None:
+    text = FILE.replace("NAMESPACE", "perception").replace("PORT", "1993")
+    images = skeleton.files()["registry/images.yaml"]
+    images = images.replace("images:\n", "registry: k3d-registry.localhost:41671\nimages:\n", 1)
+    assert told(tmp_path, text, **{"registry/images.yaml": images}) == REPLACED[:1]
+
+
 def test_what_the_state_repo_lacks_is_named(ros: None, tmp_path: Path) -> None:
     text = FILE.replace("NAMESPACE", "default").replace("PORT", "1994")
     assert told(tmp_path, text) == [
-        *REPLACED,
+        REPLACED[0],
         f"parameter namespace {UNUSED} 'default' is not a namespace in "
         "policy/access-domains.yaml; services run in that of their access domain",
+        REPLACED[1],
         f"parameter connections.communication_broker_params.edge.host {UNUSED} the broker of node "
         "'edge' at service-mqtt-broker-edge:1994 is not in inventory/brokers.yaml; add it there",
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -18,6 +19,9 @@ from tests.kit.chance import chances, examples
 from tests.kit.goals import EXPERIMENT, application, connection
 from tests.kit.reference import Reference
 
+RUN = yaml.safe_load((Path(__file__).parents[2] / "fixtures/reference-run.yaml").read_text())[
+    "steps"
+]
 CONNECTION, FUSION = "mqtt-connection-station00-edge", "of-edge-object-detection-fusion"
 
 
@@ -48,6 +52,19 @@ def holds(joins: list[Join]) -> Counter[Hold]:
 
 def who(joins: list[Join]) -> list[tuple[str, ...]]:
     return [join.requesters for join in joins]
+
+
+def test_the_stand_in_keeps_the_books_of_the_recorded_run() -> None:
+    recorded: dict[str, list[str]] = {}
+    for step, path in enumerate(EXPERIMENT):
+        assert RUN[step]["goal"] == f"examples/experiment/{path.name}"
+        recorded |= RUN[step]["books"]
+        books = read(experiment(step + 1), "bookkeeping").books.items()
+        assert {
+            f"{name} {topic}".strip(): sorted(who for t, who in book.elements() if t == topic)
+            for name, book in books
+            for topic, _ in book
+        } == {name: requesters for name, requesters in recorded.items() if requesters}
 
 
 def test_the_versioning_files_tell_who_joined_together() -> None:
