@@ -55,7 +55,8 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
 def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
     """What `ros2 run` and `ros2 launch` look up; there are no wheels of these to run here."""
     packages = pytest.importorskip("ament_index_python.packages")
-    options = ["-q", "--no-deps", "--no-index", "--prefix", str(tmp_path)]
+    # without --ignore-installed pip would remove the package under test from its environment
+    options = ["-q", "--no-deps", "--no-index", "--ignore-installed", "--prefix", str(tmp_path)]
     subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
