@@ -10,6 +10,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 from collections.abc import Callable, Iterator
@@ -29,6 +30,9 @@ UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
+
+_ENTRY = re.compile(rb"([0-7]+) ([^\0]+)\0(.{20})", re.DOTALL)
+"""A line of a tree object: the mode, the name and the raw id."""
 
 Entries = dict[bytes, tuple[bytes, bytes]]
 """A folder: name → mode and the raw id of the object."""
@@ -147,6 +151,7 @@ class NewObjects(pygit2.OdbBackend):
         return pack
 
     def _needed_by(self, commit: Oid) -> list[Oid]:
+        known = {oid.raw: oid for oid in self._known}
         needed, queue = dict[Oid, None](), [commit]
         while queue:
             oid = queue.pop()
@@ -158,7 +163,7 @@ class NewObjects(pygit2.OdbBackend):
                 found = self.repo[oid].peel(pygit2.Commit)
                 queue += [found.tree_id, *found.parent_ids]
             elif kind is ObjectType.TREE:
-                queue += [Oid(raw=raw) for _, raw in entries_of(data).values()]
+                queue += [known[raw] for _, _, raw in _ENTRY.findall(data) if raw in known]
         return list(needed)
 
     # ---- what libgit2 calls ----
@@ -191,13 +196,7 @@ class NewObjects(pygit2.OdbBackend):
 
 def entries_of(data: bytes) -> Entries:
     """Return the entries of a tree object."""
-    entries, start = Entries(), 0
-    while start < len(data):
-        space = data.index(b" ", start)
-        end = data.index(b"\0", space) + 1
-        entries[data[space + 1 : end - 1]] = (data[start:space], data[end : end + 20])
-        start = end + 20
-    return entries
+    return {name: (mode, raw) for mode, name, raw in _ENTRY.findall(data)}
 
 
 @contextmanager

@@ -204,4 +204,4 @@ def _content(entries: Entries) -> bytes:
         (name + b"/" if mode == _FOLDER else name, mode, name, raw)
         for name, (mode, raw) in entries.items()
     )
-    return b"".join(b"%s %s\0%s" % (mode, name, raw) for _, mode, name, raw in ordered)
+    return b"".join([mode + b" " + name + b"\0" + raw for _, mode, name, raw in ordered])
