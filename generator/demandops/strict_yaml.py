@@ -8,8 +8,9 @@ PyYAML and Go's parsers read the same value.
 from __future__ import annotations
 
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
@@ -26,15 +27,11 @@ _WORDS = frozenset(
     ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
 )  # some parsers do not read these words as text
 
-_OPENING = (yaml.MappingStartEvent, yaml.SequenceStartEvent)
-_CLOSING = (yaml.MappingEndEvent, yaml.SequenceEndEvent)
 MAX_LENGTH = 4_000_000
 """The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 14_000
 """Of a whole number; Python prints no more than 4,300 digits."""
-_NEEDS_CHECK = re.compile(r"[&*]|[-?:][ \t]+[-?][ \t]|^\?", re.MULTILINE)
-"""Text that may hold an alias, or many levels on one line."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
@@ -43,76 +40,136 @@ _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
-class _StrictLoader(_Loader):  # type: ignore[misc]
-    """A safe loader that rejects duplicate keys and keeps dates as text."""
+_TAG = "tag:yaml.org,2002:"
+_TEXT = f"{_TAG}str"
+_RESOLVER, _CONSTRUCTOR = yaml.resolver.Resolver(), yaml.constructor.SafeConstructor()
+_REPRESENTER = yaml.representer.SafeRepresenter()
 
 
-def _mapping(loader: Any, node: yaml.MappingNode) -> dict[str, Any]:  # noqa: ANN401
-    if not isinstance(node, yaml.MappingNode):
-        raise yaml.constructor.ConstructorError(
-            None, None, "a mapping is expected here", node.start_mark
-        )
-    seen: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(
-                None,
-                None,
-                f"the key {short_repr(key)} must be text; put it in quotes",
-                key_node.start_mark,
-            )
-        if key in seen:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"the key {key!r} appears twice", key_node.start_mark
-            )
-        seen[key] = loader.construct_object(value_node, deep=True)
-    return seen
+@lru_cache(16_384)
+def _tag_of(text: str) -> str:
+    """Return the tag of a scalar without quotes. The same words and topics come again and again."""
+    return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
-def _integer(loader: Any, node: yaml.ScalarNode) -> int:  # noqa: ANN401
-    number: int = loader.construct_yaml_int(node)
+def _integer(node: yaml.ScalarNode) -> int:
+    number: int = _CONSTRUCTOR.construct_yaml_int(node)
     if number.bit_length() > _MAX_BITS:
-        raise yaml.constructor.ConstructorError(
-            None, None, f"a whole number has more than {_MAX_BITS} bits", node.start_mark
-        )
+        raise _problem(f"a whole number has more than {_MAX_BITS} bits", node)
     return number
 
 
-def _not_data(loader: Any, node: yaml.Node) -> None:  # noqa: ANN401
-    raise yaml.constructor.ConstructorError(
-        None,
-        None,
-        f"the tag {short_repr(node.tag)} is not allowed; write plain data",
-        node.start_mark,
-    )
+_CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
+    f"{_TAG}timestamp": _CONSTRUCTOR.construct_scalar,  # dates stay text
+    f"{_TAG}int": _integer,
+    f"{_TAG}float": _CONSTRUCTOR.construct_yaml_float,
+    f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
+    f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
+}
+"""Returns the value of a scalar, by its tag; JSON has no values of other tags."""
 
 
-_StrictLoader.add_constructor("tag:yaml.org,2002:map", _mapping)
-_StrictLoader.add_constructor("tag:yaml.org,2002:int", _integer)
-for _tag in ("binary", "set", "omap", "pairs"):  # JSON has no such values
-    _StrictLoader.add_constructor(f"tag:yaml.org,2002:{_tag}", _not_data)
-# PyYAML resolves each scalar anew; the same words and topics come again and again
-_StrictLoader.resolve = staticmethod(lru_cache(16_384)(yaml.resolver.Resolver().resolve))
-_StrictLoader.add_constructor(
-    "tag:yaml.org,2002:timestamp", lambda loader, node: loader.construct_scalar(node)
-)
+def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
+    return yaml.constructor.ConstructorError(None, None, what, at.start_mark)
 
 
-class _PlainDumper(_Dumper):  # type: ignore[misc]
-    """A dumper that writes no anchors and quotes every string that a parser could misread."""
+class _Parser:
+    """Builds the values of a text in one pass over PyYAML's events.
 
-    def ignore_aliases(self, data: object) -> bool:
-        """Return True, so that a value that occurs twice is written twice."""
-        return True
+    It stops before the text is too deep for those who read the values.
+    """
+
+    def __init__(self, text: str) -> None:
+        self._next = _Loader(text).get_event
+
+    def documents(self, most: float) -> Iterator[Any]:
+        while not isinstance(event := self._next(), yaml.StreamEndEvent):
+            if isinstance(event, yaml.DocumentStartEvent):
+                most -= 1
+                if most < 0:
+                    raise _problem("another document starts here; only one is allowed", event)
+                yield self._value(self._next(), 1)
+
+    def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401
+        kind = type(event)
+        if kind is yaml.AliasEvent or event.anchor:
+            where = f"line {event.start_mark.line + 1}"
+            message = "anchors and aliases (& and *) are not allowed; write the value out"
+            raise InvalidInput.at(where, message)
+        if kind is yaml.ScalarEvent:
+            return self._scalar(event)
+        if depth > _MAX_DEPTH:
+            raise InvalidInput.at("", f"is nested deeper than {_MAX_DEPTH} levels")
+        name = "seq" if kind is yaml.SequenceStartEvent else "map"
+        if event.tag not in (None, "!", f"{_TAG}{name}"):
+            raise _refused_tag(event.tag, event)
+        return self._sequence(depth) if name == "seq" else self._mapping(depth)
+
+    def _scalar(self, event: Any) -> Any:  # noqa: ANN401
+        tag = event.tag
+        if tag is None or tag == "!":
+            tag = _tag_of(event.value) if event.implicit[0] else _TEXT
+        if tag == _TEXT:
+            return event.value
+        if tag not in _CONSTRUCT:
+            raise _refused_tag(tag, event)
+        return _CONSTRUCT[tag](yaml.ScalarNode(tag, event.value, event.start_mark))
+
+    def _sequence(self, depth: int) -> list[Any]:
+        items = []
+        while type(event := self._next()) is not yaml.SequenceEndEvent:
+            items.append(self._value(event, depth + 1))
+        return items
+
+    def _mapping(self, depth: int) -> dict[str, Any]:
+        seen: dict[str, Any] = {}
+        while type(event := self._next()) is not yaml.MappingEndEvent:
+            key = self._value(event, depth + 1)
+            if not isinstance(key, str):
+                raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
+            if key in seen:
+                raise _problem(f"the key {key!r} appears twice", event)
+            seen[key] = self._value(self._next(), depth + 1)
+        return seen
 
 
-def _text(dumper: Any, text: str) -> yaml.ScalarNode:  # noqa: ANN401
-    tag = "tag:yaml.org,2002:str"
+def _refused_tag(tag: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401
+    return _problem(f"the tag {short_repr(tag)} is not allowed; write plain data", at)
+
+
+_START = (yaml.StreamStartEvent(), yaml.DocumentStartEvent(explicit=False))
+_END = (yaml.DocumentEndEvent(explicit=False), yaml.StreamEndEvent())
+_MAPPING = yaml.MappingStartEvent(None, None, True, flow_style=False), yaml.MappingEndEvent()
+_SEQUENCE = yaml.SequenceStartEvent(None, None, True, flow_style=False), yaml.SequenceEndEvent()
+
+
+def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
+    """Yield the events that write a value. A value that occurs twice is written twice."""
+    if isinstance(value, str):
+        yield _text(value)
+    elif isinstance(value, Mapping):
+        yield _MAPPING[0]
+        for key, item in value.items():
+            yield _text(key)
+            yield from _events(item)
+        yield _MAPPING[1]
+    elif isinstance(value, list | tuple):
+        yield _SEQUENCE[0]
+        for item in value:
+            yield from _events(item)
+        yield _SEQUENCE[1]
+    else:
+        written = _REPRESENTER.represent_data(value).value
+        yield yaml.ScalarEvent(None, None, (True, False), written)
+
+
+@lru_cache(16_384)
+def _text(text: str) -> yaml.ScalarEvent:
+    """Return the event of a text, in quotes if a parser could misread it."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
-        return dumper.represent_scalar(tag, text)  # type: ignore[no-any-return]
+        return yaml.ScalarEvent(None, None, (True, False), text)
     style = "|" if _readable_block(text) else '"'
-    return dumper.represent_scalar(tag, text, style=style)  # type: ignore[no-any-return]
+    return yaml.ScalarEvent(None, None, (False, True), text, style=style)
 
 
 def _readable_block(text: str) -> bool:
@@ -124,9 +181,6 @@ def _readable_block(text: str) -> bool:
         and text.count("\n") > 1
         and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
     )
-
-
-_PlainDumper.add_representer(str, _text)
 
 
 def short_repr(value: object) -> str:
@@ -149,10 +203,12 @@ def _strict(file: str) -> Iterator[None]:
         raise InvalidInput.at(where, message, file=file) from error
     except _MISFITS as error:
         raise InvalidInput.at("", _MISFIT, file=file) from error
+    except InvalidInput as error:
+        raise InvalidInput(faults_in(error, file)) from None
 
 
-def load_all(text: str, file: str = "") -> Iterator[Any]:
-    """Yield the documents of ``text``.
+def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]:
+    """Yield the documents of ``text``, ``most`` of them.
 
     Raises:
         InvalidInput: if it is not strict YAML; the fault names ``file``.
@@ -161,17 +217,7 @@ def load_all(text: str, file: str = "") -> Iterator[Any]:
         message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
         raise InvalidInput.at("", message, file=file)
     with _strict(file):
-        depth = 0
-        for event in yaml.parse(text, Loader=_Loader):
-            depth += isinstance(event, _OPENING) - isinstance(event, _CLOSING)
-            if depth > _MAX_DEPTH:  # before the C parser builds it and overruns its stack
-                message = f"is nested deeper than {_MAX_DEPTH} levels"
-                raise InvalidInput.at("", message, file=file)
-            if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None):
-                where = f"line {event.start_mark.line + 1}" if event.start_mark else ""
-                message = "anchors and aliases (& and *) are not allowed; write the value out"
-                raise InvalidInput.at(where, message, file=file)
-        yield from yaml.load_all(text, Loader=_StrictLoader)
+        yield from _Parser(text).documents(most)
 
 
 def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
@@ -180,39 +226,14 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
     Raises:
         InvalidInput: if it is not strict YAML; the fault names ``file``.
     """
-    documents = list(load_all(text, file))
-    if len(documents) > 1:
-        message = f"holds {len(documents)} documents; only one is allowed"
-        raise InvalidInput.at("", message, file=file)
+    documents = list(load_all(text, file, most=1))
     return documents[0] if documents else None
-
-
-def load_rendered(text: str) -> Any:  # noqa: ANN401
-    """Return the document that a template produced.
-
-    Anchors and depth are checked only if the text can have them, which saves a pass for most.
-
-    Raises:
-        InvalidInput: if it is not strict YAML.
-    """
-    if _NEEDS_CHECK.search(text) or text.count("[") + text.count("{") > _MAX_DEPTH:
-        return load(text)
-    with _strict(""):
-        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - derives from SafeLoader
 
 
 def dump(data: Mapping[str, Any]) -> str:
     """Return ``data`` as block YAML in the given order, with a newline at the end."""
-    return str(
-        yaml.dump(
-            data,
-            Dumper=_PlainDumper,
-            sort_keys=False,
-            allow_unicode=True,
-            default_flow_style=False,
-            width=4096,
-        )
-    )
+    events = (*_START, *_events(data), *_END)
+    return str(yaml.emit(events, Dumper=_Dumper, allow_unicode=True, width=4096))
 
 
 def set_key(text: str, key: str, value: object) -> str:

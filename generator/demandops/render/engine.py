@@ -105,12 +105,7 @@ def _plain(value: object) -> object:
 
 def _block(value: Mapping[str, Any], indent: int) -> _Verbatim:
     text = strict_yaml.dump(value) if value else "{}\n"
-    pad = " " * indent
-    return _Verbatim(
-        "".join(
-            pad + line if line.strip() else line for line in text.splitlines(keepends=True)
-        ).rstrip("\n")
-    )
+    return _Verbatim(re.sub(r"(?m)^(?=.)", " " * indent, text.rstrip("\n")))
 
 
 def _literal(value: str, indent: int) -> _Verbatim:
@@ -171,7 +166,7 @@ class Engine:
                 compiled: Template = self._config.get_template(template)
             with budget():  # a full one, whether or not the template was compiled before
                 text = compiled.render(**context)
-            values = strict_yaml.load_rendered(text)
+            values = strict_yaml.load(text)
         except InvalidInput as error:
             raise InvalidInput(
                 fault(

@@ -94,7 +94,7 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterable[dict[str, Any]]:
     try:
-        documents = [strict_yaml.load_rendered(part) for part in text.split("\n---\n")]
+        documents = list(strict_yaml.load_all(text))
     except InvalidInput as error:
         faults += strict_yaml.faults_in(error, path)
         return []

@@ -21,7 +21,7 @@ from tests.unit.demand import wrong_types as of_form
 from tests.unit.overrides import test_override_mistakes as of_overrides
 
 FILE = Path(__file__).with_name("messages.txt")
-_FOREIGN = re.compile(r"(not valid YAML: |input should be )(?!the key|a tag).*?(, not |$)")
+_FOREIGN = re.compile(r"(not valid YAML: |input should be )(?!the key|a tag|another).*?(, not |$)")
 
 
 def text() -> str:
