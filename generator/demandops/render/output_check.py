@@ -8,7 +8,8 @@ once.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,6 +31,7 @@ KUBERNETES_VERSION = "1.36.0"
 OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 
 _BUILT_IN = frozenset({"v1", "apps/v1", "networking.k8s.io/v1", "rbac.authorization.k8s.io/v1"})
+_API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
 
 
 def check_values(
@@ -92,16 +94,23 @@ def check_files(files: Mapping[str, str | None]) -> None:
         raise InvalidInput(faults)
 
 
-def _documents(path: str, text: str, faults: list[Fault]) -> Iterable[dict[str, Any]]:
-    try:
-        documents = list(strict_yaml.load_all(text))
-    except InvalidInput as error:
-        faults += strict_yaml.faults_in(error, path)
-        return []
-    for document in documents:
-        if not isinstance(document, dict):
+def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
+    """Yield the documents of a file; one of a controller's own kinds without its ``spec``.
+
+    That is the program's own template around values that are checked already.
+    """
+    for part in text.split("\n---\n"):
+        api = _API.search(part)
+        of_controller = api is not None and api[1] not in _BUILT_IN
+        try:
+            document = strict_yaml.load(part.partition("\nspec:\n")[0] if of_controller else part)
+        except InvalidInput as error:
+            faults += strict_yaml.faults_in(error, path)
+            continue
+        if isinstance(document, dict):
+            yield document
+        else:
             faults.append(fault("", "has a document that is not a mapping").within(path))
-    return [document for document in documents if isinstance(document, dict)]
 
 
 def _check_object(

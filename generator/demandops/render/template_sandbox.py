@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import (
     Callable,
+    Collection,
     ItemsView,
     Iterable,
     Iterator,
@@ -66,6 +67,7 @@ _METHODS: dict[type, list[str]] = {
     list: ["count", "index"],
     tuple: ["count", "index"],
 }
+_MAPPING = (dict, Mapping)  # the first is told at once
 _PLAIN = (str, int, float, type(None), Undefined)
 
 
@@ -102,35 +104,35 @@ def _size(value: object, *, data: bool = True) -> int:
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
-    size, rest = 0, [value]
+    size, rest = 0, list[Collection[object]]([(value,)])
     while rest:
-        part = rest.pop()
-        size += 1
-        if isinstance(part, str):
-            size += len(part) >> 4
-        elif isinstance(part, Mapping):
-            rest += part
-            rest += part.values()
-        elif isinstance(part, list | tuple):
-            rest += part
-        elif isinstance(part, range):
-            size += len(part)
-        elif data and not isinstance(part, _PLAIN):
-            raise SecurityError(
-                f"a template may write text, numbers, lists and mappings, not {type(part)}"
-            )
+        parts = rest.pop()
+        size += len(parts)
+        for part in parts:
+            if isinstance(part, str):
+                size += len(part) >> 4
+            elif isinstance(part, list | tuple):
+                rest.append(part)
+            elif isinstance(part, _MAPPING):
+                rest += (part, part.values())
+            elif isinstance(part, range):
+                size += len(part)
+            elif data and not isinstance(part, _PLAIN):
+                raise SecurityError(
+                    f"a template may write text, numbers, lists and mappings, not {type(part)}"
+                )
         if size > MAX_SIZE:
             raise SecurityError(f"a value is too large: it has more than {MAX_SIZE} parts")
     return size
 
 
-def _kept(value: Any) -> Any:  # noqa: ANN401
+def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
     """Return a new value if it is not too large; what is lazy becomes a list."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
         raise SecurityError("a text is too large")
-    _budget.get().take(_size(value, data=False))
+    _budget.get().take(_size(value, data=data))
     return value
 
 
@@ -299,7 +301,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         super().__init__(**options)
         written = self.finalize
         assert written is not None  # noqa: S101 - our own options
-        self.finalize = lambda value: written(_kept(value) if _size(value) else value)
+        self.finalize = lambda value: written(_kept(value, data=True))
         kept = {name: one for name, one in self.filters.items() if name in _FILTERS}
         self.filters = {name: _counted(name, one) for name, one in {**kept, **filters}.items()}
         self.filters |= {"_iterated": _iterated, "_measured": _measured}
