@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import chain
 from types import MappingProxyType
 from typing import Literal
+
+from rpds import HashTrieMap
 
 from demandops.config.config import Config
 from demandops.demand import admission, demand_goal, deployment_request_goal, permission
@@ -34,7 +36,8 @@ from demandops.plan.overrides.claim_overrides import (
     without_suspended,
 )
 from demandops.plan.planner import is_bridged
-from demandops.plan.release_keys import affected_keys, all_keys
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.render.changes.changeset import FileReader, ReleaseChange
@@ -60,14 +63,30 @@ Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 
 @dataclass(frozen=True, slots=True)
 class State(World):
-    """The world at one commit, with the engine of its configuration."""
+    """The world at one commit, with the engine of its configuration.
+
+    ``plans`` are the releases that earlier decisions on this configuration planned. A replaced
+    state has none: only :func:`decide` knows which of them are still right.
+    """
 
     engine: Engine
+    plans: HashTrieMap[ReleaseKey, Release] = field(
+        default_factory=HashTrieMap, init=False, compare=False, repr=False
+    )
 
     @classmethod
     def of(cls, config: Config, ledger: Ledger) -> State:
         """Return a state with a fresh engine for ``config``."""
         return cls(config, ledger, Engine(config.files))
+
+    def followed_by(self, ledger: Ledger, plans: Mapping[ReleaseKey, Release | None]) -> State:
+        """Return the state after a decision that planned all releases that it affects."""
+        known = self.plans
+        for key, release in plans.items():
+            known = known.insert(key, release) if release else known.discard(key)
+        state = replace(self, ledger=ledger)
+        object.__setattr__(state, "plans", known)
+        return state
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +153,10 @@ def decide(
     clashes = list(topic_clash.faults(request, state, after, keys))
     if clashes:
         raise Refused(clashes)
-    rendered = changeset.build_changeset(state, after, changes, keys, state.engine, read)
+    rendered = changeset.build_changeset(
+        state, after, changes, keys, state.engine, read, state.plans
+    )
+    after = state.followed_by(ledger, rendered.plans)
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims:

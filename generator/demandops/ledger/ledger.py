@@ -102,7 +102,7 @@ class Ledger:
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
         held = self.claims.get(subject)
-        return tuple(held.by_demand[demand] for demand in sorted(held.by_demand)) if held else ()
+        return tuple(claim for _, claim in sorted(held.by_demand.items())) if held else ()
 
     def first_claim(self, subject: Subject) -> Claim | None:
         """Return the claim on ``subject`` with the lowest demand id, or ``None``."""

@@ -30,14 +30,21 @@ def outputs(
     if key.application is not None:
         instance = naming.topic_part(key.application)
     else:
-        source, topic = str(key.source), str(key.topic)
-        usual = usual_topic(config, source, str(service.each))
-        extra = "" if topic == usual or (usual is None and not further) else topic
-        instance = naming.topic_part(source, extra)
-    return {
-        name: pattern.replace("{instance}", instance)
-        for name, pattern in sorted(service.outputs.items())
-    }
+        input = InputTopic(str(key.topic), str(key.source), further=further)
+        instance = instance_of(config, str(service.each), input)
+    return {name: named(pattern, instance) for name, pattern in sorted(service.outputs.items())}
+
+
+def instance_of(config: Config, role: str, topic: InputTopic) -> str:
+    """Return what ``{instance}`` is for the service that has ``topic`` as its input."""
+    usual = usual_topic(config, topic.source, role)
+    is_usual = topic.topic == usual or (usual is None and not topic.further)
+    return naming.topic_part(topic.source, "" if is_usual else topic.topic)
+
+
+def named(pattern: str, instance: str) -> str:
+    """Return the topic of an instance."""
+    return pattern.replace("{instance}", instance)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:

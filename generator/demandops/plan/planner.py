@@ -20,11 +20,11 @@ from demandops.connections.connection import Connection
 from demandops.connections.connection_type import ConnectionType
 from demandops.connections.connection_types import route_faults
 from demandops.connections.route import Route
-from demandops.demand.application import InputTopic
+from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, requesters_of
 from demandops.errors import Refused
 from demandops.ledger.world import World
-from demandops.plan.output_topics import outputs, usual_topic
+from demandops.plan.output_topics import instance_of, named, outputs, usual_topic
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
@@ -61,21 +61,20 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     config, claims = world.config, claims_needing(world, key)
     if not claims:
         return None
-    users = tuple(dict.fromkeys(claim.subject.id for claim in claims))
-    first = world.ledger.application(users[0]) or claims[0].application
+    apps = [claim.application for claim in claims]
+    first = world.ledger.application(apps[0].id) or apps[0]
     appdef = appdef_of(config, first.appdef)
     service = appdef.services[key.service]
     node, domain = config.node_and_domain(key.node)
     inputs: dict[str, tuple[InputTopic, ...]]
     if service.each is not None:
-        inputs = {service.each: (_shared_input(claims, service.each, key),)}
+        inputs = {service.each: (_shared_input(apps, service.each, key),)}
     else:
-        inputs = _application_inputs(config, appdef, service, claims)
+        inputs = _application_inputs(config, appdef, service, apps)
     further = any(one.further for topics in inputs.values() for one in topics)
     definitions: dict[str, Parameter] = {}
-    for name in sorted({claim.application.appdef for claim in claims}, reverse=True):
+    for name in sorted({app.appdef for app in apps}, reverse=True):
         definitions |= appdef_of(config, name).parameters
-    values = _merged_parameters(definitions, claims)
     return ServiceRelease(
         key=key,
         name=service_name(config, service, key),
@@ -87,19 +86,19 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
             if known.services.get(key.service) == service
         ),
         service=service,
-        chart=_chart(config, service, claims),
+        chart=_chart(config, service, apps),
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
-        parameters=MappingProxyType(values),
+        parameters=MappingProxyType(_merged_parameters(definitions, claims)),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
-        applications=users,
+        applications=tuple(dict.fromkeys(app.id for app in apps)),
         requesters=requesters_of(claims),
     )
 
 
-def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSource:
+def _chart(config: Config, service: Service, apps: Iterable[Application]) -> ChartSource:
     chart = config.charts[service.chart]
-    wanted = {claim.application.version for claim in claims}
+    wanted = {app.version for app in apps}
     charts = {version: chart.at(version) or chart for version in wanted}
     if len({source.version for source in charts.values()}) > 1:
         versions = " and ".join(
@@ -112,42 +111,35 @@ def _chart(config: Config, service: Service, claims: Iterable[Claim]) -> ChartSo
     return next(iter(charts.values()))
 
 
-def _shared_input(claims: Iterable[Claim], role: str, key: ServiceKey) -> InputTopic:
+def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> InputTopic:
     source, topic = str(key.source), str(key.topic)
-    found = [one for claim in claims for one in claim.application.inputs_from(role, source, topic)]
+    found = [one for app in apps for one in app.inputs_from(role, source, topic)]
     type = min((one.type for one in found if one.type), default="")
     return InputTopic(topic, source, type, all(one.further for one in found))
 
 
 def _application_inputs(
-    config: Config, appdef: ApplicationDefinition, service: Service, claims: Iterable[Claim]
+    config: Config, appdef: ApplicationDefinition, service: Service, apps: Iterable[Application]
 ) -> dict[str, tuple[InputTopic, ...]]:
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role, origin in sorted(service.inputs.items()):
         producer_name, _, output = origin.partition(".")
         if not output:
-            inputs[role] = _united(claims, origin)
+            united = {(one.topic, one.source): one for one in sorted(_topics(apps, origin))}
+            inputs[role] = tuple(united.values())
             continue
         producer = appdef.services[producer_name]
-        made = set()
-        for topic in {
-            topic
-            for claim in claims
-            for topic in claim.application.inputs.get(str(producer.each), ())
-        }:
-            key = ServiceKey(producer_name, topic.source, source=topic.source, topic=topic.topic)
-            names = outputs(config, producer, key, further=topic.further)
-            made.add(InputTopic(names[output], topic.source))
+        pattern, each = producer.outputs[output], str(producer.each)
+        made = {
+            InputTopic(named(pattern, instance_of(config, each, one)), one.source)
+            for one in _topics(apps, each)
+        }
         inputs[role] = tuple(sorted(made))
     return inputs
 
 
-def _united(claims: Iterable[Claim], role: str) -> tuple[InputTopic, ...]:
-    types: dict[tuple[str, str], set[str]] = {}
-    for claim in claims:
-        for topic in claim.application.inputs.get(role, ()):
-            types.setdefault((topic.topic, topic.source), set()).add(topic.type)
-    return tuple(InputTopic(*key, max(found)) for key, found in sorted(types.items()))
+def _topics(apps: Iterable[Application], role: str) -> set[InputTopic]:
+    return {one for app in apps for one in app.inputs.get(role, ())}
 
 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
@@ -173,10 +165,11 @@ def _replicas(scaling: Scaling, topics: int) -> int:
 
 
 def _merged_parameters(
-    definitions: Mapping[str, Parameter], claims: tuple[Claim, ...]
+    definitions: Mapping[str, Parameter], claims: Iterable[Claim]
 ) -> dict[str, object]:
     """Return the value of every parameter; the appdef says how several values become one."""
     values: dict[str, object] = {}
+    claims = [claim for claim in claims if claim.application.parameters]
     for name, parameter in sorted(definitions.items()):
         given = [claim for claim in claims if name in claim.application.parameters]
         values[name] = _merged_value(name, parameter, given) if given else parameter.default

@@ -6,7 +6,8 @@ A file whose text stays the same is not in the changeset, so an unchanged releas
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Literal
 
 from demandops.config.repo_settings import ROOT_FILE
@@ -59,6 +60,8 @@ class Changeset:
     """The files of the overrides that shape the written files."""
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
+    plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
+    """The releases that may differ, as they are now."""
 
 
 def build_changeset(
@@ -68,6 +71,7 @@ def build_changeset(
     keys: Iterable[ReleaseKey],
     engine: Engine,
     read: FileReader,
+    plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
 ) -> Changeset:
     """Return the changes in the state repo that follow from a change of the ledger.
 
@@ -75,6 +79,10 @@ def build_changeset(
         before, after: the world before and after; the configuration is the same.
         changes: what differs in the ledger.
         keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
+
+        engine: the engine of the configuration.
+        read: reads the state repo before the change.
+        plans: releases of ``before`` that are planned already.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
@@ -91,8 +99,9 @@ def build_changeset(
     releases = []
     shaped: set[str] = set()
     blocked: list[str] = []
-    for key in keys:
-        old, new = _plan_leniently(before, key), plan(after, key)
+    now = {key: plan(after, key) for key in keys}
+    for key, new in now.items():
+        old = plans.get(key) or _plan_leniently(before, key)
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
@@ -110,7 +119,7 @@ def build_changeset(
     check_files(files)
     _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda change: change.order)
-    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
+    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now)
 
 
 def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
