@@ -51,6 +51,8 @@ _FILTERS = re.findall(
 )
 _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
 """Filters that take a step whatever the size: they only look at a value or return a part of it."""
+_EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
+"""Filters that look at each item: what they ask of it takes steps of its own."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
 """Filters that take more steps for the same size."""
 _PADDING = frozenset(
@@ -104,13 +106,17 @@ def _size(value: object, *, data: bool = True) -> int:
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
-    size, rest = 0, list[Collection[object]]([(value,)])
+    size = text = 0
+    rest: list[Collection[object]] = [(value,)]
     while rest:
         parts = rest.pop()
         size += len(parts)
+        if {*map(type, parts)} == {str}:
+            text += sum(map(len, cast(Collection[str], parts)))
+            parts = ()
         for part in parts:
             if isinstance(part, str):
-                size += len(part) >> 4
+                text += len(part)
             elif isinstance(part, list | tuple):
                 rest.append(part)
             elif isinstance(part, _MAPPING):
@@ -121,9 +127,9 @@ def _size(value: object, *, data: bool = True) -> int:
                 raise SecurityError(
                     f"a template may write text, numbers, lists and mappings, not {type(part)}"
                 )
-        if size > MAX_SIZE:
+        if size + (text >> 4) > MAX_SIZE:
             raise SecurityError(f"a value is too large: it has more than {MAX_SIZE} parts")
-    return size
+    return size + (text >> 4)
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
@@ -187,7 +193,8 @@ def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
             steps.take(1)
             return function(*args, **kwargs)
         for value in values:
-            steps.take(_size(value) * _SLOW.get(name, 1))
+            of_items = name in _EACH and isinstance(value, list | tuple)
+            steps.take(len(value) if of_items else _size(value) * _SLOW.get(name, 1))
         _refuse_growth(name, values)
         return _kept(function(*args, **kwargs))
 
