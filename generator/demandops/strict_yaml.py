@@ -147,17 +147,17 @@ def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
     """Yield the events that write a value. A value that occurs twice is written twice."""
     if isinstance(value, str):
         yield _text(value)
+    elif isinstance(value, list | tuple):
+        yield _SEQUENCE[0]
+        for item in value:
+            yield from (_text(item),) if isinstance(item, str) else _events(item)
+        yield _SEQUENCE[1]
     elif isinstance(value, Mapping):
         yield _MAPPING[0]
         for key, item in value.items():
             yield _text(key)
             yield from _events(item)
         yield _MAPPING[1]
-    elif isinstance(value, list | tuple):
-        yield _SEQUENCE[0]
-        for item in value:
-            yield from _events(item)
-        yield _SEQUENCE[1]
     else:
         written = _REPRESENTER.represent_data(value).value
         yield yaml.ScalarEvent(None, None, (True, False), written)
