@@ -31,11 +31,12 @@ UNFINISHED = "demandops-pack-"
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
-_ENTRY = re.compile(rb"([0-7]+) ([^\0]+)\0(.{20})", re.DOTALL)
-"""A line of a tree object: the mode, the name and the raw id."""
+_ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0(.{20}))", re.DOTALL)
+"""An entry of a tree object: the mode, the name and the raw id."""
+_FOLDER = b"40000"
 
-Entries = dict[bytes, tuple[bytes, bytes]]
-"""A folder: name → mode and the raw id of the object."""
+Entries = dict[bytes, bytes]
+"""The entries of a folder by name; a folder's name ends in a slash, as Git sorts it."""
 
 
 class NewObjects(pygit2.OdbBackend):
@@ -163,7 +164,7 @@ class NewObjects(pygit2.OdbBackend):
                 found = self.repo[oid].peel(pygit2.Commit)
                 queue += [found.tree_id, *found.parent_ids]
             elif kind is ObjectType.TREE:
-                queue += [known[raw] for _, _, raw in _ENTRY.findall(data) if raw in known]
+                queue += [known[raw] for *_, raw in _ENTRY.findall(data) if raw in known]
         return list(needed)
 
     # ---- what libgit2 calls ----
@@ -196,7 +197,10 @@ class NewObjects(pygit2.OdbBackend):
 
 def entries_of(data: bytes) -> Entries:
     """Return the entries of a tree object."""
-    return {name: (mode, raw) for mode, name, raw in _ENTRY.findall(data)}
+    return {
+        name + b"/" if mode == _FOLDER else name: entry
+        for entry, mode, name, _ in _ENTRY.findall(data)
+    }
 
 
 @contextmanager

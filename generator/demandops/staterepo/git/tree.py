@@ -18,7 +18,6 @@ pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectTyp
 
 MAX_DEPTH = 64
 """The folders above a file; deeper ones are not read."""
-_FOLDER, _FILE = b"40000", b"100644"
 
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
@@ -167,27 +166,33 @@ def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | Non
     below: dict[bytes, dict[str, str | None]] = {}
     here: dict[bytes, str | None] = {}
     for path, text in files.items():
-        name, _, rest = path.partition("/")
+        first, _, rest = path.partition("/")
         if rest:
-            below.setdefault(_raw_name(name, entries), {})[rest] = text
+            below.setdefault(_raw_name(first, entries), {})[rest] = text
         else:
-            here[_raw_name(name, entries)] = text
-    for folder, inner in below.items():
-        mode, raw = entries.get(folder, (b"", b""))
-        kept = mode == _FOLDER and here.get(folder, "") is not None
-        subtree = _write(objects, objects.repo[Oid(raw=raw)].peel(Tree) if kept else None, inner)
+            here[_raw_name(first, entries)] = text
+    for name, inner in below.items():
+        folder = name + b"/"
+        kept = folder in entries and here.get(name, "") is not None
+        old = objects.repo[Oid(raw=entries[folder][-20:])].peel(Tree) if kept else None
+        subtree = _write(objects, old, inner)
         if subtree is not None:
-            entries[folder] = (_FOLDER, subtree.raw)
+            entries.pop(name, None)
+            entries[folder] = b"40000 %s\0%s" % (name, subtree.raw)
         elif kept:
             del entries[folder]
-    for file, text in here.items():  # last, so that a file can replace a folder
+    for name, text in here.items():  # last, so that a file can replace a folder
         if text is not None:
-            entries[file] = (_FILE, objects.add(ObjectType.BLOB, text.encode()).raw)
-        elif not any(inner is not None for inner in below.get(file, {}).values()):
-            entries.pop(file, None)
+            entries.pop(name + b"/", None)
+            blob = objects.add(ObjectType.BLOB, text.encode())
+            entries[name] = b"100644 %s\0%s" % (name, blob.raw)
+        elif not any(inner is not None for inner in below.get(name, {}).values()):
+            entries.pop(name, None)
+            entries.pop(name + b"/", None)
     if not entries:
         return None
-    return objects.add(ObjectType.TREE, _content(entries))
+    content = b"".join(entries[name] for name in sorted(entries))
+    return objects.add(ObjectType.TREE, content)
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
@@ -195,13 +200,5 @@ def _raw_name(name: str, entries: Entries) -> bytes:
     raw = name.encode()
     if raw in entries or b"\\" not in raw:
         return raw
-    return next((known for known in entries if _printable(known) == name), raw)
-
-
-def _content(entries: Entries) -> bytes:
-    """Return a tree object: Git sorts a folder as if its name ended in a slash."""
-    ordered = sorted(
-        (name + b"/" if mode == _FOLDER else name, mode, name, raw)
-        for name, (mode, raw) in entries.items()
-    )
-    return b"".join([mode + b" " + name + b"\0" + raw for _, mode, name, raw in ordered])
+    known = (one.removesuffix(b"/") for one in entries)
+    return next((one for one in known if _printable(one) == name), raw)
