@@ -8,13 +8,13 @@ from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from itertools import islice, takewhile
 from types import MappingProxyType
+from typing import NamedTuple
 
 from demandops import naming
 from demandops.subject import Subject, SubjectKind, TopicKey
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class InputTopic:
+class InputTopic(NamedTuple):
     """An input topic of an application, and the node that publishes it.
 
     ``further`` says that another topic of the node was its usual one when this one was booked

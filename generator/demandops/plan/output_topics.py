@@ -116,7 +116,7 @@ def _marked(
     marked: dict[str, list[InputTopic]] = {}
     for role, topic in _per_topic(app, config):
         further = is_further(role, topic)
-        marked.setdefault(role, []).append(replace(topic, further=further))
+        marked.setdefault(role, []).append(topic._replace(further=further))
     return app.with_inputs(
         {**app.inputs, **{role: tuple(topics) for role, topics in marked.items()}}
     )

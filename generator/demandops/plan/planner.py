@@ -125,7 +125,7 @@ def _application_inputs(
     for role, origin in sorted(service.inputs.items()):
         producer_name, _, output = origin.partition(".")
         if not output:
-            united = {(one.topic, one.source): one for one in sorted(_topics(apps, origin))}
+            united = {one[:2]: one for one in sorted(_topics(apps, origin))}
             inputs[role] = tuple(united.values())
             continue
         producer = appdef.services[producer_name]
