@@ -161,3 +161,20 @@ def test_housekeeping_keeps_a_pack_that_no_reference_leads_to_yet(tmp_path: Path
         repo.references.create("refs/heads/main", commit)
     git(tmp_path, "gc", "--prune=now", "--quiet")
     git(tmp_path, "fsck", "--strict")
+
+
+def test_git_reads_packed_files_of_every_size(tmp_path: Path) -> None:
+    repo = pygit2.init_repository(tmp_path, bare=True)
+    new = NewObjects(repo)
+    sizes = [0, 1, 15, 16, 17, 2047, 2048, 2049, 300_000]
+    files: dict[str, str | None] = {f"f{size}": "é" + "x" * size for size in sizes}
+    tree = trees.write(new, None, files)
+    who = pygit2.Signature("A", "a@example.org", 1_770_000_000)
+    text = repo.create_commit_string(who, who, "x", tree, [])
+    commit = new.add(pygit2.enums.ObjectType.COMMIT, text.encode())
+    with new.packed(commit):
+        repo.references.create("refs/heads/main", commit)
+    (index,) = (tmp_path / "objects" / "pack").glob("*.idx")
+    git(tmp_path, "verify-pack", str(index))
+    git(tmp_path, "fsck", "--strict")
+    assert {path: git(tmp_path, "show", f"main:{path}") for path in files} == files
