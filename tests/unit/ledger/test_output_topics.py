@@ -143,7 +143,7 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
 
 def without_marks(claim: Claim) -> Any:
     inputs = {
-        role: tuple(replace(topic, further=False) for topic in topics)
+        role: tuple(topic._replace(further=False) for topic in topics)
         for role, topics in claim.application.inputs.items()
     }
     return claim.application.with_inputs(inputs)
