@@ -50,6 +50,8 @@ class Machine(Runtime):
         self.started_at = 0.0
         self.crashes_in = self.losses = self.rejections = 0
         self.is_cut_off, self.delay = False, 0.0
+        self.has_rejected = False
+        """Whether a push of it was refused by the remote."""
 
     def start_thread(self, name: str, target: Callable[[], object]) -> Any:
         self.threads.append(self.turns.start_thread(name, target))
@@ -184,7 +186,7 @@ class Clone(RemoteRepository):
         if self._aborted or machine.is_cut_off:
             raise _failed(command, "fatal: unable to access the remote: Connection refused")
         if verb == "push" and machine.rejections:
-            machine.rejections -= 1
+            machine.rejections, machine.has_rejected = machine.rejections - 1, True
             raise _failed(command, "! [remote rejected] (pre-receive hook declined)")
         if verb == "fsck":
             return "", ""
@@ -209,8 +211,11 @@ class Clone(RemoteRepository):
 
     def _fetch_there(self, repo: git.Repo, *arguments: str) -> str:
         source, target = arguments[-1].removeprefix("+").split(":")
-        tip = self._machine.world.remote.references[source].target
-        pygit2.Repository(repo.git_dir).references.create(target, tip, force=True)
+        file = Path(repo.git_dir, target)
+        tip = f"{self._machine.world.remote.references[source].target}\n"
+        if not file.exists() or file.read_text() != tip:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(tip)
         return ""
 
     def _ls_remote_there(self, repo: git.Repo, *arguments: str) -> str:
@@ -261,7 +266,6 @@ class World:
         """What must not happen, if it did."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
-        self.last_set_back = -1000.0
         self.last_jump = -1.0
         """When the clocks were set forward the last time."""
 
@@ -301,8 +305,6 @@ class World:
         self.turns.set_by(seconds)
         if seconds > 0:
             self.last_jump = self.turns.monotonic()
-        else:
-            self.last_set_back = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
         """Return the seconds of a wall clock's time, to be compared only."""

@@ -219,9 +219,13 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Return demands that no longer need approval to the state waiting."""
+        """Return demands that no longer need approval to the state waiting.
+
+        A person may have merged one of them meanwhile.
+        """
         with self._changed:
             for ticket in tickets:
+                ticket.mark_maybe_published(ticket.base)
                 self._journal.append([ticket.journal_entry()])
                 ticket.proposal = None
                 _change(ticket, "waiting")
@@ -280,11 +284,14 @@ class Demands:
         """Answer each demand with its result and remove it from the journal, unless ``keep``.
 
         A demand is answered once: a later result is dropped.
+
+        Raises:
+            Unsound: nobody knows what is in the journal; nobody is answered.
         """
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
             if not keep:
-                self._journal.mark_done(ticket.operation for ticket, _ in results)
+                self._mark_done(results)
             for ticket, _ in results:
                 _change(ticket, "done")
                 if self._tickets.pop(ticket.operation, None):
@@ -295,6 +302,22 @@ class Demands:
                 ticket.future.set_result(result)
             else:
                 ticket.future.set_exception(result)
+
+    def _mark_done(self, results: list[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
+        """Remove demands from the journal, durably if no commit shows what became of one of them.
+
+        After a crash such a demand would be decided again: what was refused could be booked.
+        """
+        operations = [ticket.operation for ticket, _ in results]
+        durably = any(
+            not isinstance(result, Receipt) or result.outcome == "unchanged" or ticket.has_released
+            for ticket, result in results
+        )
+        try:
+            self._journal.mark_done(operations, durably=durably)
+        except StateRepoError as error:  # no room: the next write that succeeds makes it durable
+            log.error("a demand that was answered may be decided again after a crash: %s", error)
+            self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
         """Answer every demand of a batch with an error."""

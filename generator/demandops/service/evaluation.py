@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import logging
 
+from pygit2 import Oid
+
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
-from demandops.service.approvals.approvals import Approvals
+from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.approvals.proposal import is_release, name_of
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
@@ -20,7 +22,6 @@ from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository, disk_error
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history.commit_log import RecordedOutcome, operations_since
-from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
@@ -40,16 +41,8 @@ class Evaluator:
         self._with_targets = with_targets
         self._rate_limit = RateLimit()
 
-    def evaluate(
-        self,
-        commits: CommitBatch,
-        ticket: Ticket,
-        published: dict[str, RecordedOutcome],
-    ) -> Receipt | DemandOpsError | Decision:
+    def evaluate(self, commits: CommitBatch, ticket: Ticket) -> Receipt | DemandOpsError | Decision:
         """Decide a demand, commit it on the commit batch and return its result.
-
-        Args:
-            published: the result of :meth:`published_before` for the batch.
 
         Returns:
             Its receipt or error; if it needs approval, the decision, which is not committed.
@@ -59,8 +52,6 @@ class Evaluator:
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
-        if ticket.operation in published:
-            return _receipt_of_published(ticket, published[ticket.operation])
         try:
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
@@ -106,19 +97,25 @@ class Evaluator:
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
-    def published_before(self, start: Snapshot, batch: list[Ticket]) -> dict[str, RecordedOutcome]:
-        """Return the demands that are published but not answered, by operation id.
+    def published_before(self, tip: Oid, batch: list[Ticket]) -> list[Result]:
+        """Return the results of the demands that ``tip`` has, in the order of their commits.
 
-        This happens if the connection or the process ends after the remote accepted the push, or
-        if a sync failed. So what they rest on is written anew.
+        They have no answer if the connection or the process ended after the remote accepted the
+        push, or if a sync failed. So what they rest on is written anew.
         """
-        published: dict[str, RecordedOutcome] = {}
-        for base in {ticket.base for ticket in batch if ticket.maybe_published}:
-            found = operations_since(self._repository.objects, start.commit, base)
-            if any(ticket.operation in found for ticket in batch):
-                self._repository.write_anew(base)
-            published |= found
-        return published
+        sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
+        bases = dict.fromkeys(ticket.base for ticket in sought.values())
+        found = [(base, operations_since(self._repository.objects, tip, base)) for base in bases]
+        # they are on one line, so what was recorded since one of them has the rest
+        since, recorded = max(found, key=lambda each: len(each[1]), default=("", {}))
+        published = [operation for operation in reversed(recorded) if operation in sought]
+        if published:
+            self._repository.write_anew(since)
+        for operation in sought.keys() - published:
+            sought[operation].base = str(tip)
+        return [
+            (sought[one], _receipt_of_published(sought[one], recorded[one])) for one in published
+        ]
 
 
 def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt | DemandOpsError:

@@ -32,12 +32,14 @@ class RemoteMonitor:
     def __init__(self, address: str, runtime: Runtime) -> None:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
+        self._away_from = 0.0
 
     def record_unreachable(self, reason: str) -> None:
         """Record that the remote cannot be reached; warn if it could be before."""
         since = self.status.unreachable_since
         if since is None:
             log.warning("%s; trying again until it is back", reason)
+            self._away_from = self._runtime.monotonic()
         else:
             log.debug("%s", reason)
         since = since or self._runtime.now()
@@ -47,7 +49,7 @@ class RemoteMonitor:
         """Record that the remote was reached; log it if it could not be before."""
         now, before = self._runtime.now(), self.status
         if before.unreachable_since is not None:
-            away = (now - before.unreachable_since).total_seconds()
+            away = self._runtime.monotonic() - self._away_from
             log.info("%s is back after %.0f s", self._address, away)
         self.status = RemoteStatus(
             push_denied="" if pushed else before.push_denied,

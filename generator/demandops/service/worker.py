@@ -104,9 +104,7 @@ class Worker:
         batch: list[Ticket] = []
         try:
             self._demands.take(batch, self._batch_limit)
-            if not self._demands.has_waiting:  # else one of them may renew a lease
-                batch += self._lease_expiry.tickets(self.snapshot.state.ledger)
-            if batch:
+            if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
                 if self.snapshot.problems:  # a release may have made a change possible
                     self._try_to_carry_out_changes()
@@ -176,7 +174,9 @@ class Worker:
     # ---- publishing demands ----
 
     def _publish(self, batch: list[Ticket]) -> None:
-        """Publish a batch, with the demands that arrive during retries, and empty it.
+        """Publish a batch, with the demands that arrive during retries, and end leases.
+
+        The batch is empty then.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -184,7 +184,7 @@ class Worker:
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
-        while batch:
+        while batch or self._ended_leases(self.snapshot):
             self._require_time()
             try:
                 wait = self._attempt(batch, backoff)
@@ -229,16 +229,23 @@ class Worker:
             self._repository.refresh()
             self._must_fetch, self._tip_is_fresh = False, True
         self._demands.answer_withdrawn(batch)
-        part = batch[: backoff.max_demands]
+        tip = self._repository.tip()
+        results = self._evaluator.published_before(tip, batch)
+        published = {ticket for ticket, _ in results}
+        left = [ticket for ticket in batch if ticket not in published]
+        part, left = left[: backoff.max_demands], left[backoff.max_demands :]
         self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
+        if commits.start.commit != tip:
+            return None
         began = self._runtime.monotonic()
-        published = self._evaluator.published_before(commits.start, part)
-        results: list[Result] = []
         for ticket in part:
             self._require_time()
             self._approvals.withdraw_released(results, ticket, commits.head.state)
-            results.append((ticket, self._evaluator.evaluate(commits, ticket, published)))
+            results.append((ticket, self._evaluator.evaluate(commits, ticket)))
+        if not left:
+            for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
+                results.append((ticket, self._evaluator.evaluate(commits, ticket)))
         evaluated = self._runtime.monotonic()
         if commits.is_empty and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
@@ -246,16 +253,22 @@ class Worker:
             if self._repository.refresh() != commits.start.commit:
                 return None
         if self._publish_commits(commits, results):
-            del batch[: len(part)]
+            batch[:] = left
             backoff.published()
             return None
-        log.info("the state repo has moved; evaluating %d demands again", len(part))
+        log.info("the state repo has moved; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
         return backoff.overtaken(
-            len(part), evaluated - began, self._runtime.monotonic() - evaluated
+            len(results), evaluated - began, self._runtime.monotonic() - evaluated
         )
+
+    def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
+        """Return tickets that end leases; none while a demand waits, which may renew one."""
+        if self._rests or self._demands.has_waiting:
+            return []
+        return self._lease_expiry.tickets(snapshot.state.ledger)
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
         """Publish a commit batch and answer; return False if another writer was first.

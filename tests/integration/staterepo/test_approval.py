@@ -395,6 +395,40 @@ def test_a_branch_that_cannot_be_rebuilt_can_still_be_merged(
     assert rig.operations(bare) == ["op-1"]
 
 
+def test_what_a_branch_still_has_is_not_said_to_be_replaced(
+    bare: Path, url: str, petra: Person
+) -> None:
+    with rig.running(url, fetch_interval=0.1) as generator:
+        first = Proposed(generator, put("d", 1), "op-1")
+        branch = first.branch
+        rig.hook(bare, "update", 'case "$1" in refs/heads/demand/*) exit 1;; esac')
+        generator.submit(put("d", 2), "op-2")
+        failed = f"rebuilding {branch}"
+        rig.wait_until(lambda: failed in generator.failures, "the push is denied")
+        assert not first.ticket.future.done()
+        petra.merge(branch)
+        assert first.outcome() == "booked"
+    assert rig.operations(bare) == ["op-1"]
+
+
+def test_what_replaced_a_proposal_waits_on_after_two_restarts(
+    bare: Path, url: str, petra: Person
+) -> None:
+    with rig.running(url) as generator:
+        branch = Proposed(generator, put("d", 1), "op-1").branch
+        hook = rig.hook(bare, "update", 'case "$1" in refs/heads/demand/*) exit 1;; esac')
+        generator.submit(put("d", 2), "op-2")
+        rig.wait_until(lambda: generator.failures, "the push is denied")
+    hook.unlink()
+    before = git(bare, "rev-parse", branch)
+    with rig.running(url):
+        rig.wait_until(lambda: git(bare, "rev-parse", branch) != before, "it is rebuilt")
+    assert rig.restart(url)
+    petra.merge(branch)
+    assert rig.restart(url)
+    assert rig.operations(bare) == ["op-2"]
+
+
 def test_a_policy_that_asks_no_more_lets_what_waits_through(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1), "op-1")

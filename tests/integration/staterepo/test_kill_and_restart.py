@@ -188,6 +188,33 @@ def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
     assert rig.claims(bare) == [], "its requester has left since"
 
 
+@pytest.mark.parametrize("node", ["edge", "cloud"])
+def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
+    bare: Path, data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, node: str
+) -> None:
+    """It was unchanged or refused; the release behind it would let it be booked."""
+    synced, again = {}, goal(1)
+    again["apps"][0]["header"]["node_id"] = node
+
+    def sync(handle: int) -> None:
+        path = Path(f"/proc/self/fd/{handle}").readlink()
+        synced[path] = path.read_bytes()
+
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        monkeypatch.setattr(os, "fdatasync", sync)
+        ticket = generator.submit(again)
+        assert (ticket.future.exception(rig.PATIENCE_S) is None) == (node == "edge")
+        left = dict(synced)
+    with rig.running(bare, data=tmp_path / "another-machine") as other:
+        rig.book(other, leave(1))
+    (journal,) = data_home.glob("*/slot-0/outbox.jsonl")
+    journal.write_bytes(left[journal])
+
+    assert rig.restart(bare) is True
+    assert rig.claims(bare) == []
+
+
 # ---- what a kill leaves lying about ----
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -141,15 +142,30 @@ def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(
 def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     clock: Clock, bare: Path
 ) -> None:
-    now = clock.now()
-    leave_in_outbox(bare, "op-put", put("d", 60), now - timedelta(seconds=100))
-    assert rig.restart(bare)
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, put("d", 60))
     # the record says that it ended 40 s ago; the renewal came before, and no one could take it up
-    leave_in_outbox(bare, "op-renew", renew("d"), now - timedelta(seconds=50))
+    leave_in_outbox(bare, "op-renew", renew("d"), clock.now() + timedelta(seconds=50))
+    clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:
         rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")
         assert held(generator, "d")
     assert expiries(bare) == []
+
+
+def test_an_end_that_waits_while_the_clock_is_set_back_does_not_come(
+    clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
+    with rig.running(url, runtime=clock) as generator:
+        rig.book(generator, put("d"))
+        with rig.away(bare):
+            clock.pass_(61)
+            rig.wait_until(lambda: "trying again" in caplog.text, "it tries to end the lease")
+            clock.set_by(-3600)
+        rig.book(generator, put("other"))
+    assert expiries(bare) == []
+    assert re.search(r"is back after \d+ s", caplog.text)
 
 
 def test_what_another_generator_renewed_is_kept(

@@ -85,6 +85,26 @@ def _kinds(bare: Path) -> list[str]:
     return [commit.one("Operation") or "person" for commit in rig.commits(bare)]
 
 
+@pytest.mark.parametrize("deletes", [True, False], ids=["claims", "inventory"])
+def test_what_people_undo_of_another_generators_work_is_undone_in_its_files(
+    address: str, bare: Path, person: Person, tmp_path: Path, deletes: bool
+) -> None:
+    """For the first, nothing differs between what it saw last and what people made of it."""
+    with rig.running(address) as first, rig.running(address, data=tmp_path / "other") as second:
+        rig.book(first, goal(3))
+        rig.book(second, goal(3))
+        if not deletes:
+            _move_broker(person)
+        rig.book(second, goal(1))
+        if deletes:
+            _delete_claims(bare)(person)
+        else:
+            person.edit(BROKERS, "broker-of-the-edge", "service-mqtt-broker-edge")
+        rig.book(first, goal(2))
+    rig.assert_sound(bare)
+    assert rig.books(bare) == rig.books_after(map(goal, (3, 2) if deletes else (3, 1, 2)))
+
+
 @EITHER
 def test_an_edited_readme_is_kept_and_asks_for_no_commit_of_its_own(
     address: str, bare: Path, person: Person, running: bool

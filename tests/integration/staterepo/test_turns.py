@@ -7,6 +7,8 @@ import threading
 from pathlib import Path
 
 from demandops.service import Generator
+from demandops.staterepo.write.journal import JournalEntry
+from demandops.staterepo.write.slot import Slot
 
 from tests.kit import rig
 from tests.kit.turns import Turns
@@ -29,6 +31,26 @@ def history(seed: int, template: Path, folder: Path) -> list[str]:
     assert threading.active_count() == threads
     rig.assert_sound(bare)
     return [commit.id for commit in rig.commits(bare)]
+
+
+def test_resumed_demands_are_answered_in_the_order_of_their_commits(
+    bare: Path, tmp_path: Path
+) -> None:
+    base = rig.tip(bare)
+    with rig.running(bare) as generator:
+        rig.receipt(generator.submit(rig.goal(2), "op-2"))
+    # as if its answer had been lost with the process, and op-1 had not been published
+    slot, turns, answered = Slot(tmp_path), Turns(1), []
+    slot.journal.append(
+        JournalEntry(f"op-{number}", rig.goal(number), turns.now().isoformat(), base)
+        for number in (1, 2)
+    )
+    slot.close()
+    generator = Generator(str(bare), data=tmp_path, runtime=turns)
+    for operation, ticket in generator._demands._tickets.items():
+        ticket.future.add_done_callback(lambda _, operation=operation: answered.append(operation))
+    turns.wait(generator.stop().done)
+    assert answered == rig.operations(bare) == ["op-2", "op-1"]
 
 
 def test_a_seed_decides_what_is_committed(bare_template: Path, tmp_path: Path) -> None:

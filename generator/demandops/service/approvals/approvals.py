@@ -20,9 +20,9 @@ from demandops.errors import DemandOpsError, InvalidInput, Refused, ShuttingDown
 from demandops.quoting import quoted
 from demandops.service.approvals.forge_worker import ForgeWorker
 from demandops.service.approvals.proposal import (
-    Decided,
     Key,
     Proposal,
+    Verdict,
     admit_or_none,
     decide_in_turn,
     is_release,
@@ -95,13 +95,15 @@ class Approvals:
             self._resume(ticket, admit_or_none(state, ticket.goal))
 
     def _resume(self, ticket: Ticket, request: DemandRequest | None) -> None:
-        record = ticket.proposal or ProposalRecord("")
+        record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
         proposal = next((p for p in self._proposals.values() if p.branch == record.branch), None)
         if proposal is None:
             key = key_of(request) if request else ("operation", ticket.operation)
             if key in self._proposals:  # an earlier run proposed the same demand
                 key = ("operation", ticket.operation)
             proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
+        if ticket.state == "proposed":  # what was withdrawn has an older record
+            proposal.record = record
         proposal.tickets.append(ticket)
         proposal.requests += [request] if request else []
         self._changed.append(proposal.branch)
@@ -263,20 +265,21 @@ class Approvals:
         ]
         self._demands.answer(booked)
         proposal.drop(booked)
-        if not verdict.waiting and (not booked or head in proposal.record.commits):
+        if verdict.waiting:
+            if booked and not head:  # only a part was merged
+                proposal.record = replace(proposal.record, pushed=False)
+            if not self._leave_out(proposal, verdict, snapshot, head):
+                self._changed.append(proposal.branch)
+                return
+            proposal.checked_at = tip
+        elif not booked or head in proposal.record.commits:
             self._delete_branch(proposal, heads)
+        # the branch has none of these any more, so nobody can merge them
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
-        proposal.wait_for(verdict.waiting)
         if not verdict.waiting:
+            proposal.wait_for([])
             self._forget(proposal, close=not booked)
-            return
-        if booked and not head:  # only a part was merged
-            proposal.record = replace(proposal.record, pushed=False)
-        if self._update(proposal, verdict.waiting, snapshot, head):
-            proposal.checked_at = tip
-        else:
-            self._changed.append(proposal.branch)
 
     def _receipt(
         self,
@@ -294,7 +297,24 @@ class Approvals:
 
     # ---- the branch and its pull request ----
 
-    def _update(self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str) -> bool:
+    def _leave_out(
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
+    ) -> bool:
+        """Update the branch for the demands that still need approval; the others leave it.
+
+        Returns:
+            False if the proposal must be checked again; then it still has all of them.
+        """
+        before, is_updated = proposal.tickets, False
+        proposal.wait_for(verdict.waiting)
+        try:
+            is_updated = self._update(proposal, verdict, snapshot, head)
+        finally:
+            if not is_updated:
+                proposal.tickets = [ticket for ticket in before if ticket.state != "done"]
+        return is_updated
+
+    def _update(self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str) -> bool:
         """Update the branch, so that merging it gives what main would render now.
 
         Returns:
@@ -304,7 +324,7 @@ class Approvals:
             if not proposal.edited:
                 log.info("%s has commits by a person and stays unchanged", proposal.branch)
             proposal.edited = True
-        elif not self._bring_up_to_date(proposal, left, snapshot, head):
+        elif not self._bring_up_to_date(proposal, verdict, snapshot, head):
             return False
         forge = snapshot.state.config.repo_settings.proposals
         if forge.forge in ("github", "gitea"):
@@ -320,15 +340,13 @@ class Approvals:
         return True
 
     def _bring_up_to_date(
-        self, proposal: Proposal, left: Decided, snapshot: Snapshot, head: str
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
         """Commit the demands on main and push the branch, unless it is up to date."""
         commits = CommitBatch(self._repository, snapshot)
-        steps, failed = decide_in_turn(left, snapshot.state, commits.read)
-        self._demands.answer(failed)
+        steps, failed = decide_in_turn(verdict.waiting, snapshot.state, commits.read)
+        verdict.failed.extend(failed)
         proposal.drop(failed)
-        if not steps:
-            return False
         old, tip = proposal.record, snapshot.commit
         files = {path: text for _, step in steps for path, text in step.files.items()}
         if head and self._branches.is_up_to_date(tip, head, old.base, files):

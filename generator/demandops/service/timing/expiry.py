@@ -42,19 +42,22 @@ class LeaseExpiry:
         self._tried: dict[str, datetime] = {}
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, unless it was just tried."""
+        """Return a ticket for each demand whose lease has ended, unless one was just answered.
+
+        They are for this ledger and this moment: another may show that a lease was renewed or that
+        the clock was set.
+        """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
         # forget what was released or renewed meanwhile
         self._tried = {d: at for d, at in self._tried.items() if at > now - _RETRY and d in ended}
-        demands = [demand for demand in ended if demand not in self._tried]
-        self._tried |= dict.fromkeys(demands, now)
-        return [self._ticket(demand, now) for demand in demands]
+        return [self._ticket(demand, now) for demand in ended if demand not in self._tried]
 
     def _ticket(self, demand: str, now: datetime) -> Ticket:
         ticket = Ticket(self._runtime.fresh_id(), Expire(id=demand, demand=demand), now)
 
         def tell(future: Future[Receipt]) -> None:
+            self._tried[demand] = now
             error = future.exception()
             if isinstance(error, InvalidInput):  # nobody else gets it as an answer
                 self._runtime.failed(f"end of the lease of {quoted(demand)}", error)

@@ -33,6 +33,9 @@ from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
 
+ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
+"""The folders and files that a snapshot is read from."""
+
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
@@ -123,7 +126,7 @@ def advance(
         known = _last_valid_config(repo, before, to)
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
-    config_changed = world_changed or _has_manual_edit(repo, before.commit, to)
+    config_changed = world_changed or _must_render_all(repo, before.commit, to)
     ledger = replace(state.ledger, ended=ended, shutdowns=_shutdowns(old, new, state.ledger))
     state = State.of(config, ledger) if known.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
@@ -162,10 +165,20 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
     return shutdowns
 
 
-def _has_manual_edit(repo: Repository, before: Oid, to: Oid) -> bool:
+def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
+    """Return whether what differs since ``before`` does not tell which generated files must change.
+
+    They fit the newest commit of a generator. After it, people may have edited them, or undone what
+    another generator did since ``before``.
+    """
+    people = list(commit_log.person_commits(repo, to, before))
+    if not people or people[0].id != to:
+        return False
+    is_alone = len(people) == sum(1 for _ in commit_log.commits(repo, to, before))
+    roots = GENERATED_ROOTS if is_alone else (*GENERATED_ROOTS, *ROOTS)
     return any(
-        trees.differ(commit.parents[0].tree, commit.tree, GENERATED_ROOTS)
-        for commit in commit_log.person_commits(repo, to, before)
+        trees.differ(commit.parents[0].tree, commit.tree, roots)
+        for commit in people
         if commit.parents
     )
 
@@ -228,11 +241,13 @@ class ReadAhead:
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
         if known.snapshot.commit != tip or known.snapshot.problems:
-            more = advance(repo, known.snapshot, tip)
+            more, start = advance(repo, known.snapshot, tip), known.snapshot.commit
             known = Advance(
                 more.snapshot,
                 tuple(dict.fromkeys((*known.subjects, *more.subjects))),
-                known.config_changed or more.config_changed,
+                known.config_changed
+                or more.config_changed
+                or (start != before.commit and _must_render_all(repo, before.commit, tip)),
             )
         self._known, self._start = known, before.commit
         return known

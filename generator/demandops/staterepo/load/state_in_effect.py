@@ -20,7 +20,6 @@ from urllib.parse import quote, unquote
 
 from pygit2 import Oid, Repository, Tree
 
-from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import State, changeset_of_edit, policy_faults_of_edit, rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
@@ -40,7 +39,6 @@ _NONE = "none"
 _HELD_BACK = "Held-Back"
 _TO_CHECK = Fault("invalid", "", "must be checked again")
 """A placeholder: advancing to later commits finds the real problems again."""
-_ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
@@ -106,7 +104,7 @@ def start_at(
         except (InvalidInput, StateRepoError) as error:  # a record that is not ours
             faults.append(error)
     for ancestor in commit_log.first_parents(repo, record.commit):
-        content = tuple(trees.entry_id(ancestor.tree, root) for root in _ROOTS)
+        content = tuple(trees.entry_id(ancestor.tree, root) for root in snapshots.ROOTS)
         if content not in tried:
             tried.add(content)
             try:
