@@ -7,6 +7,7 @@ has already: a loose object may not be on the disk yet, or about to be pruned.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -27,6 +28,8 @@ _LAST = 0
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
+"""What file systems answer that have no hard links, or no more of them."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -82,7 +85,7 @@ class NewObjects(pygit2.OdbBackend):
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
         """Build a pack and place it before its index: git removes an index without a pack.
 
-        Its .keep is a link to the index, so it needs no sync and :meth:`clean` knows it.
+        Its .keep begins like the index, so :meth:`clean` knows it.
         """
         packs = self._packs
         with (
@@ -96,7 +99,7 @@ class NewObjects(pygit2.OdbBackend):
             keep = placed.with_suffix(".keep")
             keep.unlink(missing_ok=True)
             try:
-                keep.hardlink_to(built.with_suffix(".idx"))
+                _mark(keep, built.with_suffix(".idx"))
                 built.replace(placed)
                 built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
                 sync_folder(packs)
@@ -133,8 +136,7 @@ class NewObjects(pygit2.OdbBackend):
         )  # fmt: skip
         if done.returncode:
             raise pygit2.GitError(done.stderr.strip())
-        (pack,) = Path(folder).glob("*.pack")
-        return pack
+        return _pack_in(folder)
 
     def _build_pack(self, folder: str, needed: list[Oid]) -> Path:
         """Build a pack and its index; libgit2 syncs both, and raises if that fails."""
@@ -143,8 +145,7 @@ class NewObjects(pygit2.OdbBackend):
         for oid in needed:
             builder.add(oid)
         builder.write(folder)
-        (pack,) = Path(folder).glob("*.pack")
-        return pack
+        return _pack_in(folder)
 
     def _needed_by(self, commit: Oid) -> list[Oid]:
         needed, queue = dict[Oid, None](), [commit]
@@ -209,6 +210,30 @@ def _locked(folder: Path, how: int) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def _pack_in(folder: str) -> Path:
+    """Return the only pack in a folder. Unlike glob, raise if the folder cannot be read."""
+    (pack,) = [path for path in Path(folder).iterdir() if path.suffix == ".pack"]
+    return pack
+
+
+def _mark(keep: Path, index: Path) -> None:
+    """Make the .keep of a pack: a link to its index, which is synced already.
+
+    Where a file system has no hard links it is a file, synced before it has its name.
+    """
+    try:
+        keep.hardlink_to(index)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        made = index.with_suffix(".keep")
+        with made.open("wb") as file:
+            file.write(_INDEX)
+            file.flush()
+            os.fsync(file.fileno())
+        made.replace(keep)
 
 
 def sync_folder(folder: Path) -> None:
