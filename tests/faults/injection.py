@@ -52,7 +52,7 @@ _TRIES = 3
 """How often to count the calls again if one is missed."""
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls of a demand, by the folder in which this process books it."""
-_HIDDEN = ("not a Git repository", "checked out", "cannot be read")
+_HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """What is said if libgit2 does not say why it could not read a file."""
 
 

@@ -25,7 +25,7 @@ from demandops.staterepo.git.repository import (
     PushDenied,
     StateRepository,
     Unavailable,
-    disk_error,
+    access_error,
 )
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
@@ -118,7 +118,7 @@ class Worker:
             if not self._rests:
                 self._check_proposals()
         except Exception as error:
-            self._fail(batch, disk_error(error, self._repository.address) or error)
+            self._fail(batch, access_error(error, self._repository.address))
         else:
             if not self._rests:
                 self._rest = _FIRST_REST_S
@@ -189,7 +189,7 @@ class Worker:
             try:
                 wait = self._attempt(batch, backoff)
             except Exception as error:
-                reason = disk_error(error, self._repository.address) or error
+                reason = access_error(error, self._repository.address)
                 if isinstance(reason, PushDenied):
                     self.remote.record_push_denied(str(reason))
                 if not isinstance(reason, Unavailable):
