@@ -27,6 +27,8 @@ from tests.faults.injection import Result
 from tests.faults.rig import Rig
 
 WORKERS = 2
+MEMORY = Path("/dev/shm")
+"""A disk on which a sync takes no time; what a sync means is the traces' part."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
 _RIGS: dict[tuple[bool, bool], Rig] = {}
 _FOLDER, _SHORT = Path(), True
@@ -51,13 +53,15 @@ def main() -> int:
         import_module(module.name)
     began = time.monotonic()
     results: list[Result] = []
-    with tempfile.TemporaryDirectory(prefix="demandops-faults-") as folder:
+    fast = MEMORY if MEMORY.is_dir() else None
+    with tempfile.TemporaryDirectory(prefix="demandops-faults-", dir=fast) as folder:
         tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
         print(f"{len(tasks)} tasks", flush=True)
         start = (Path(folder), not chosen.long)
         with get_context("fork").Pool(WORKERS, _start, start) as pool:
             for found in pool.imap_unordered(_run, tasks):
                 results += found
+                _tell_problems(found)
     _report(results, time.monotonic() - began)
     return int(any(result.problems for result in results))
 
@@ -117,6 +121,13 @@ def _results(task: _Task) -> list[Result]:
     return [injection.run(rig, *task.what)]
 
 
+def _tell_problems(results: list[Result]) -> None:
+    for result in results:
+        for problem in result.problems:
+            where = " ".join(result.where)
+            print(f"VIOLATED {result.part} {where} {result.fault}: {problem}", flush=True)
+
+
 def _report(results: list[Result], seconds: float) -> None:
     by_class: dict[str, Counter[str]] = {}
     for result in results:
@@ -130,9 +141,6 @@ def _report(results: list[Result], seconds: float) -> None:
     for name, verdicts in sorted(by_class.items()):
         told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
         print(f"{name}: {told}")
-    for result in results:
-        for problem in result.problems:
-            print(f"VIOLATED {result.part} {' '.join(result.where)} {result.fault}: {problem}")
     wrong = sum(bool(result.problems) for result in results)
     print(f"{len(results)} faults and states, {wrong} with a violation, {seconds:.0f} s")
 

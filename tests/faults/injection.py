@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tests.faults.invariants import DEMAND, after_fault, after_restart
-from tests.faults.rig import Rig, Strace
+from tests.faults.rig import PLENTY_S, Rig, Strace
 from tests.faults.trace import Call, file_class, parse
 
 EVERYTHING = "trace=%file,%desc,%process"
@@ -52,8 +52,8 @@ _TRIES = 3
 """How often to count the calls again if one is missed."""
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls of a demand, by the folder in which this process books it."""
-_HIDDEN = ("not a Git repository", "checked out")
-"""What is said if libgit2 takes a file that it cannot read for one that is not there."""
+_HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
+"""What is said if libgit2 does not say why it could not read a file."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Result:
 def sites(rig: Rig) -> list[Site]:
     """Book one demand under strace, and return its calls."""
     rig.restore()
-    ran = rig.must(rig.book(DEMAND, Strace(["-f", "-s", "64", "-e", EVERYTHING])))
+    ran = rig.must(rig.book(DEMAND, Strace(["-f", "-s", "64", "-e", EVERYTHING]), PLENTY_S))
     found, counts = [], Counter[object]()
     for call in parse(ran.trace, ran.roles, rig.folder):
         site = _site(call, rig)

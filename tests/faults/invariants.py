@@ -51,7 +51,7 @@ def after_restart(
         journaled: the demand is in the journal, so it must be booked.
         clones: the clones must be whole too.
     """
-    found = rig.book(NEXT, limit=15.0)
+    found = rig.book(NEXT, limit=2 * rig.limit)
     if not found.commit:
         last = found.err.strip().splitlines()[-1:] or [found.out]
         yield f"the next start fails: exit code {found.code} {found.hangs} {last[0]}"

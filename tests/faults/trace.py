@@ -13,6 +13,14 @@ _LINE = re.compile(r"(\d+) +(.*)")
 _CALL = re.compile(r"(\w+)\((.*)\) += (-?\d+|\?|0x[0-9a-f]+)(.*)", re.DOTALL)
 _TEXT = re.compile(r'"((?:[^"\\]|\\.)*)"')
 _FILE = re.compile(r"(?:AT_FDCWD|\d+)<((?:[^>\\]|\\.)*)>")
+_NAME_IN = re.compile(rf"{_FILE.pattern}, {_TEXT.pattern}")
+_AT = {
+    "execveat", "faccessat", "faccessat2", "fchmodat", "fchownat", "linkat", "mkdirat",
+    "newfstatat", "openat", "readlinkat", "renameat", "renameat2", "statx", "symlinkat",
+    "unlinkat", "utimensat",
+}  # fmt: skip
+"""The calls that name a file in a folder that is open."""
+_TWO_NAMES = {"link", "linkat", "rename", "renameat", "renameat2", "symlink"}
 _FORKS = ("clone", "clone3", "fork", "vfork")
 _RANDOM = (
     (re.compile(r"\b[0-9a-f]{2}/[0-9a-f]{38}\b"), "??/*"),
@@ -80,7 +88,9 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
         if "faults-begin" in arguments:
             counts = {key: n for key, n in counts.items() if key[0] != process}
         counts[process, kind] = n = counts.get((process, kind), 0) + 1
-        paths = [os.path.normpath(path) for path in _paths(arguments, folders.get(process, "/"))]
+        paths = [
+            os.path.normpath(path) for path in _paths(kind, arguments, folders.get(process, "/"))
+        ]
         if kind == "execve" and result.startswith("0"):
             roles[process] = _program(arguments, roles.get(process, ""))
             if roles[process].startswith("git ") and " > " not in roles[process]:
@@ -129,26 +139,24 @@ def _program(arguments: str, before: str) -> str:
     return f"{command} > {name}" if command.startswith("git ") else name
 
 
-def _paths(arguments: str, folder: str) -> list[str]:
-    """Return the paths of the files that a call names, by name or by number."""
-    annotated = [_decoded(each).decode(errors="replace") for each in _FILE.findall(arguments)]
-    named = [
-        _decoded(each).decode(errors="replace")
-        for each in _TEXT.findall(arguments)
-        if "\\0" not in each
-    ]
-    first = arguments.lstrip()
-    if first.startswith('"'):
-        return [each if each.startswith("/") else f"{folder}/{each}" for each in named[:2]]
-    if first.startswith("AT_FDCWD") or (re.match(r'\d+<[^>]*>, "', first) and _is_at(arguments)):
-        base = annotated[0] if annotated else folder
-        return [each if each.startswith("/") else f"{base}/{each}" for each in named[:2]]
-    return [each for each in annotated if each.startswith("/")]
+def _paths(kind: str, arguments: str, folder: str) -> list[str]:
+    """Return the paths of the files that a call names, by name or by number.
+
+    What is in quotes may be any bytes that are read or written, so only the kind of a call says
+    whether it is a name.
+    """
+    if kind in _AT:
+        named = [Path(_name(base), _name(name)) for base, name in _NAME_IN.findall(arguments)]
+    elif arguments.startswith('"'):
+        named = [Path(folder, _name(name)) for name in _TEXT.findall(arguments)]
+    else:
+        numbered = map(_name, _FILE.findall(_TEXT.sub("", arguments)))
+        return [path for path in numbered if path.startswith("/")]
+    return [str(path) for path in named[: 2 if kind in _TWO_NAMES else 1]]
 
 
-def _is_at(arguments: str) -> bool:
-    """Whether a text after a folder is a name in it, and not what is written or read."""
-    return "O_" in arguments or "AT_" in arguments
+def _name(text: str) -> str:
+    return _decoded(text).decode(errors="replace")
 
 
 def _decoded(text: str) -> bytes:

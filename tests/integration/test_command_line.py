@@ -570,7 +570,9 @@ class TestStateRepo:
         url = "https://somebody:hunter2@127.0.0.1:1/x.git?hunter2"
         ran = demandops("-v", *command.split(), "--state-repo", url, stdin=text(perception()))
         assert (ran.code, ran.out) == (1, "")
-        assert ran.err.startswith("error: the state repo's address holds a password, which ")
+        assert ran.err.startswith(
+            "error: the state repo's address holds a password or token, which "
+        )
         assert "hunter2" not in ran.err
         for path in data_home.rglob("*"):
             assert "hunter2" not in path.name

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from demandops.staterepo.git.signing import Signer, SigningFailed
 
+from tests.kit import rig
 from tests.kit.goals import connection, goal
 from tests.kit.repo import FORGER, branches, git
 
@@ -131,6 +132,27 @@ def test_every_command_that_writes_signs(
     assert len(set(made)) == 5
     for commit in made:
         assert git_says(state, listed(key), tmp_path, commit).returncode == 0
+
+
+def test_a_generator_without_a_key_warns_once_where_keys_are_listed(
+    bare: Path, state: Any, key: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    warning = (
+        "policy/allowed-signers lists who may sign, but this generator has no key; `verify` will "
+        "refuse its commits, and generators will take them for a person's: start it with "
+        "--signing-key"
+    )
+    with rig.running(bare) as generator:
+        rig.book(generator, rig.goal(1))
+        assert warning not in caplog.messages
+        state.commit({SIGNERS: listed(key)})
+        rig.book(generator, rig.goal(2), rig.goal(3))
+        assert caplog.messages.count(warning) == 1
+    with rig.running(bare, signing_key=key) as generator:
+        rig.book(generator, rig.goal(4))
+    assert caplog.messages.count(warning) == 1
+    with rig.running(bare):
+        assert caplog.messages.count(warning) == 2
 
 
 class TestProposals:

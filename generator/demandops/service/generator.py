@@ -19,7 +19,7 @@ from demandops.service.remote_status import RemoteStatus
 from demandops.service.ticket import Listener, Ticket
 from demandops.service.worker import Worker
 from demandops.staterepo.git.address import connect
-from demandops.staterepo.git.repository import disk_error
+from demandops.staterepo.git.repository import access_error
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
@@ -73,7 +73,7 @@ class Generator:
         try:
             self._slot = Slot(data or settings.data_home(state_repo))
         except OSError as error:
-            raise disk_error(error, f"the data folder of {state_repo}") or error from None
+            raise access_error(error, f"the data folder of {state_repo}") from None
         try:
             repository = connect(
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
@@ -87,8 +87,9 @@ class Generator:
                 snapshot = state_in_effect.first_snapshot(repository, progress)
         except BaseException as error:
             self._slot.close()
-            told = disk_error(error, state_repo) if isinstance(error, Exception) else None
-            raise told or error from None
+            if isinstance(error, Exception):
+                raise access_error(error, state_repo) from None
+            raise
         self._repository, self._runtime = repository, runtime
         self.given_address = state_repo
         self.address = repository.address

@@ -25,8 +25,9 @@ from demandops.staterepo.git.repository import (
     PushDenied,
     StateRepository,
     Unavailable,
-    disk_error,
+    access_error,
 )
+from demandops.staterepo.history import allowed_signers
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
 
@@ -74,7 +75,9 @@ class Worker:
         self._packs_since_tidy = 0
         self._logged: frozenset[Fault] = frozenset()
         self._ends_soon = self._runtime.event()
+        self._warned_of_signers = False
         self._rest, self._rests_until = _FIRST_REST_S, self._runtime.monotonic()
+        self._warn_if_unsigned()
 
     # ---- from any thread ----
 
@@ -116,7 +119,7 @@ class Worker:
             if not self._rests:
                 self._check_proposals()
         except Exception as error:
-            self._fail(batch, disk_error(error, self._repository.address) or error)
+            self._fail(batch, access_error(error, self._repository.address))
         else:
             if not self._rests:
                 self._rest = _FIRST_REST_S
@@ -189,7 +192,7 @@ class Worker:
             try:
                 wait = self._attempt(batch, backoff)
             except Exception as error:
-                reason = disk_error(error, self._repository.address) or error
+                reason = access_error(error, self._repository.address)
                 if isinstance(reason, PushDenied):
                     self.remote.record_push_denied(str(reason))
                 if not isinstance(reason, Unavailable):
@@ -390,8 +393,22 @@ class Worker:
         before, self.snapshot = self.snapshot, snapshot
         if snapshot.commit != before.commit:  # a merge may need no commit of the generator
             self._packs_since_tidy += 1
+            self._warn_if_unsigned()
             for listener in self.listeners:
                 listener(snapshot.state.config)
+
+    def _warn_if_unsigned(self) -> None:
+        """Warn, once, if people list signing keys and this generator has none."""
+        if self._repository.signer is not None or self._warned_of_signers:
+            return
+        if allowed_signers.are_listed(self._repository.objects, self.snapshot.commit):
+            self._warned_of_signers = True
+            log.warning(
+                "%s lists who may sign, but this generator has no key; `verify` will refuse its "
+                "commits, and generators will take them for a person's: start it with "
+                "--signing-key",
+                allowed_signers.ALLOWED_SIGNERS,
+            )
 
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""

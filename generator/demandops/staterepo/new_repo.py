@@ -67,6 +67,7 @@ def _write(
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
+    repo.config["receive.fsckObjects"] = True  # libgit2 cannot read all that git pushes
     repo.config["gc.auto"] = 0  # the generator joins the packs, beside its work
     objects = NewObjects(repo)
     tree = trees.write(objects, None, content)

@@ -14,11 +14,16 @@ from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import Runtime
 from demandops.service import Generator
 from demandops.staterepo import reader
-from demandops.staterepo.git.repository import DiskFull, PushDenied, disk_error
+from demandops.staterepo.git.repository import (
+    DiskFull,
+    PushDenied,
+    StateRepository,
+    disk_error,
+)
 
 from tests.kit import rig
 from tests.kit.limits import files_end_at
-from tests.kit.repo import tip
+from tests.kit.repo import git, tip
 from tests.kit.rig import Person, Stages, goal
 
 
@@ -38,6 +43,20 @@ def test_an_error_of_a_disk_is_known_by_number_or_text(number: int, kind: type) 
     of_libgit2 = OSError(f"failed to write out file: {os.strerror(number)}")
     for error in (of_python, of_libgit2):
         assert type(disk_error(error, "fleet.git")) is kind
+
+
+def test_a_folder_that_cannot_be_used_is_no_fault_of_the_program(
+    bare: Path, tmp_path: Path
+) -> None:
+    slot = tmp_path / "data" / "slot-0"
+    slot.parent.mkdir()
+    slot.write_text("")
+    with pytest.raises(StateRepoError) as error:
+        Generator(str(bare), data=slot.parent)
+    assert str(error.value) == (
+        f"the data folder of {bare} cannot be read: [Errno 17] File exists: '{slot}'; check its "
+        "disk and its files, then try again"
+    )
 
 
 def test_a_full_disk_keeps_demands_waiting_until_there_is_room(
@@ -88,6 +107,39 @@ class _Broken:
         return getattr(self._repo, name)
 
 
+def test_a_demand_on_main_is_not_refused_because_its_folder_could_not_be_synced(bare: Path) -> None:
+    with rig.running(bare) as generator:
+
+        def deny(stage: str, text: str) -> None:
+            if stage == "committed":
+                generator._repository.objects = _Moved(generator._repository)
+
+        ticket = generator.submit(goal(1), "op-1", deny)
+        assert rig.receipt(ticket).commit == tip(bare)
+    assert rig.operations(bare) == ["op-1"]
+
+
+class _Moved:
+    """A repository whose branch moves once, and the sync of its folder is not allowed then."""
+
+    def __init__(self, repository: StateRepository) -> None:
+        self._repository, self._objects = repository, repository.objects
+        self.references = {repository.main_reference: self}
+
+    @property
+    def target(self) -> pygit2.Oid:
+        return self._objects.references[self._repository.main_reference].target
+
+    def set_target(self, *arguments: str) -> None:
+        repository = self._repository
+        repository.objects = self._objects
+        repository.objects.references[repository.main_reference].set_target(*arguments)
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._objects, name)
+
+
 def test_a_lock_that_is_no_file_is_told_and_not_waited_for_in_silence(bare: Path) -> None:
     with rig.running(bare) as generator:
         stages = Stages()
@@ -103,11 +155,15 @@ def test_a_lock_that_is_no_file_is_told_and_not_waited_for_in_silence(bare: Path
 
 
 def _commit_by_hand(
-    bare: Path, tree: pygit2.Oid | None = None, time: int = 1_770_000_000, more: str = ""
+    bare: Path,
+    tree: pygit2.Oid | None = None,
+    time: int = 1_770_000_000,
+    more: str = "",
+    people: str = "",
 ) -> None:
     """Commit what no library would write."""
     repo, parent = pygit2.Repository(str(bare)), tip(bare)
-    people = f"Petra <petra@example.org> {time} +0000"
+    people = people or f"Petra <petra@example.org> {time} +0000"
     text = (
         f"tree {tree or repo[parent].peel(pygit2.Tree).id}\nparent {parent}\nauthor {people}\n"
         f"committer {people}\n{more}\nHello\n"
@@ -141,6 +197,29 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
         rig.book(generator, goal(3))
         rig.wait_until(lambda: "writer" not in generator.failures, "it works again")
     rig.assert_sound(bare)
+
+
+def test_a_commit_that_cannot_be_read_is_told_and_refused_at_a_push(
+    bare: Path, tmp_path: Path
+) -> None:
+    git(tmp_path, "clone", "--quiet", "--bare", str(bare), "clone.git")
+    _commit_by_hand(tmp_path / "clone.git", people="Petra 1770000000 +0000")  # without an address
+    push = ("push", "--quiet", str(bare), "main:main")
+    made = tip(tmp_path / "clone.git")
+    with pytest.raises(AssertionError, match=f"object {made}: missingEmail"):
+        git(tmp_path / "clone.git", *push)
+    with rig.running(bare) as generator:
+        good = tip(bare)
+        git(bare, "config", "receive.fsckObjects", "false")  # as most servers have it
+        git(tmp_path / "clone.git", *push)
+        with pytest.raises(StateRepoError) as error:
+            rig.receipt(generator.submit(goal(1)))
+        assert str(error.value) == (
+            f"commit {made}: failed to parse signature - malformed e-mail; set the branch back to "
+            "the commit before it"
+        )
+        git(bare, "update-ref", "refs/heads/main", good)
+        rig.book(generator, goal(2))
 
 
 def test_a_commit_in_an_unknown_encoding_is_like_any_other(bare: Path) -> None:

@@ -90,10 +90,23 @@ def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> N
         LocalRepository(tmp_path / "borrows.git")
 
 
-@pytest.mark.parametrize("text", ["", "x" * 40 + "\n"])
-def test_a_repo_whose_branch_is_damaged_is_called_so(bare: Path, text: str) -> None:
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("", "refs/heads/main: corrupted loose reference file: refs/heads/main"),
+        ("x" * 40 + "\n", "refs/heads/main: corrupted loose reference file: refs/heads/main"),
+        ("1" * 40 + "\n", f"its commit {'1' * 40} is not there"),
+    ],
+)
+def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(
+    bare: Path, text: str, what: str
+) -> None:
     branch = bare / "refs/heads/main"
     branch.parent.mkdir(exist_ok=True)
     branch.write_text(text)
-    with pytest.raises(StateRepoError, match=r"state\.git is damaged: .*fsck"):
+    with pytest.raises(StateRepoError) as error:
         LocalRepository(bare)
+    assert str(error.value) == (
+        f"{bare} cannot be read: {what}; check its disk, and if `git -C {bare} fsck` finds it "
+        "broken, restore it from a backup or a clone"
+    )

@@ -53,8 +53,8 @@ def test_a_folder_that_exists_wins_over_what_its_name_looks_like(
 
 
 HIDDEN = (
-    "the state repo's address holds a password, which process lists would show; remove it and "
-    "use a credential helper, ~/.netrc or an SSH key"
+    "the state repo's address holds a password or token, which process lists would show; "
+    "remove it and use a credential helper, ~/.netrc or an SSH key"
 )
 SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or file"
 
@@ -71,6 +71,14 @@ SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or 
         ("https://user:sec@ret@example.org/state.git", HIDDEN),
         ("http://user:secret@127.0.0.1/state.git", HIDDEN),
         ("ssh://git:secret@example.org/state.git", HIDDEN),
+        # a token as the name; the sixth is of Gitea, the last of Azure DevOps
+        (f"https://ghp_{'secret1' * 5}@github.com/team/state.git", HIDDEN),
+        (f"https://github_pat_{'secret1' * 9}@github.com/team/state.git", HIDDEN),
+        ("https://glpat-secret@gitlab.com/team/state.git", HIDDEN),
+        ("https://glptt-secret@gitlab.com/team/state.git", HIDDEN),
+        ("https://ATBBsecret@bitbucket.org/team/state.git", HIDDEN),
+        (f"https://{'5ec4e7' * 7}@git.example.org/team/state.git", HIDDEN),
+        (f"https://{'secret1' * 8}@dev.azure.com/team/project/_git/state", HIDDEN),
         # remote helpers that run commands
         ("ext::sh -c touch% evil", "a state repo's address cannot start with"),
         ("ext::sh -c touch% evil% ://", "a state repo's address cannot start with"),
@@ -116,10 +124,13 @@ def test_secrets_are_taken_out_of_whatever_is_shown(text: str, wanted: str) -> N
     assert without_secrets(text) == wanted
 
 
-def test_neither_address_nor_error_shows_a_token(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", ["git", "x-access-token", "petra.platform", "team-of-2026-with-quite-a-long-name"]
+)
+def test_a_name_in_an_address_is_accepted_and_not_shown(tmp_path: Path, name: str) -> None:
     with pytest.raises(RemoteAway) as error:
-        connect("http://token-s3cr3t@127.0.0.1:9/state.git", tmp_path / "data")
-    assert "s3cr3t" not in str(error.value)
+        connect(f"http://{name}@127.0.0.1:9/state.git", tmp_path / "data")
+    assert f"{name}@" not in str(error.value)
     assert str(error.value).startswith("http://127.0.0.1:9/state.git cannot be fetched: ")
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import pygit2
+import pytest
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.new_objects import NewObjects
 from hypothesis import given
@@ -148,7 +151,15 @@ def test_a_submodule_has_no_text_and_is_told_as_a_difference(repo: pygit2.Reposi
     assert [path for path, _ in trees.differences(None, tree)] == ["top/f", "top/sub"]
 
 
-def test_housekeeping_keeps_a_pack_that_no_reference_leads_to_yet(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_links", [True, False])
+def test_housekeeping_keeps_a_pack_that_no_reference_leads_to_yet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
+) -> None:
+    def link(*_: object) -> None:
+        raise OSError(errno.EPERM, os.strerror(errno.EPERM))  # as exFAT answers
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", link)
     repo = pygit2.init_repository(tmp_path, bare=True)
     new = NewObjects(repo)
     tree = new.add(pygit2.enums.ObjectType.TREE, b"")
@@ -159,6 +170,12 @@ def test_housekeeping_keeps_a_pack_that_no_reference_leads_to_yet(tmp_path: Path
         git(tmp_path, "gc", "--prune=now", "--quiet")
         assert git(tmp_path, "cat-file", "-p", str(commit)) == text.rstrip("\n")
         repo.references.create("refs/heads/main", commit)
+        (keep,) = (tmp_path / "objects" / "pack").glob("*.keep")
+        left = keep.read_bytes()
+    assert not keep.exists()
+    keep.write_bytes(left)  # as if the process had been killed
+    new.clean()
+    assert not keep.exists()
     git(tmp_path, "gc", "--prune=now", "--quiet")
     git(tmp_path, "fsck", "--strict")
 

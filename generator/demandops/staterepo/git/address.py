@@ -8,7 +8,12 @@ from pathlib import Path
 from demandops.errors import StateRepoError
 from demandops.quoting import quoted
 from demandops.staterepo.git.local_repository import LocalRepository
-from demandops.staterepo.git.remote_repository import HAS_PASSWORD, Notify, RemoteRepository
+from demandops.staterepo.git.remote_repository import (
+    HAS_PASSWORD,
+    HAS_TOKEN,
+    Notify,
+    RemoteRepository,
+)
 from demandops.staterepo.git.repository import StateRepository
 
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
@@ -62,8 +67,8 @@ def _check_url(url: str) -> None:
         raise StateRepoError(
             f"a state repo's address cannot start with '{scheme[0]}'; use https, ssh, git or file"
         )
-    if HAS_PASSWORD.search(url):
+    if HAS_PASSWORD.search(url) or HAS_TOKEN.match(url):
         raise StateRepoError(
-            "the state repo's address holds a password, which process lists would show; remove "
-            "it and use a credential helper, ~/.netrc or an SSH key"
+            "the state repo's address holds a password or token, which process lists would show; "
+            "remove it and use a credential helper, ~/.netrc or an SSH key"
         )

@@ -11,12 +11,13 @@ from pathlib import Path
 import pygit2
 from pygit2 import Oid, Repository
 
-from demandops.errors import StateRepoError
+from demandops.errors import StateRepoError, Unsound
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.new_objects import NewObjects, sync_folder
 from demandops.staterepo.git.repository import (
     ENVIRONMENT,
     MAIN,
+    PushDenied,
     StateRepository,
     Unavailable,
     disk_error,
@@ -53,15 +54,15 @@ class LocalRepository(StateRepository):
         try:
             self._require_branch(path)
         except (pygit2.GitError, KeyError) as error:
-            raise disk_error(error, self.address) or self._damaged(str(error)) from None
+            raise disk_error(error, self.address) or self._unreadable(str(error)) from None
 
-    def _damaged(self, what: str) -> StateRepoError:
+    def _unreadable(self, what: str) -> StateRepoError:
         return StateRepoError(
-            f"{self.address} is damaged: {what}; `git -C {self.address} fsck` lists what is "
-            "broken, restore it from a backup or from a clone"
+            f"{self.address} cannot be read: {what}; check its disk, and if "
+            f"`git -C {self.address} fsck` finds it broken, restore it from a backup or a clone"
         )
 
-    def renew_if_damaged(self) -> bool:
+    def renew_if_unreadable(self) -> bool:
         """Raise StateRepoError if git finds it damaged: nobody can make it anew."""
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
@@ -73,7 +74,7 @@ class LocalRepository(StateRepository):
             check=False,
         )
         if checked.returncode:
-            raise self._damaged((checked.stderr + checked.stdout).strip().partition("\n")[0])
+            raise self._unreadable((checked.stderr + checked.stdout).strip().partition("\n")[0])
         return False
 
     def _require_branch(self, path: Path) -> None:
@@ -87,6 +88,8 @@ class LocalRepository(StateRepository):
                 f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
+        if self.tip() not in self.objects:
+            raise self._unreadable(f"its commit {self.tip()} is not there")
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
@@ -103,6 +106,8 @@ class LocalRepository(StateRepository):
                 reference.set_target(commit, "demandops")
         except (pygit2.GitError, OSError) as error:
             reason = disk_error(error, self.address)
+            if isinstance(reason, PushDenied) and self.tip() != expected:
+                return False  # it may be this commit that is there, and not synced
             if reason is not None:
                 raise reason from None
             self._break_stale_lock()
@@ -124,9 +129,10 @@ class LocalRepository(StateRepository):
                 sync_folder(branch.parent)
         except (pygit2.GitError, OSError) as error:
             self._break_stale_lock()
-            raise disk_error(error, self.address) or Unavailable(
-                f"{self.address} cannot be written: {error}"
-            ) from None
+            reason = disk_error(error, self.address)
+            if not isinstance(reason, Unsound | Unavailable):  # it is no answer: they are on main
+                reason = Unavailable(str(reason or f"{self.address} cannot be written: {error}"))
+            raise reason from None
 
     def _break_stale_lock(self) -> None:
         """Remove the branch's lock if a killed process left it.

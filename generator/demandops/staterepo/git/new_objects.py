@@ -7,22 +7,20 @@ has already: a loose object may not be on the disk yet, or about to be pruned.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
 import re
 import shutil
-import struct
 import subprocess
-import zlib
-from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pygit2
-from pygit2 import Oid, Repository
+from pygit2 import Oid, PackBuilder, Repository
 from pygit2.enums import ObjectType
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
@@ -31,6 +29,8 @@ _LAST = 0
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
+"""What file systems answer that have no hard links, or no more of them."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -90,7 +90,7 @@ class NewObjects(pygit2.OdbBackend):
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
         """Build a pack and place it before its index: git removes an index without a pack.
 
-        Its .keep is a link to the index, so it needs no sync and :meth:`clean` knows it.
+        Its .keep begins like the index, so :meth:`clean` knows it.
         """
         packs = self._packs
         with (
@@ -104,7 +104,7 @@ class NewObjects(pygit2.OdbBackend):
             keep = placed.with_suffix(".keep")
             keep.unlink(missing_ok=True)
             try:
-                keep.hardlink_to(built.with_suffix(".idx"))
+                _mark(keep, built.with_suffix(".idx"))
                 built.replace(placed)
                 built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
                 sync_folder(packs)
@@ -141,34 +141,16 @@ class NewObjects(pygit2.OdbBackend):
         )  # fmt: skip
         if done.returncode:
             raise pygit2.GitError(done.stderr.strip())
-        (pack,) = Path(folder).glob("*.pack")
-        return pack
+        return _pack_in(folder)
 
     def _build_pack(self, folder: str, needed: list[Oid]) -> Path:
-        """Build a pack and its index, synced. It has no deltas: git makes some when it joins packs.
-
-        The format is Git's: https://git-scm.com/docs/gitformat-pack.
-        """
-        pack = bytearray(struct.pack(">4sII", b"PACK", 2, len(needed)))
-        rows = list[tuple[bytes, int, int]]()
+        """Build a pack and its index; libgit2 syncs both, and raises if that fails."""
+        builder = PackBuilder(self.repo)
+        builder.set_threads(1)
         for oid in needed:
-            kind, data = self._known[oid]
-            packed = _size_in_pack(kind, len(data)) + zlib.compress(data, 1)
-            rows.append((oid.raw, zlib.crc32(packed), len(pack)))
-            pack += packed
-        pack += _sha1(pack)
-        raws, checksums, offsets = zip(*sorted(rows), strict=True)
-        firsts = [raw[0] for raw in raws]
-        fanout = (bisect_right(firsts, byte) for byte in range(256))
-        index = struct.pack(">4sI256I", _INDEX, 2, *fanout) + b"".join(raws)
-        index += struct.pack(f">{len(raws)}I{len(raws)}i", *checksums, *offsets) + pack[-20:]
-        path = Path(folder) / f"pack-{_sha1(b''.join(raws)).hex()}.pack"
-        for file, content in (path, pack), (path.with_suffix(".idx"), index + _sha1(index)):
-            with open(file, "wb", opener=_read_only) as writing:
-                writing.write(content)
-                writing.flush()
-                os.fsync(writing.fileno())
-        return path
+            builder.add(oid)
+        builder.write(folder)
+        return _pack_in(folder)
 
     def _needed_by(self, commit: Oid) -> list[Oid]:
         known = {oid.raw: oid for oid in self._known}
@@ -214,22 +196,8 @@ class NewObjects(pygit2.OdbBackend):
         """Do nothing: memory is always current."""
 
 
-def _read_only(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o444)
-
-
 def _sha1(data: bytes | bytearray) -> bytes:
     return hashlib.sha1(data).digest()  # noqa: S324 - Git's object ids
-
-
-def _size_in_pack(kind: ObjectType, size: int) -> bytes:
-    """Return the type and size of an object as a pack has them: 4 bits of the size, then 7 each."""
-    written, size = bytearray([kind << 4 | size & 15]), size >> 4
-    while size:
-        written[-1] |= 128
-        written.append(size & 127)
-        size >>= 7
-    return bytes(written)
 
 
 def entries_of(data: bytes) -> Entries:
@@ -249,6 +217,30 @@ def _locked(folder: Path, how: int) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def _pack_in(folder: str) -> Path:
+    """Return the only pack in a folder. Unlike glob, raise if the folder cannot be read."""
+    (pack,) = [path for path in Path(folder).iterdir() if path.suffix == ".pack"]
+    return pack
+
+
+def _mark(keep: Path, index: Path) -> None:
+    """Make the .keep of a pack: a link to its index, which is synced already.
+
+    Where a file system has no hard links it is a file, synced before it has its name.
+    """
+    try:
+        keep.hardlink_to(index)
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        made = index.with_suffix(".keep")
+        with made.open("wb") as file:
+            file.write(_INDEX)
+            file.flush()
+            os.fsync(file.fileno())
+        made.replace(keep)
 
 
 def sync_folder(folder: Path) -> None:

@@ -47,6 +47,10 @@ _NO_PERMISSION = re.compile(
 _USER = re.compile(r"(://)[^/@\s]*@")
 
 HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
+HAS_TOKEN = re.compile(
+    r"^https?://(gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-zA-Z]*\d)[a-zA-Z0-9]{32,}@)", re.I
+)
+"""A user name that is a token. A name alone is none: some forges have it in their addresses."""
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")

@@ -68,21 +68,32 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
     """
     number = getattr(error, "errno", None)
     if number is None:
-        number = next((_TOLD[text] for text in _TOLD if str(error).endswith(text)), None)
+        what = next((text for text in _TOLD if str(error).endswith(text)), "")
+        number = _TOLD.get(what)
+    else:
+        what = os.strerror(number)
     if number in _NO_ROOM:
-        return DiskFull(
-            f"{address} cannot be written: its disk has no room ({os.strerror(number)}); free some"
-        )
+        return DiskFull(f"{address} cannot be written: its disk has no room ({what}); free some")
     if number in _NOT_ALLOWED:
         return PushDenied(
-            f"{address} cannot be written: {os.strerror(number)}; let the generator's user write "
+            f"{address} cannot be written: {what}; let the generator's user write "
             "all of its files and folders"
         )
     if number in _BROKEN:
-        return Unsound(
-            f"{address} cannot be written: {os.strerror(number)}; check its disk, then start again"
-        )
+        return Unsound(f"{address} cannot be written: {what}; check its disk, then start again")
     return None
+
+
+def access_error(error: Exception, address: str) -> Exception:
+    """Return what it means that a folder or state repo could not be read or written.
+
+    An error of the system or of libgit2 is no fault of the program.
+    """
+    if not isinstance(error, OSError | pygit2.GitError):
+        return error
+    return disk_error(error, address) or StateRepoError(
+        f"{address} cannot be read: {error}; check its disk and its files, then try again"
+    )
 
 
 class StateRepository(ABC):
@@ -126,7 +137,7 @@ class StateRepository(ABC):
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote's answer was its promise
         """Make durable what was published after the commit ``since``, whatever became of it before.
 
-        Raises Unavailable, PushDenied or Unsound if that fails.
+        Raises Unavailable or Unsound if that fails.
         """
 
     def includes(self, commit: str, other: str) -> bool:

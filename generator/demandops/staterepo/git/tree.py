@@ -25,7 +25,11 @@ def commit_of(repo: Repository, revision: str | Oid) -> Commit:
     try:
         found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
         return found.peel(Commit)
-    except (KeyError, ValueError, pygit2.GitError):
+    except (KeyError, ValueError, pygit2.GitError) as error:
+        if isinstance(revision, Oid) and isinstance(error, pygit2.InvalidError):
+            raise StateRepoError(
+                f"commit {error}; set the branch back to the commit before it"
+            ) from None
         raise StateRepoError(
             f"'{revision}' is not a commit of the state repo; `demandops log` lists them"
         ) from None

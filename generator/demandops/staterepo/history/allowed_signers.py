@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import git
-from pygit2 import Commit, Repository
+from pygit2 import Commit, Oid, Repository
 
 from demandops.staterepo.git import tree as trees
 
@@ -33,6 +33,11 @@ class Check(NamedTuple):
 
 _good: dict[str, Check] = {}
 """Commit → its check, if it is good: a commit, its signature and its parent never change."""
+
+
+def are_listed(repo: Repository, commit: Oid) -> bool:
+    """Return whether a commit lists the keys that may sign."""
+    return trees.entry(trees.commit_of(repo, commit).tree, ALLOWED_SIGNERS) is not None
 
 
 def signature_of(commit: Commit) -> str:
