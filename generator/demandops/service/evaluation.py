@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import logging
 
-from pygit2 import Oid
-
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
@@ -97,7 +95,7 @@ class Evaluator:
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
-    def published_before(self, tip: Oid, batch: list[Ticket]) -> list[Result]:
+    def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         """Return the results of the demands that ``tip`` has, in the order of their commits.
 
         They have no answer if the connection or the process ended after the remote accepted the
@@ -112,7 +110,7 @@ class Evaluator:
         if published:
             self._repository.write_anew(since)
         for operation in sought.keys() - published:
-            sought[operation].base = str(tip)
+            sought[operation].base = tip
         return [
             (sought[one], _receipt_of_published(sought[one], recorded[one])) for one in published
         ]

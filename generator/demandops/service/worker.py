@@ -233,7 +233,7 @@ class Worker:
             self._must_fetch, self._tip_is_fresh = False, True
         self._demands.answer_withdrawn(batch)
         tip = self._repository.tip()
-        results = self._evaluator.published_before(tip, batch)
+        results = self._evaluator.published_before(str(tip), batch)
         published = {ticket for ticket, _ in results}
         left = [ticket for ticket in batch if ticket not in published]
         part, left = left[: backoff.max_demands], left[backoff.max_demands :]

@@ -150,7 +150,7 @@ class RecordedOutcome:
     outcome: _Outcome
 
 
-def operations_since(repo: Repository, tip: Oid, base: str) -> dict[str, RecordedOutcome]:
+def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
     """Return operation id → outcome of every demand that commits after ``base`` record.
 
     A person who merges a proposal may keep its trailers; any other commit by a person records no
