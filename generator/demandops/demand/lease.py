@@ -47,9 +47,10 @@ class Lease:
         """Whether the lease has started; a proposed claim's has not."""
         return self.until < UNSTARTED
 
-    def restarted(self, now: datetime) -> Lease:
-        """Return the lease with its full term from ``now``."""
-        return Term(self.seconds, self.slack).lease_from(now)
+    def started(self, now: datetime, before: Lease | None = None) -> Lease:
+        """Return the lease with its full term from ``now``, as a renewal of the one ``before``."""
+        term = Term(self.seconds, self.slack)
+        return before.renewed(term, now) if before else term.lease_from(now)
 
     @property
     def expires_at(self) -> datetime:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.demand.lease import Lease
 from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
 from demandops.service import Ticket
 from demandops.service.approvals import approvals
@@ -350,6 +352,24 @@ def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
     term = datetime.fromisoformat(end) - datetime.fromisoformat(began)
     assert 598 <= term.total_seconds() <= 601
     assert rig.commits(bare)[-1].one("Operation") == "follow"
+
+
+def test_a_merge_takes_back_nothing_of_a_lease_that_was_promised(bare: Path, petra: Person) -> None:
+    petra.policy(approval="none")
+    with rig.running(bare) as generator:
+
+        def lease() -> Lease | None:
+            (claim,) = generator.snapshot.state.ledger.application_claims("edge/d")
+            return claim.lease
+
+        rig.book(generator, put("d", 1, lease=3600))
+        before = lease()
+        petra.policy(approval="required")
+        proposed = Proposed(generator, put("d", 2, lease=60))
+        petra.merge(proposed.branch)
+        assert proposed.outcome() == "booked"
+        after = lease()
+    assert before and after == replace(before, seconds=60)
 
 
 def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(

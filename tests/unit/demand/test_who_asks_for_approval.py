@@ -131,6 +131,6 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     assert claim_file.read(text, path) == claim
     found = {one.key for one in waiting.state.ledger.unstarted_claims()}
     assert found == {one.key for one in waiting.state.ledger.claims_of_demand("d")}
-    later = claim.lease.restarted(NOW)
+    later = claim.lease.started(NOW)
     assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
     assert waiting.state.ledger.ended_claims(NOW.replace(year=2100)) == ()

@@ -9,6 +9,7 @@ from pygit2 import Oid, Repository, Tree
 
 from demandops import naming
 from demandops.demand.claim import Claim, ClaimKey
+from demandops.demand.lease import Lease
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import ClaimChange, Ledger
@@ -85,6 +86,15 @@ def last_valid_claims(
             claims |= {path: claim_at(commit.tree, path) for path in changed}
             left.difference_update(changed)
     return claims
+
+
+def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
+    """Return the lease that the claim at a path had on main before a proposal of it was merged."""
+    for commit in commit_log.first_parents(repo, to):
+        claim = valid_claim_at(commit.tree, path)
+        if claim is None or claim.lease is None or claim.lease.has_started:
+            return claim.lease if claim else None
+    return None
 
 
 def claims_by_people(

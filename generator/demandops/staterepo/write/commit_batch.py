@@ -36,6 +36,7 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import authorship, commit_log, commit_message
 from demandops.staterepo.load import (
     last_valid_config,
+    ledger_files,
     problem_report,
     state_in_effect,
 )
@@ -162,7 +163,7 @@ class CommitBatch:
         applied = update_ledger(before.state, state, accepted.subjects, marked, now)
         state = replace(state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
-        return _with_started_leases(accepted.snapshot, state, change, applied.keys, now)
+        return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
 
     def _rendered_subjects(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
@@ -171,7 +172,30 @@ class CommitBatch:
         state = replace(state, ledger=ledger)
         change = changeset_of_edit(state, old, subjects, self.read)
         change = replace(change, files={**files, **change.files})
-        return _with_started_leases(accepted.snapshot, state, change, keys, now)
+        return self._with_started_leases(accepted.snapshot, state, change, keys, now)
+
+    def _with_started_leases(
+        self,
+        snapshot: Snapshot,
+        state: State,
+        change: Changeset,
+        keys: Iterable[ClaimKey],
+        now: datetime,
+    ) -> _Followed:
+        """Start the leases of claims that a person approved.
+
+        They start at approval because a lease could otherwise end before the demand is approved.
+        """
+        ledger, files = state.ledger, dict(change.files)
+        for claim in ledger.unstarted_claims():
+            assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
+            path = claim_file.path_of(claim.key)
+            before = ledger_files.lease_before_approval(self._objects, snapshot.commit, path)
+            started = replace(claim, lease=claim.lease.started(now, before))
+            ledger = ledger.replace(claim.key, started)
+            files[path] = claim_file.text_of(started)
+        snapshot = replace(snapshot, state=replace(state, ledger=ledger))
+        return snapshot, replace(change, files=files), tuple(keys)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
         """Return the problem report, if it changed."""
@@ -252,20 +276,3 @@ class CommitBatch:
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)
-
-
-def _with_started_leases(
-    snapshot: Snapshot, state: State, change: Changeset, keys: Iterable[ClaimKey], now: datetime
-) -> _Followed:
-    """Start the leases of claims that a person approved.
-
-    They start at approval because a lease could otherwise end before the demand is approved.
-    """
-    ledger, files = state.ledger, dict(change.files)
-    for claim in ledger.unstarted_claims():
-        assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
-        started = replace(claim, lease=claim.lease.restarted(now))
-        ledger = ledger.replace(claim.key, started)
-        files[claim_file.path_of(claim.key)] = claim_file.text_of(started)
-    snapshot = replace(snapshot, state=replace(state, ledger=ledger))
-    return snapshot, replace(change, files=files), tuple(keys)
