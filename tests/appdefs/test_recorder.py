@@ -68,14 +68,15 @@ def test_it_is_demanded_with_yaml_alone(demandops: Run, state: GitRepo, tmp_path
     assert (row["outcome"], row["warnings"]) == ("booked", [UNCARRIED])
     ran = demandops("bookkeeping", "--state-repo", state.path, "--output", "json")
     found = ran.json()["services"]
-    assert found == {
+    told = ("applications", "service", "node", "source", "source_topic", "inputs", "requesters")
+    assert {name: {key: entry[key] for key in told} for name, entry in found.items()} == {
         "drv-vehicle00-vehicle00": {
             "applications": ["edge/record"],
             "service": "driver",
             "node": "vehicle00",
             "source": "vehicle00",
             "source_topic": CLOUD[0],
-            "inputs": {"point_cloud": [CLOUD[0]]},
+            "inputs": {"point_cloud": {CLOUD[0]: ["vehicle00"]}},
             "requesters": ["vehicle00"],
         },
         next(name for name in found if name.startswith("rec-")): {
@@ -84,7 +85,7 @@ def test_it_is_demanded_with_yaml_alone(demandops: Run, state: GitRepo, tmp_path
             "node": "edge",
             "source": None,
             "source_topic": None,
-            "inputs": {"clouds": ["/vehicle00/driver/points"]},
+            "inputs": {"clouds": {"/vehicle00/driver/points": ["vehicle00"]}},
             "requesters": ["vehicle00"],
         },
     }
@@ -130,9 +131,10 @@ def test_a_demand_of_our_own_gets_the_connection_that_brings_what_is_made_at_the
     assert books.send(demand | {"applications": [application]}).warnings == ()
     assert books.books()["connections"] == {
         "derived/vehicle00/edge": {
+            "type": "mqtt",
             "source": "vehicle00",
             "target": "edge",
-            "topics": ["/vehicle00/driver/points"],
+            "topics": {"/vehicle00/driver/points": ["vehicle00"]},
             "requesters": ["vehicle00"],
         }
     }
@@ -149,12 +151,20 @@ def test_two_applications_of_different_kinds_share_a_driver(books: MemoryRepo) -
     drivers = {n: e for n, e in books.books()["services"].items() if e["service"] == "driver"}
     assert drivers == {
         "drv-vehicle00-vehicle00": {
+            "version": "0.1.0",
+            "parameters": {
+                "format": "mcap",
+                "labels": [],
+                "quality": None,
+                "rate": 1,
+                "title": "untitled",
+            },
             "applications": ["cloud/monitor", "edge/record"],
             "service": "driver",
             "node": "vehicle00",
             "source": "vehicle00",
             "source_topic": CLOUD[0],
-            "inputs": {"point_cloud": [CLOUD[0]]},
+            "inputs": {"point_cloud": {CLOUD[0]: ["operator", "vehicle00"]}},
             "requesters": ["operator", "vehicle00"],
         }
     }

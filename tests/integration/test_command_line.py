@@ -322,7 +322,9 @@ class TestBookkeeping:
                     "node": "edge",
                     "source": "vehicle00",
                     "source_topic": CLOUD[0],
-                    "inputs": {"point_cloud": [CLOUD[0]]},
+                    "version": "0.1.0",
+                    "parameters": {},
+                    "inputs": {"point_cloud": {CLOUD[0]: ["vehicle00"]}},
                     "requesters": ["vehicle00"],
                 },
                 FUSION: {
@@ -331,15 +333,21 @@ class TestBookkeeping:
                     "node": "edge",
                     "source": None,
                     "source_topic": None,
-                    "inputs": {"ego_data": [], "object_list": ["/vehicle00_local_objectlist"]},
+                    "version": "0.1.0",
+                    "parameters": {},
+                    "inputs": {
+                        "ego_data": {},
+                        "object_list": {"/vehicle00_local_objectlist": ["vehicle00"]},
+                    },
                     "requesters": ["vehicle00"],
                 },
             },
             "connections": {
                 "vehicle00/edge": {
+                    "type": "mqtt",
                     "source": "vehicle00",
                     "target": "edge",
-                    "topics": [CLOUD[0]],
+                    "topics": {CLOUD[0]: ["vehicle00"]},
                     "requesters": ["vehicle00"],
                 }
             },
@@ -358,7 +366,7 @@ class TestBookkeeping:
         assert detection["applications"] == ["a/first", APP]
         assert detection["requesters"] == ["a", "vehicle00", "z"]
         entry = found["connections"]["vehicle00/edge"]
-        assert entry["topics"] == ["/a", CLOUD[0], "/z"]
+        assert [*entry["topics"]] == ["/a", CLOUD[0], "/z"]
         assert entry["requesters"] == ["a", "vehicle00", "z"]
 
     def test_the_text_is_a_table(self, demandops: Run, joined: Any) -> None:
@@ -367,7 +375,8 @@ class TestBookkeeping:
         cells = [[c.strip() for c in line.split("│")] for line in ran.out.splitlines()]
         assert ["", "od-edge-vehicle00", "object-detection", "edge", "vehicle00", CLOUD[0],
                 "vehicle00", ""] in cells  # fmt: skip
-        assert ["", "vehicle00/edge", "vehicle00", "edge", CLOUD[0], "vehicle00", ""] in cells
+        assert ["", "vehicle00/edge", "mqtt", "vehicle00", "edge", CLOUD[0],
+                "vehicle00", ""] in cells  # fmt: skip
         assert ran.out.splitlines()[-1] == f"at {joined.tip}"
 
 

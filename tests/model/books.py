@@ -272,15 +272,15 @@ class Books:
             node, who = claim["fixed"]["node"], requesters_of(claim)
             fusion = found.setdefault(("object-fusion", node, id_), _service())
             _add(fusion, id_, who)
-            for role, topic, source in claim["holds"]:
+            for (role, topic, source), holders in claim["holds"].items():
                 if role == "ego_data":
-                    fusion["inputs"]["ego_data"].add(topic)
+                    _hold(fusion["inputs"]["ego_data"], topic, holders)
                     continue
                 cloud = f"{source} {topic}"
-                fusion["inputs"]["object_list"].add(cloud)
+                _hold(fusion["inputs"]["object_list"], cloud, holders)
                 detection = found.setdefault(("object-detection", node, cloud), _service())
-                _add(detection, id_, who)
-                detection["inputs"]["point_cloud"].add(topic)
+                _add(detection, id_, holders)
+                _hold(detection["inputs"]["point_cloud"], topic, holders)
         return {key: _sorted(entry) for key, entry in found.items()}
 
     def connection_view(self) -> dict[str, dict[str, Any]]:
@@ -288,11 +288,13 @@ class Books:
         found: dict[str, dict[str, Any]] = {}
         for id_, claim in self._on("connection"):
             ends = {end: claim["fixed"][end] for end in ("source", "target")}
-            entry = found.setdefault(id_, {**ends, "topics": set(), "requesters": set()})
-            entry["topics"] |= {topic for (topic,) in claim["holds"]}
+            entry = found.setdefault(id_, {**ends, "topics": {}, "requesters": set()})
+            for (topic,), holders in claim["holds"].items():
+                _hold(entry["topics"], topic, holders)
             entry["requesters"] |= requesters_of(claim)
         return {
-            id_: entry | {name: sorted(entry[name]) for name in ("topics", "requesters")}
+            id_: entry
+            | {"topics": _lists(entry["topics"]), "requesters": sorted(entry["requesters"])}
             for id_, entry in found.items()
         }
 
@@ -381,7 +383,7 @@ def _absolute_pairs(connection: Item) -> list[tuple[str, str]]:
 
 
 def _service() -> dict[str, Any]:
-    inputs: dict[str, set[str]] = {"ego_data": set(), "object_list": set(), "point_cloud": set()}
+    inputs: dict[str, dict[str, set[str]]] = {"ego_data": {}, "object_list": {}, "point_cloud": {}}
     return {"applications": set(), "inputs": inputs, "requesters": set()}
 
 
@@ -390,10 +392,18 @@ def _add(entry: dict[str, Any], application: str, who: Iterable[str]) -> None:
     entry["requesters"].update(who)
 
 
+def _hold(topics: dict[str, set[str]], topic: str, who: Iterable[str]) -> None:
+    topics.setdefault(topic, set()).update(who)
+
+
+def _lists(topics: Mapping[str, set[str]]) -> dict[str, list[str]]:
+    return {topic: sorted(who) for topic, who in sorted(topics.items())}
+
+
 def _sorted(entry: dict[str, Any]) -> dict[str, Any]:
     return {
         "applications": sorted(entry["applications"]),
-        "inputs": {role: sorted(topics) for role, topics in entry["inputs"].items() if topics},
+        "inputs": {role: _lists(topics) for role, topics in entry["inputs"].items() if topics},
         "requesters": sorted(entry["requesters"]),
     }
 
@@ -418,19 +428,23 @@ def in_model_words(
         key = (entry["service"], node, subject)
         assert key not in services, f"{key} appears twice"
         for topics in entry["inputs"].values():
-            assert topics == sorted(set(topics)), topics
-        inputs = {role: list(topics) for role, topics in entry["inputs"].items() if topics}
+            assert list(topics) == sorted(topics), topics
+        inputs = {role: topics for role, topics in entry["inputs"].items() if topics}
         if "object_list" in inputs:
-            inputs["object_list"] = sorted(
-                object_lists.get((node, topic), f"published by nobody: {topic}")
-                for topic in inputs["object_list"]
-            )
+            inputs["object_list"] = {
+                object_lists.get((node, topic), f"published by nobody: {topic}"): who
+                for topic, who in inputs["object_list"].items()
+            }
         services[key] = {
             "applications": entry["applications"],
             "inputs": inputs,
             "requesters": entry["requesters"],
         }
-    return {"services": services, "connections": dict(data["connections"])}
+    told = ("source", "target", "topics", "requesters")
+    connections = {
+        id: {name: entry[name] for name in told} for id, entry in data["connections"].items()
+    }
+    return {"services": services, "connections": connections}
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:

@@ -52,7 +52,7 @@ def test_the_model_gives_the_papers_table() -> None:
         if fusion:
             present = ["0"] * bool(by_vehicle) + others.split()
             inputs = fusion["inputs"]
-            assert inputs["ego_data"] == [f"/vehicles/vehicle0{one}/ego_data" for one in present]
+            assert [*inputs["ego_data"]] == [f"/vehicles/vehicle0{one}/ego_data" for one in present]
             clouds = [STATION_CLOUD] + [VEHICLE_CLOUD] * bool(by_vehicle)
-            assert inputs["object_list"] == clouds
+            assert [*inputs["object_list"]] == clouds
     assert not books.claims

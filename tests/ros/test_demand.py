@@ -108,7 +108,9 @@ def test_a_refusal_names_code_field_and_remedy(
         vehicle.put("refused", [{"node_id": "edge"}])
     assert tip(shared.state_repo) == before
     assert vehicle.put("refused", connections=[link("refused")]).outcome == "booked"
-    assert shared.bookkeeping()["connections"]["refused"]["topics"] == ["/a", "/b"]
+    assert shared.bookkeeping()["connections"]["refused"]["topics"] == {
+        topic: ["vehicle00"] for topic in ("/a", "/b")
+    }
 
 
 def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: DemandClient) -> None:

@@ -6,7 +6,7 @@ Keys come from :mod:`demandops.plan.release_keys`.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -29,6 +29,7 @@ from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, appdef_of, claims_needing
+from demandops.subject import TopicKey
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
@@ -92,8 +93,16 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         parameters=MappingProxyType(_merged_parameters(definitions, claims)),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
         applications=tuple(dict.fromkeys(app.id for app in apps)),
-        requesters=requesters_of(claims),
+        requesters=_requesters(claims, service, key),
     )
+
+
+def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
+    """Return who requests a service; for one topic, who still holds it."""
+    if service.each is None:
+        return requesters_of(claims)
+    topic = (service.each, str(key.topic), str(key.source))
+    return tuple(sorted({who for claim in claims for who in claim.holders(topic)}))
 
 
 def _chart(config: Config, service: Service, apps: Iterable[Application]) -> ChartSource:
@@ -136,6 +145,27 @@ def _application_inputs(
         }
         inputs[role] = tuple(sorted(made))
     return inputs
+
+
+def demanded_inputs(
+    config: Config, release: ServiceRelease, app: Application
+) -> Iterator[tuple[str, str, TopicKey]]:
+    """Yield role and topic of each input that an application gives a service, and its key."""
+    service, key = release.service, release.key
+    if service.each is not None:
+        for one in app.inputs_from(service.each, str(key.source), str(key.topic)):
+            yield service.each, one.topic, (service.each, one.topic, one.source)
+        return
+    services = appdef_of(config, app.appdef).services
+    for role, origin in service.inputs.items():
+        producer, _, output = origin.partition(".")
+        each = str(services[producer].each) if output else origin
+        for one in app.inputs.get(each, ()):
+            topic = one.topic
+            if output:
+                pattern = services[producer].outputs[output]
+                topic = named(pattern, instance_of(config, each, one))
+            yield role, topic, (each, one.topic, one.source)
 
 
 def _topics(apps: Iterable[Application], role: str) -> set[InputTopic]:

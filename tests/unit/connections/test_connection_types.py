@@ -150,7 +150,7 @@ class TestThroughTheWire:
         assert books.send(goal([], [asked])).outcome == "unchanged"
         (claim,) = books.state.ledger.connection_claims("c")
         assert claim.connection.known_type.name == name
-        assert books.books()["connections"]["c"]["topics"] == ["/a"]
+        assert books.books()["connections"]["c"]["topics"] == {"/a": ["vehicle00"]}
         assert books.send(goal([], [asked], shutdown=True)).outcome == "released"
         assert len(books.state.ledger) == 0
 

@@ -37,7 +37,14 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         for name, entry in books.services.items()
     ]
     connections = [
-        (id, entry.source, entry.target, "\n".join(entry.topics), "\n".join(entry.requesters))
+        (
+            id,
+            entry.type,
+            entry.source,
+            entry.target,
+            "\n".join(entry.topics),
+            "\n".join(entry.requesters),
+        )
         for id, entry in books.connections.items()
     ]
     suspended = [
@@ -52,7 +59,9 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     ]
     tables = [
         _table("Services", ("Service", "Kind", "Node", "For", "Takes in", "Requesters"), services),
-        _table("Connections", ("Connection", "From", "To", "Topics", "Requesters"), connections),
+        _table(
+            "Connections", ("Connection", "By", "From", "To", "Topics", "Requesters"), connections
+        ),
     ]
     if suspended:
         columns = ("Subject", "Demand", "Requesters", "By", "Reason")

@@ -1,43 +1,52 @@
-"""Bookkeeping: for each service and connection, who requests it.
+"""Bookkeeping: what is demanded, and for each service, connection and topic, who requests it.
 
 This is Table III, column 4, of the paper. It is derived from claims and stored nowhere.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
-from demandops.demand.claim import requesters_of
+from demandops.demand.claim import Claim, requesters_of
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import suspended_claims, without_suspended
-from demandops.plan.planner import connection_topics
-from demandops.plan.release import ServiceRelease
+from demandops.plan.planner import connection_topics, demanded_inputs
+from demandops.plan.release import ServiceRelease, claims_of
 from demandops.plan.views import release_causes
 from demandops.subject import SubjectKind
+
+_Requesters: TypeAlias = dict[str, list[str]]
+"""Topic → who requests it, sorted."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """One service: its requesters and its inputs (role → sorted topics)."""
+    """One service, its requesters and those of its inputs (role → topic → requesters).
+
+    ``version`` is its chart's.
+    """
 
     applications: list[str]
     service: str
     node: str
     source: str | None
     source_topic: str | None
-    inputs: dict[str, list[str]]
+    version: str
+    parameters: dict[str, object]
+    inputs: dict[str, _Requesters]
     requesters: list[str]
 
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """One connection: its requesters and the source topics that it carries."""
+    """One connection, its requesters and those of each source topic that it carries."""
 
+    type: str
     source: str
     target: str
-    topics: list[str]
+    topics: _Requesters
     requesters: list[str]
 
 
@@ -66,32 +75,33 @@ class Bookkeeping:
 
 
 def bookkeeping(world: World) -> Bookkeeping:
-    """Return the requesters of each service and connection."""
-    services = {}
-    for release in release_causes.releases(world):
-        if isinstance(release, ServiceRelease):
-            services[release.name] = ServiceEntry(
-                applications=list(release.applications),
-                service=release.key.service,
-                node=release.node.id,
-                source=release.key.source,
-                source_topic=release.key.topic,
-                inputs={
-                    role: sorted({topic.topic for topic in topics})
-                    for role, topics in release.inputs.items()
-                },
-                requesters=list(release.requesters),
-            )
+    """Return what runs and who requests it."""
+    active = without_suspended(world)
+    services = {
+        release.name: ServiceEntry(
+            applications=list(release.applications),
+            service=release.key.service,
+            node=release.node.id,
+            source=release.key.source,
+            source_topic=release.key.topic,
+            version=release.chart.version,
+            parameters=dict(release.parameters),
+            inputs=_requesters_of_inputs(release, active),
+            requesters=list(release.requesters),
+        )
+        for release in release_causes.releases(world)
+        if isinstance(release, ServiceRelease)
+    }
     connections = {}
-    active = without_suspended(world).ledger
     for id in world.ledger.subjects(SubjectKind.CONNECTION):
-        claims = active.connection_claims(id)
-        if not claims:
+        first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
+        if first is None or not claims:
             continue
         connections[id] = ConnectionEntry(
-            source=claims[0].connection.source,
-            target=claims[0].connection.target,
-            topics=[route.source for route in connection_topics(claims)],
+            type=first.type.word if first.type else "",
+            source=first.source,
+            target=first.target,
+            topics=_requesters_of_topics(claims),
             requesters=list(requesters_of(claims)),
         )
     suspended = [
@@ -106,6 +116,26 @@ def bookkeeping(world: World) -> Bookkeeping:
         for claim, override in suspended_claims(world)
     ]
     return Bookkeeping(dict(sorted(services.items())), connections, suspended)
+
+
+def _requesters_of_topics(claims: Iterable[Claim]) -> _Requesters:
+    found = {route.source: set[str]() for route in connection_topics(claims)}
+    for claim in claims:
+        for key in claim.held.topic_keys():
+            found[key[0]].update(claim.holders(key))
+    return _sorted(found)
+
+
+def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _Requesters]:
+    found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
+    for claim in claims_of(release, active.ledger):
+        for role, topic, key in demanded_inputs(active.config, release, claim.application):
+            found[role][topic].update(claim.holders(key))
+    return {role: _sorted(topics) for role, topics in found.items()}
+
+
+def _sorted(topics: dict[str, set[str]]) -> _Requesters:
+    return {topic: sorted(who) for topic, who in topics.items()}
 
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
@@ -165,9 +195,16 @@ def _facts(entry: _Entry) -> Iterator[str]:
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"
-        yield from (f"topic {topic}" for topic in entry.topics)
+        yield f"by {entry.type}"
+        yield from _topic_facts("topic", entry.topics)
         return
     yield f"on {entry.node}"
     yield from (f"for {application}" for application in entry.applications)
+    yield f"version {entry.version}"
+    yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
     for role, topics in sorted(entry.inputs.items()):
-        yield from (f"{role} {topic}" for topic in topics)
+        yield from _topic_facts(role, topics)
+
+
+def _topic_facts(what: str, topics: _Requesters) -> Iterator[str]:
+    yield from (f"{what} {topic}" for topic in topics)
