@@ -99,7 +99,8 @@ class Leadership:
             except Unsound:
                 raise
             except Exception as error:  # the library raises errors of many kinds
-                self._tell(f"the Lease {self._lease} cannot be read or written: {_reason(error)}")
+                problem = f"cannot be read or written: {_reason(error)}"
+                self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
             self._closed.wait(_PAUSE_S)
             self._require_renewed()  # a renewal must not begin too late
@@ -116,8 +117,10 @@ class Leadership:
                 self._seen, self._seen_at = spec, self._runtime.monotonic()
             ends = self._seen_at + (spec.get("leaseDurationSeconds") or _LEASE_S)
             is_free = holder in ("", self._identity) or self._runtime.monotonic() >= ends
-            if not (is_free and self._may_lead()):
-                self._tell(f"standing by: the leader is {quoted(holder)}" if holder else "")
+            if not self._may_lead():
+                return
+            if not is_free:
+                self._tell(logging.INFO, f"standing by: the leader is {quoted(holder)}")
                 return
         began = self._runtime.monotonic()
         self._write(lease, self._identity)
@@ -152,10 +155,10 @@ class Leadership:
             **self._request, body=lease | {"spec": spec}, _request_timeout=_CALL_S
         )
 
-    def _tell(self, text: str) -> None:
+    def _tell(self, level: int, text: str) -> None:
         """Log a text once, until another one follows."""
-        if text not in ("", self._told):
-            log.info("%s", text) if text.startswith("standing by") else log.warning("%s", text)
+        if text != self._told:
+            log.log(level, "%s", text)
         self._told = text
 
     def _end(self, why: str) -> None:

@@ -1,4 +1,4 @@
-"""Who leads: processes compete for a Lease of an API server over real HTTP, in time that tests move.
+"""Who leads: processes compete for a Lease over real HTTP, in time that tests move.
 
 That a real API server takes what is written here is shown in tests/e2e/flux/test_deployment.py.
 """
@@ -179,9 +179,9 @@ def test_a_leader_that_cannot_renew_ends_before_another_leads(server: Server) ->
     server.turns.sleep(12)
     assert not first.leads
     assert str(first.unsound) == (
-        "the Lease its/generator was not renewed for 10 s (the Lease its/generator cannot be read or "
-        "written: ServiceException: Service Unavailable); another process may be the leader now, so "
-        "this one must start again"
+        "the Lease its/generator was not renewed for 10 s (the Lease its/generator cannot be read "
+        "or written: ServiceException: Service Unavailable); another process may be the leader "
+        "now, so this one must start again"
     )
 
 
