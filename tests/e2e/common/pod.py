@@ -1,8 +1,10 @@
 """A pod's container as a process of this machine, started as a kubelet would start it.
 
 It has a root file system of its own, which it cannot write to, the pod's volumes at their places,
-the pod's user, no privileges, and no environment but the container's. Only network and process ids
-are the machine's. This needs root.
+the pod's user, no privileges, and no environment but the container's. Network and process ids are
+the machine's. Unlike in a cluster it has no shared memory: where ROS 2 talks on one machine only,
+as in tests, it would use it whatever the chart says, and a client outside would miss every message.
+This needs root.
 
 The image is made of this machine's programs and this checkout. With ``E2E_IMAGE_ROOT`` it is the
 root file system in that folder (``deploy/fresh-root``).
@@ -35,7 +37,8 @@ if [ -n "$image" ]; then
   mount -t overlay -o "lowerdir=$image,upperdir=$root/above,workdir=$root/work" pod "$root/merged"
   root=$root/merged
 else
-  cp -a /etc /bin /sbin /lib* "$root/" 2>/dev/null || true
+  cp -a /etc /bin /sbin /lib* "$root/"
+  echo "demandops:x:$user:$group::/:/bin/sh" >>"$root/etc/passwd"
   for folder in $folders; do
     mkdir -p "$root$folder"
     mount --bind "$folder" "$root$folder"
@@ -45,7 +48,7 @@ fi
 mkdir -p "$root/proc" "$root/dev"
 mount --bind /proc "$root/proc"
 mount --bind /dev "$root/dev"
-mount -t tmpfs -o mode=1777 tmpfs "$root/dev/shm"
+mount -t tmpfs -o mode=700 tmpfs "$root/dev/shm"
 for volume in $volumes; do
   mode=${volume%%:*} target=${volume##*:} source=${volume#*:}
   mkdir -p "$root$target"
