@@ -257,7 +257,7 @@ def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
     before = deployed.subjects()
     deployed.stop_git()
     sent = client.send(demand(3))
-    client.wait(lambda: "away" in sent.stages)
+    client.wait(lambda: "waiting:" in sent.stages)
     active.kill()
     deployed.wait_text(standby, "taking demands on")
     deployed.start_git()
@@ -279,7 +279,9 @@ def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed, active: P
 def test_a_pod_that_ends_leaves_the_lease_at_once(
     deployed: Deployed, active: Pod, standby: Pod
 ) -> None:
+    holder = deployed.lease["holderIdentity"]
     assert active.stop() == 0
+    assert deployed.lease["holderIdentity"] != holder
     deployed.wait_text(standby, "taking demands on")
     deployed.start(active)
 
