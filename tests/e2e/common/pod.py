@@ -26,11 +26,11 @@ from tests.e2e.rig.kube import Kube, Manifest
 ROOT = Path(__file__).parents[3]
 IMAGE_VARIABLE = "E2E_IMAGE_ROOT"
 
-# Arguments: the root's folder, the image, the folders that stand for an image, MODE:SOURCE:TARGET
-# for each volume, user, group, and the command.
+# Arguments: the root's folder, the image, the folders and the Python that stand for an image,
+# MODE:SOURCE:TARGET for each volume, user, group, and the command.
 _START = """
-root=$1 image=$2 folders=$3 volumes=$4 user=$5 group=$6
-shift 6
+root=$1 image=$2 folders=$3 python=$4 volumes=$5 user=$6 group=$7
+shift 7
 mount -t tmpfs -o mode=755 tmpfs "$root"
 if [ -n "$image" ]; then
   mkdir "$root/above" "$root/work" "$root/merged"
@@ -39,6 +39,9 @@ if [ -n "$image" ]; then
 else
   cp -a /etc /bin /sbin /lib* "$root/"
   echo "demandops:x:$user:$group::/:/bin/sh" >>"$root/etc/passwd"
+  mkdir "$root/image"
+  printf '#!/bin/sh\nexec %s -m demandops.cli.main "$@"\n' "$python" >"$root/image/demandops"
+  chmod 755 "$root/image/demandops"
   for folder in $folders; do
     mkdir -p "$root$folder"
     mount --bind "$folder" "$root$folder"
@@ -106,13 +109,10 @@ class Pod:
             mounts.append(f"{mode}:{sources[mount['name']]}:{mount['mountPath']}")
         root = self._folder / f"{self.log.stem}-root"
         root.mkdir(exist_ok=True)
-        image, path = os.environ.get(IMAGE_VARIABLE, ""), "/usr/local/bin:/usr/bin:/bin"
-        environment = {}
-        if not image:
-            path = f"{Path(sys.executable).parent}:{path}"
-            environment = {"PYTHONPATH": os.environ.get("PYTHONPATH", "")}
+        image = os.environ.get(IMAGE_VARIABLE, "")
+        environment = {} if image else {"PYTHONPATH": os.environ.get("PYTHONPATH", "")}
         environment |= {
-            "PATH": path,
+            "PATH": "/image:/usr/local/bin:/usr/bin:/bin",
             "KUBERNETES_SERVICE_HOST": self._host,
             "KUBERNETES_SERVICE_PORT": self._port,
         }
@@ -127,7 +127,14 @@ class Pod:
                 [
                     *launch.command("/usr/bin/unshare", "--mount", "--propagation", "private"),
                     *("/bin/sh", "-eu", "-c", _START, "pod", str(root), image),
-                    *(" ".join(sorted(folders)), " ".join(mounts), *ids, *variables, *command),
+                    *(
+                        " ".join(sorted(folders)),
+                        sys.executable,
+                        " ".join(mounts),
+                        *ids,
+                        *variables,
+                        *command,
+                    ),
                 ],
                 stdout=log,
                 stderr=subprocess.STDOUT,
