@@ -54,7 +54,8 @@ mount --bind /dev "$root/dev"
 mount -t tmpfs -o mode=700 tmpfs "$root/dev/shm"
 for volume in $volumes; do
   mode=${volume%%:*} target=${volume##*:} source=${volume#*:}
-  mkdir -p "$root$target"
+  chroot "$root" mkdir -p "$target"
+  target=$(chroot "$root" realpath "$target")  # an image's link must not lead out of it
   mount --bind "${source%:*}" "$root$target"
   mount -o "remount,bind,$mode" "$root$target"
 done
