@@ -115,9 +115,9 @@ class ShuttingDown(DemandOpsError):
 
 
 class Unsound(DemandOpsError):
-    """Raised when going on could lose or double a demand: nobody is answered, the process ends.
+    """Raised when going on could lose or double a demand, or answer what another process answers.
 
-    Its exit code is 3. The next start goes by the journal.
+    Nobody is answered, and the process ends with exit code 3. The next start goes by the journal.
     """
 
 

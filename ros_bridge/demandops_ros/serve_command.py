@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -15,6 +16,7 @@ import rclpy
 from demandops.cli.main import ExitCode
 from demandops.cli.output import errors, progress, signing_option
 from demandops.cluster import access, reconcile_trigger
+from demandops.cluster.leadership import Leadership
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.input_file import read_secret
 from demandops.quoting import OneLineFormatter
@@ -92,15 +94,22 @@ class RosLogHandler(logging.Handler):
     help="The secret that signs the webhook's notifications; needed unless it listens on a "
     "loopback address.",
 )
+@click.option(
+    "--leader-lease",
+    metavar="NAMESPACE/NAME",
+    help="The Lease that makes one of several nodes the leader, which answers the actions; the "
+    "others stand by. For pods; see docs/deployment.md.",
+)
 @signing_option
 @click.pass_context
-def serve(
+def serve(  # noqa: PLR0913, PLR0917 - one for each option
     ctx: click.Context,
     state_repo: str | None,
     access_file: Path | None,
     fetch_interval: str | None,
     webhook: str | None,
     webhook_secret_file: Path | None,
+    leader_lease: str | None,
     signing_key: Path | None,
 ) -> None:
     """Run the ROS 2 node that accepts demands.
@@ -149,7 +158,22 @@ def serve(
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
         push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        _run(generator, settings, status, push_webhook)
+        signals = _Signals()
+        leadership = None
+        if leader_lease:
+            # what the journal holds comes before the demands of clients, unless it has to wait
+            leadership = Leadership(
+                leader_lease,
+                lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
+                signals.wake,
+            )
+            signals.wait(lambda: leadership.is_leader)
+        if signals.stopping:  # before it was the leader
+            generator.close()
+        else:
+            _run(generator, settings, status, push_webhook, signals)
+        if leadership is not None:
+            leadership.close()
         trigger.close()
     finally:
         rclpy.try_shutdown()
@@ -160,6 +184,7 @@ def _run(
     settings: dict[str, Any],
     status: RolloutWatcher | None,
     push_webhook: PushWebhook | None,
+    signals: _Signals,
 ) -> None:
     node = DemandNode(
         generator,
@@ -179,18 +204,13 @@ def _run(
     library_log.setLevel(logging.DEBUG)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    signals = _Signals()
     # the executor spins in a thread, so that the main thread notices a signal at once
     spinner = REAL.keep_running("executor", executor.spin)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
     if push_webhook is not None:
         node.get_logger().info(f"listening for pushes at {push_webhook.url}")
-    REAL.when_unsound = signals.wake
     signals.wait()
-    if REAL.unsound is not None:
-        errors.print(f"error: {REAL.unsound}")
-        os._exit(ExitCode.PROGRAM_ERROR)  # no goal may get an answer on the way
     if push_webhook is not None:
         push_webhook.close()
     _drain(executor, node, generator, status)
@@ -234,24 +254,31 @@ class _Signals:
     """
 
     def __init__(self) -> None:
-        self._stopping = False
+        self.stopping = False
         self._read, self._write = os.pipe()
         os.set_blocking(self._write, False)
         signal.set_wakeup_fd(self._write)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._handle)
+        REAL.when_unsound = self.wake
 
-    def wait(self) -> None:
-        """Wait for a signal or :meth:`wake`."""
-        while not self._stopping and REAL.unsound is None:
+    def wait(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Wait for a signal, or until something holds; :meth:`wake` looks again.
+
+        Ends the process if it must end.
+        """
+        while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)
+        if REAL.unsound is not None:
+            errors.print(f"error: {REAL.unsound}")
+            os._exit(ExitCode.PROGRAM_ERROR)  # no goal may get an answer on the way
 
     def wake(self) -> None:
-        """End the wait; from any thread."""
+        """Let the wait look again; from any thread."""
         os.write(self._write, b"\0")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._stopping:
+        if self.stopping:
             errors.print("stopped at once; unpublished demands are in the journal")
             os._exit(ExitCode.INTERRUPTED)
-        self._stopping = True
+        self.stopping = True

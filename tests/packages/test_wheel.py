@@ -1,4 +1,7 @@
-"""The built wheel carries templates, appdefs and skeleton: it renders where no checkout is."""
+"""The built wheel carries templates, appdefs and skeleton: it renders where no checkout is.
+
+It is built of what deploy/Containerfile copies.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent.parent
-PACKAGED = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton")
+CONTAINER_FILE = ROOT / "deploy" / "Containerfile"
 
 
 @pytest.fixture(scope="module")
@@ -23,12 +26,15 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     sources = folder / "sources"  # setuptools would leave its build folder in the checkout
     sources.mkdir()
-    for name in (*PACKAGED, "pyproject.toml", "README.md", "LICENSE"):
-        if (ROOT / name).is_dir():
-            skipped = shutil.ignore_patterns("__pycache__", "*.egg-info")
-            shutil.copytree(ROOT / name, sources / name, ignore=skipped)
-        else:
-            shutil.copy(ROOT / name, sources / name)
+    for line in CONTAINER_FILE.read_text().splitlines():
+        command, *names = line.split() or [""]
+        for name in names[:-1] if command == "COPY" else ():
+            (sources / name).parent.mkdir(exist_ok=True)
+            if (ROOT / name).is_dir():
+                skipped = shutil.ignore_patterns("__pycache__", "*.egg-info")
+                shutil.copytree(ROOT / name, sources / name, ignore=skipped)
+            else:
+                shutil.copy(ROOT / name, sources / name)
     options = ["-q", "--no-deps", "-w", str(folder)]
     command = [sys.executable, "-m", "pip", "wheel", *options, str(sources)]
     subprocess.run(command, check=True)

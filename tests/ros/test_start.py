@@ -33,6 +33,7 @@ LOG_LEVEL = "parameter log_level is 'loud'; it takes debug, info, warn, error, f
             1,
             "error: /nowhere/secret: cannot be read: No such file",
         ),
+        (["--leader-lease", "its"], 1, "error: --leader-lease: 'its' names no Lease; write"),
         (["--signing-key", "/no/such/key"], 1, "signing key /no/such/key is not a file"),
     ],
 )

@@ -68,6 +68,27 @@ class ClusterAccess(FrozenModel):
         )
 
 
+def own_cluster_api() -> Any:  # noqa: ANN401 - the library has no types
+    """Return the API of the cluster in which this process is a pod, as its service account.
+
+    A call that fails is not tried again.
+
+    Raises:
+        InvalidInput: if this process is not a pod, or its pod has no token.
+    """
+    from kubernetes import client, config  # noqa: PLC0415 - half a second; only when used
+
+    settings = client.Configuration()
+    settings.retries = False
+    try:
+        config.load_incluster_config(settings)
+    except config.ConfigException as error:
+        raise InvalidInput.at(
+            "--leader-lease", f"needs a pod with a service account's token: {error}"
+        ) from None
+    return client.CustomObjectsApi(client.ApiClient(settings))
+
+
 class AccessFile(FileModel):
     """The operator's file: the access to each cluster, by its name."""
 

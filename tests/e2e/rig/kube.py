@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
+from kubernetes.client.api.authorization_v1_api import AuthorizationV1Api
+from kubernetes.client.api.core_v1_api import CoreV1Api
 from kubernetes.client.api_client import ApiClient
 from kubernetes.client.configuration import Configuration
 from kubernetes.client.exceptions import ApiException
@@ -113,6 +115,19 @@ class Kube:
             body=body,
             content_type="application/merge-patch+json",
         )
+
+    def token(self, account: str, namespace: str) -> str:
+        """Return a new token of a service account, as a kubelet gets it for a pod."""
+        call: Any = CoreV1Api(self.api).create_namespaced_service_account_token
+        return str(call(account, namespace, {"spec": {"expirationSeconds": 3607}}).status.token)
+
+    def rules(self, account: str, namespace: str) -> list[Manifest]:
+        """Return what a service account may do in its namespace."""
+        who = f"system:serviceaccount:{namespace}:{account}"
+        api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)
+        call: Any = AuthorizationV1Api(api).create_self_subject_rules_review
+        review = api.sanitize_for_serialization(call({"spec": {"namespace": namespace}}))
+        return list(review["status"]["resourceRules"])
 
     def reconcile(self, kind: str, name: str, namespace: str) -> str:
         """Trigger a Flux controller; return the token for `handled`."""

@@ -1,0 +1,311 @@
+"""The generator's chart: what helm and the API server take, and its pods on the real API.
+
+The cluster's nodes are simulated, so each pod's container is started here as a kubelet would start
+it: the pod as the API has it, its volumes, its user, and a token of its account.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.e2e.common.expected import demand
+from tests.e2e.common.pod import Pod
+from tests.e2e.common.ros import Client
+from tests.e2e.common.staterepo import demandops
+from tests.e2e.rig import githttp, launch
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.kube import Manifest, build_manifest
+from tests.e2e.rig.net import answers, free_port, url
+from tests.kit.repo import git
+
+CHART = Path(__file__).parents[3] / "deploy" / "chart"
+RELEASE, NAMESPACE = "generator", "demandops"
+TAKES_OVER_S = 25
+USER, PASSWORD = "robot", "a token of the git server"
+NEEDED = {"stateRepo": "https://git.invalid/state.git", "image": {"repository": "its/demandops"}}
+ALL = NEEDED | {
+    "stateRepo": "ssh://git@git.invalid/state.git",
+    "image": {"repository": "its/demandops", "digest": "sha256:" + 64 * "0"},
+    "imagePullSecrets": [{"name": "registry"}],
+    "replicas": 3,
+    "secrets": {use: f"{use}-secret" for use in ("git", "signing", "clusters", "webhook", "forge")},
+    "parameters": {"answer": "healthy", "answer_timeout": "60.0"},
+    "ros": {"domainId": 42, "env": [{"name": "ROS_STATIC_PEERS", "value": '10.0.0.1;"#: {'}]},
+    "hostNetwork": True,
+    "storage": {"size": "5Gi", "className": "fast"},
+    "nodeSelector": {"node_id": "edge"},
+    "tolerations": [{"key": "busy", "operator": "Exists"}],
+    "affinity": {"nodeAffinity": {}},
+}
+
+
+@pytest.fixture(scope="module")
+def namespace(rig: Rig) -> Iterator[str]:
+    rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
+    yield NAMESPACE
+    rig.kube.delete("Namespace", NAMESPACE)
+
+
+@pytest.mark.parametrize(
+    "values", [NEEDED, NEEDED | {"replicas": 1}, ALL], ids=["as it comes", "one pod", "all set"]
+)
+def test_the_chart_passes_lint_and_what_it_gives_the_server(
+    rig: Rig, namespace: str, tmp_path: Path, values: dict[str, Any]
+) -> None:
+    given = tmp_path / "values.json"
+    given.write_text(json.dumps(values))
+    rig.helm("lint", "--strict", "--quiet", f"--values={given}", str(CHART))
+    text = rig.helm("template", RELEASE, str(CHART), f"-n={namespace}", f"--values={given}")
+    made = [manifest for manifest in yaml.safe_load_all(text) if manifest]
+    for manifest in made:
+        manifest["metadata"].setdefault("namespace", namespace)
+    rig.kube.apply(*made, dry_run=True)
+    kinds = {manifest["kind"] for manifest in made}
+    assert ({"Lease", "Role", "RoleBinding"} <= kinds) == (values.get("replicas") != 1)
+    assert ("Service" in kinds) == ("secrets" in values)
+
+
+@pytest.mark.parametrize("missing", ["stateRepo", "image"])
+def test_the_chart_is_refused_without_what_it_needs(rig: Rig, missing: str) -> None:
+    given = [f"--set={key}={value}" for key, value in _flat(NEEDED) if not key.startswith(missing)]
+    with pytest.raises(Exception, match=missing):
+        rig.helm("template", RELEASE, str(CHART), *given)
+
+
+class Deployed:
+    """The chart as an operator installs it; its state repo's Git server wants a token."""
+
+    def __init__(self, rig: Rig, folder: Path, ros_domain: int) -> None:
+        self.rig, self.folder, self._port = rig, folder, free_port()
+        self._git: subprocess.Popen[bytes] | None = None
+        self.repository = folder / "git" / "state.git"
+        self.repository.parent.mkdir()
+        self.state_repo = f"{url(self._port)}/state.git"
+        demandops(folder, "init", str(self.repository), "--bare", "--url", self.state_repo)
+        git(self.repository, "config", "http.receivepack", "true")
+        self.start_git()
+        key = folder / "key"
+        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
+        self.private_key = key.read_text()
+        self._secret("git", username=USER, password=PASSWORD)
+        self._secret("signing", **{"ssh-privatekey": self.private_key})
+        self.values: dict[str, Any] = {
+            "stateRepo": self.state_repo,
+            "image": {"repository": "its/demandops"},
+            "secrets": {"git": "git", "signing": "signing"},
+            "ros": {
+                "domainId": ros_domain,
+                "env": [{"name": "ROS_AUTOMATIC_DISCOVERY_RANGE", "value": "LOCALHOST"}],
+            },
+        }
+        self.install()
+        server = yaml.safe_load(rig.kubeconfig.read_text())["clusters"][0]["cluster"]["server"]
+        names = [f"{RELEASE}-{number}" for number in range(2)]
+        for name in names:
+            rig.kube.wait(f"pod {name}", lambda name=name: rig.kube.get("Pod", name, NAMESPACE))
+        address = server.removeprefix("https://")
+        self.pods = [Pod(rig.kube, name, NAMESPACE, address, folder) for name in names]
+
+    def install(self) -> None:
+        """Install the chart, or upgrade it."""
+        given = self.folder / "values.json"
+        given.write_text(json.dumps(self.values))
+        options = ["--install", f"--namespace={NAMESPACE}", f"--values={given}"]
+        self.rig.helm("upgrade", RELEASE, str(CHART), *options)
+
+    def start_git(self) -> None:
+        command = [sys.executable, "-I", "-S", githttp.__file__]
+        command += ["--root", str(self.repository.parent), "--port", str(self._port)]
+        secrets = {githttp.USER_VARIABLE: USER, githttp.PASSWORD_VARIABLE: PASSWORD}
+        self._git = subprocess.Popen(launch.command(*command), env={**os.environ, **secrets})
+        serves = answers(self._port, githttp.HEALTH)
+        self.rig.kube.wait("the Git server", lambda: serves() is None)
+
+    def stop_git(self) -> None:
+        assert self._git is not None
+        self._git.kill()
+        self._git.wait(10)
+
+    def start(self, *pods: Pod) -> None:
+        """Start pods and wait until each is the leader or stands by."""
+        for pod in pods:
+            pod.start()
+        for pod in pods:
+            self.wait_text(pod, "taking demands on", "standing by")
+
+    def wait_text(self, pod: Pod, *texts: str) -> None:
+        def told() -> bool:
+            assert pod.code is None, pod.text()
+            return any(text in pod.text() for text in texts)
+
+        self.rig.kube.wait(f"{' or '.join(texts)} in {pod.log}", told, TAKES_OVER_S)
+
+    @property
+    def lease(self) -> dict[str, Any]:
+        found = self.rig.kube.get("Lease", RELEASE, NAMESPACE)
+        assert found is not None
+        return dict(found.get("spec") or {})
+
+    def subjects(self) -> str:
+        """Return the first lines of the commits."""
+        return git(self.repository, "log", "--format=%s", "main")
+
+    def close(self) -> None:
+        for pod in self.pods:
+            pod.kill()
+        self.rig.helm("uninstall", RELEASE, f"--namespace={NAMESPACE}")
+        self.stop_git()
+
+    def _secret(self, name: str, **data: str) -> None:
+        encoded = {key: base64.b64encode(value.encode()).decode() for key, value in data.items()}
+        self.rig.kube.apply(build_manifest("v1", "Secret", name, NAMESPACE, data=encoded))
+
+
+@pytest.fixture(scope="module")
+def deployed(
+    rig: Rig, namespace: str, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Deployed]:
+    if rig.existing:
+        pytest.skip("real kubelets start the pods of an existing cluster")
+    if os.geteuid():
+        pytest.skip("only root can start a container")
+    folder = tmp_path_factory.mktemp("deployed")
+    for parent in (folder, *folder.parents):  # the pod's user must reach its folders
+        if parent.owner() == "root" and parent != Path("/tmp"):
+            parent.chmod(parent.stat().st_mode | 0o011)
+    made = Deployed(rig, folder, ros_domain)
+    made.start(*made.pods)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def active(deployed: Deployed) -> Pod:
+    """The pod that answers."""
+    (pod,) = [pod for pod in deployed.pods if _leads(pod)]
+    return pod
+
+
+@pytest.fixture
+def standby(deployed: Deployed, active: Pod) -> Pod:
+    (pod,) = [pod for pod in deployed.pods if pod is not active]
+    return pod
+
+
+def test_one_pod_answers_with_signed_commits(deployed: Deployed, client: Client) -> None:
+    sent = client.call(demand(1))
+    assert sent.status == "succeeded", sent.message
+    assert "gpgsig" in git(deployed.repository, "cat-file", "commit", sent.commit)
+    assert sum(_leads(pod) for pod in deployed.pods) == 1
+    assert len(deployed.lease["holderIdentity"]) > 36
+
+
+def test_a_pod_has_neither_privileges_nor_secrets_in_sight(
+    deployed: Deployed, active: Pod, standby: Pod
+) -> None:
+    for pod in (active, standby):
+        process = Path("/proc", str(pod.pid))
+        status = dict(line.split(":\t", 1) for line in (process / "status").open() if ":\t" in line)
+        assert status["Uid"].split() == 4 * ["10001"]
+        assert int(status["CapEff"], 16) == int(status["CapBnd"], 16) == 0
+        with pytest.raises(OSError, match="Read-only file system"):
+            (process / "root" / "written").touch()
+        shown = [json.dumps(pod.manifest), pod.text()]
+        shown += [(process / file).read_text() for file in ("cmdline", "environ")]
+        for secret in (PASSWORD, deployed.private_key.splitlines()[1]):
+            assert not [text for text in shown if secret in text]
+
+
+def test_the_account_may_renew_the_lease_and_nothing_else(deployed: Deployed) -> None:
+    rules = deployed.rig.kube.rules(RELEASE, NAMESPACE)
+    own = [rule for rule in rules if not rule["resources"][0].startswith("selfsubject")]
+    assert own == [
+        {
+            "apiGroups": ["coordination.k8s.io"],
+            "resources": ["leases"],
+            "resourceNames": [RELEASE],
+            "verbs": ["get", "update"],
+        }
+    ]
+
+
+def test_a_killed_pod_is_replaced_and_stands_by_when_it_returns(
+    deployed: Deployed, active: Pod, standby: Pod, client: Client
+) -> None:
+    active.kill()
+    deployed.wait_text(standby, "taking demands on")
+    sent = client.call(demand(2))
+    assert sent.status == "succeeded", sent.message
+    deployed.start(active)
+    assert _leads(standby)
+    assert not _leads(active)
+
+
+def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
+    deployed: Deployed, active: Pod, standby: Pod, client: Client
+) -> None:
+    before = deployed.subjects()
+    deployed.stop_git()
+    sent = client.send(demand(3))
+    client.wait(lambda: "waiting:" in sent.stages)
+    active.kill()
+    deployed.wait_text(standby, "taking demands on")
+    deployed.start_git()
+    assert deployed.subjects() == before, "the other pod knows nothing of it"
+    slow = deployed.repository / "hooks" / "pre-receive"
+    slow.write_text("#!/bin/sh\nsleep 5\n")
+    slow.chmod(0o755)
+    deployed.start(active)
+    slow.unlink()
+    assert deployed.subjects() != before
+    assert "resuming demand" in active.text()
+    assert not _leads(active)
+
+
+def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed, active: Pod) -> None:
+    holder = deployed.lease["holderIdentity"]
+    deployed.values |= {"fetchInterval": "10s"}
+    deployed.install()
+    assert deployed.lease["holderIdentity"] == holder
+    assert active.code is None
+
+
+def test_a_pod_that_ends_leaves_the_lease_at_once(
+    deployed: Deployed, active: Pod, standby: Pod
+) -> None:
+    holder = deployed.lease["holderIdentity"]
+    assert active.stop() == 0
+    assert deployed.lease["holderIdentity"] != holder
+    deployed.wait_text(standby, "taking demands on")
+    deployed.start(active)
+
+
+def test_a_pod_that_loses_the_lease_ends(deployed: Deployed, active: Pod) -> None:
+    spec = {"holderIdentity": "a person", "leaseDurationSeconds": 3}
+    deployed.rig.kube.patch("Lease", RELEASE, {"spec": spec}, NAMESPACE)
+    assert deployed.rig.kube.wait("its end", lambda: active.code) == 3
+    told = f"the Lease {NAMESPACE}/{RELEASE} is held by 'a person'; another process may be the "
+    assert f"error: {told}leader now, so this one must start again" in active.text()
+
+
+def _leads(pod: Pod) -> bool:
+    """Return whether a pod serves the actions."""
+    return pod.code is None and "taking demands on" in pod.text()
+
+
+def _flat(values: Manifest, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value

@@ -1,0 +1,270 @@
+"""Who leads: processes compete for a Lease over real HTTP, in time that tests move.
+
+That a real API server takes what is written here is shown in tests/e2e/flux/test_deployment.py.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.cluster.leadership import Leadership
+from demandops.errors import InvalidInput
+from demandops.runtime import Runtime
+from kubernetes import client, config
+
+from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.turns import Turns
+
+PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
+TAKES_OVER_S = 15 + 2
+"""A Lease that nobody renews ends after 15 s, and the others look every 2 s."""
+
+
+@dataclass
+class Server:
+    """An API server with one Lease.
+
+    ``trouble`` says whether a call fails, before or after its effect. ``takes`` says for how many
+    seconds the caller then waits. ``ages`` are the ages of the Lease, each while a process led.
+    """
+
+    turns: Turns
+    lease: dict[str, Any] = field(
+        default_factory=lambda: {"metadata": {"name": "generator", "resourceVersion": "1"}}
+    )
+    trouble: Callable[[], str] = lambda: ""
+    takes: Callable[[], float] = lambda: 0
+    api: Any = None
+    processes: list[Process] = field(default_factory=list)
+    renewed_at: float = 0
+    ages: list[float] = field(default_factory=list)
+
+    @property
+    def age(self) -> float:
+        return self.turns.monotonic() - self.renewed_at
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        return dict(self.lease.get("spec") or {})
+
+    def answer(self, call: Call) -> Answer:
+        assert call.path == PATH
+        answer = self._answer(call, self.trouble())
+        self.turns.pass_(self.takes())
+        self.ages += [self.age for process in self.processes if process.leads]
+        return answer
+
+    def _answer(self, call: Call, trouble: str) -> Answer:
+        if trouble == "before":
+            return Answer.json({"reason": "away"}, 503)
+        if call.method == "PUT":
+            given = call.json()
+            version = self.lease["metadata"]["resourceVersion"]
+            if given["metadata"]["resourceVersion"] != version:
+                return Answer.json({"reason": "Conflict"}, 409)
+            given["metadata"]["resourceVersion"] = str(int(version) + 1)
+            self.lease, self.renewed_at = given, self.turns.monotonic()
+        if trouble == "after":
+            return Answer.json({"reason": "away"}, 503)
+        return Answer.json(copy.deepcopy(self.lease))
+
+
+class Process(Runtime):
+    """A process that competes for the Lease, and may be killed."""
+
+    def __init__(self, server: Server, may_lead: Callable[[], bool] = lambda: True) -> None:
+        super().__init__()
+        turns = server.turns
+        self.turns, self.told = turns, list[str]()
+        self.now, self.monotonic = turns.now, turns.monotonic  # type: ignore[method-assign]
+        self.sleep, self.event = turns.sleep, turns.event  # type: ignore[method-assign]
+        self.leadership = Leadership(
+            "its/generator", may_lead, lambda: self.told.append("leader"), server.api, self
+        )
+        server.processes.append(self)
+
+    def start_thread(self, name: str, target: Callable[[], object]) -> Any:
+        self.thread = self.turns.start_thread(name, target)
+        return self.thread
+
+    @property
+    def leads(self) -> bool:
+        return self.leadership.is_leader and not self.is_dead
+
+    @property
+    def is_dead(self) -> bool:
+        return bool(self.thread.dead) or self.told[-1:] == ["killed"]
+
+    def kill(self) -> None:
+        self.told.append("killed")
+        self.turns.stop([self.thread])
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with new_server(tmp_path, 0) as made:
+        yield made
+
+
+@contextmanager
+def new_server(folder: Path, seed: int) -> Iterator[Server]:
+    made = Server(Turns(seed))
+    with serving(made.answer) as running:
+        reached = config.new_client_from_config(str(kubeconfig(folder, running.url)))
+        made.api = client.CustomObjectsApi(reached)
+        yield made
+
+
+def test_one_leads_and_the_other_takes_over_after_it_was_killed(
+    server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "demandops")
+    first = Process(server)
+    server.turns.sleep(1)
+    second = Process(server)
+    server.turns.sleep(60)
+    assert (first.leads, second.leads, second.told) == (True, False, [])
+    assert "standing by: the leader is '" in caplog.text
+    first.kill()
+    server.turns.sleep(10)
+    assert not second.leads
+    server.turns.sleep(TAKES_OVER_S - 10)
+    assert (second.leads, second.told) == (True, ["leader"])
+    assert server.spec["leaseTransitions"] == 2
+
+
+def test_a_leader_that_stops_leaves_at_once(server: Server) -> None:
+    first = Process(server)
+    server.turns.sleep(1)
+    second = Process(server)
+    server.turns.sleep(5)
+    first.leadership.close()
+    assert server.spec["holderIdentity"] == ""
+    server.turns.sleep(2)
+    assert second.leads
+
+
+def test_one_that_may_not_lead_yet_leaves_a_free_lease(server: Server) -> None:
+    delivered: list[bool] = []
+    one = Process(server, may_lead=lambda: bool(delivered))
+    server.turns.sleep(30)
+    assert (one.leads, server.spec) == (False, {})
+    delivered.append(True)
+    server.turns.sleep(2)
+    assert one.leads
+
+
+def test_clocks_that_differ_between_machines_do_not_matter(server: Server) -> None:
+    first = Process(server)
+    server.turns.sleep(1)
+    server.turns.set_by(86_400)
+    second = Process(server)
+    server.turns.sleep(60)
+    assert (first.leads, second.leads) == (True, False)
+
+
+def test_a_leader_that_cannot_renew_ends_before_another_leads(server: Server) -> None:
+    first = Process(server)
+    server.turns.sleep(1)
+    server.trouble = lambda: "before"
+    server.turns.sleep(12)
+    assert not first.leads
+    assert str(first.unsound) == (
+        "the Lease its/generator was not renewed for 10 s (the Lease its/generator cannot be read "
+        "or written: ServiceException: Service Unavailable); another process may be the leader "
+        "now, so this one must start again"
+    )
+
+
+def test_a_leader_whose_lease_somebody_took_ends(server: Server) -> None:
+    first = Process(server)
+    server.turns.sleep(1)
+    server.lease["spec"]["holderIdentity"] = "a person"
+    server.lease["metadata"]["resourceVersion"] = "7"
+    server.turns.sleep(2)
+    assert not first.leads
+    assert str(first.unsound) == (
+        "the Lease its/generator is held by 'a person'; another process may be the leader now, so "
+        "this one must start again"
+    )
+
+
+def test_a_lease_that_cannot_be_read_is_told_once(
+    server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    server.trouble = lambda: "before"
+    one = Process(server)
+    server.turns.sleep(30)
+    assert (one.is_dead, one.leads) == (False, False)
+    assert caplog.messages == [
+        "the Lease its/generator cannot be read or written: ServiceException: Service Unavailable"
+    ]
+
+
+@pytest.mark.parametrize("first_s", [0, 1.99])
+@pytest.mark.parametrize("next_s", [0.16, 0.24, 0.6, 1])
+def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
+    server: Server, first_s: float, next_s: float
+) -> None:
+    """The last renewal has a slow answer; then reading works, and writing fails."""
+    one, calls = Process(server), count()
+    server.turns.sleep(0.5)
+    server.trouble = lambda: "before" if (number := next(calls)) > 1 and number % 2 else ""
+    server.takes = lambda: first_s if server.age == 0 else next_s if server.age < 9.5 else 1.99
+    server.turns.sleep(40)
+    assert max(server.ages) < 15
+    assert one.is_dead
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_never_do_two_lead(tmp_path: Path, seed: int) -> None:
+    """Calls fail before or after their effect, take time, and processes are killed."""
+    chance = random.Random(seed)
+    with new_server(tmp_path, seed) as server:
+        turns, away_until = server.turns, [0.0]
+
+        def trouble() -> str:
+            if chance.random() < 0.02:
+                away_until[0] = turns.monotonic() + chance.uniform(0, 40)
+            if turns.monotonic() < away_until[0]:
+                return chance.choice(["before", "after"])
+            return chance.choices(["", "before", "after"], [8, 1, 1])[0]
+
+        server.trouble, server.takes = trouble, lambda: chance.choice([0.01, chance.uniform(0, 2)])
+        for _ in range(3):
+            Process(server)
+        for _ in range(300):
+            turns.sleep(chance.uniform(0, 1))
+            assert sum(one.leads for one in server.processes) <= 1
+            for one in [one for one in server.processes if not one.is_dead]:
+                if chance.random() < 0.01:
+                    one.kill()
+            while sum(not one.is_dead for one in server.processes) < 3:
+                Process(server)
+        assert max(server.ages) < 15
+        assert sum("leader" in one.told for one in server.processes) > 1
+
+
+@pytest.mark.parametrize("name", ["generator", "its/", "/generator", "Its/generator", "a/b/c"])
+def test_a_name_that_no_lease_has_is_refused(name: str) -> None:
+    with pytest.raises(InvalidInput) as refused:
+        Leadership(name, lambda: True, list)
+    assert str(refused.value) == f"--leader-lease: '{name}' names no Lease; write NAMESPACE/NAME"
+
+
+def test_a_process_that_is_no_pod_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
+    with pytest.raises(InvalidInput) as refused:
+        Leadership("its/generator", lambda: True, list)
+    assert str(refused.value) == (
+        "--leader-lease: needs a pod with a service account's token: Service host/port is not set."
+    )
