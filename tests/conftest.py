@@ -20,7 +20,7 @@ from tests.kit.generator import running
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
 
-_LIMIT_S = 600.0
+_LIMIT_S = 300.0
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -102,8 +102,8 @@ def _print_answer(answer: Answer, output: str) -> None:
 
 def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
     over = REAL.event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: over.set())
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
     client.requesters = tuple(data.get("requesters", ()))
     goal, on_stage = {**data, "operation": "put"}, _print_stages(output)
     with HeldDemand(
@@ -114,5 +114,7 @@ def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
         if output != "json":
             errors.print("held until Ctrl-C")
         over.wait()
+    for number, handler in before.items():
+        signal.signal(number, handler)
     if output != "json":
         errors.print("released")

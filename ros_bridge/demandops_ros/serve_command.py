@@ -158,23 +158,23 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
         push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
         status = RolloutWatcher(clusters, generator) if clusters else None
-        signals = _Signals()
-        leadership = None
-        if leader_lease:
-            # what the journal holds comes before the demands of clients, unless it has to wait
-            leadership = Leadership(
-                leader_lease,
-                lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
-                signals.wake,
-            )
-            signals.wait(lambda: leadership.is_leader)
-        if signals.stopping:  # before it was the leader
-            generator.close()
-        else:
-            _run(generator, settings, status, push_webhook, signals)
-        if leadership is not None:
-            leadership.close()
-        trigger.close()
+        with _Signals() as signals:
+            leadership = None
+            if leader_lease:
+                # what the journal holds comes before the demands of clients, unless it has to wait
+                leadership = Leadership(
+                    leader_lease,
+                    lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
+                    signals.wake,
+                )
+                signals.wait(lambda: leadership.is_leader)
+            if signals.stopping:  # before it was the leader
+                generator.close()
+            else:
+                _run(generator, settings, status, push_webhook, signals)
+            if leadership is not None:
+                leadership.close()
+            trigger.close()
     finally:
         rclpy.try_shutdown()
 
@@ -257,10 +257,20 @@ class _Signals:
         self.stopping = False
         self._read, self._write = os.pipe()
         os.set_blocking(self._write, False)
-        signal.set_wakeup_fd(self._write)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
+
+    def __enter__(self) -> _Signals:
+        """Handle the signals from now on."""
+        self._wakeup = signal.set_wakeup_fd(self._write)
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        self._before = {number: signal.signal(number, self._handle) for number in numbers}
         REAL.when_unsound = self.wake
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Leave the signals to who handled them before."""
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
         """Wait for a signal, or until something holds; :meth:`wake` looks again.

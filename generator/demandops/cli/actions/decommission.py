@@ -8,7 +8,12 @@ from typing import Any
 
 import click
 
-from demandops.cli.actions.ledger_change import claim_text, print_consequences, started_generator
+from demandops.cli.actions.ledger_change import (
+    await_answer,
+    claim_text,
+    print_consequences,
+    started_generator,
+)
 from demandops.cli.json_output import claim_data, output_option, show
 from demandops.cli.output import progress, signing_option, state_repo_option
 from demandops.decision import decide
@@ -60,7 +65,9 @@ def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> di
     """Return the result, or None if a known node holds nothing, which is not an error."""
     with started_generator(state_repo, signing_key) as generator:
         try:
-            receipt = generator.submit(goal).future.result()
+            ticket = generator.submit(goal)
+            await_answer(ticket.future)
+            receipt = ticket.future.result()
         except Refused as error:
             _require_nothing_held(error, goal, generator.snapshot)
             return None

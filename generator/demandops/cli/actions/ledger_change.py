@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,18 @@ from demandops.cli.views.diff import release_lines
 from demandops.decision import Decision
 from demandops.errors import Fault
 from demandops.service import Generator
+
+_LOOK_UP_S = 0.5
+
+
+def await_answer(future: Future[Any]) -> None:
+    """Return once a demand has an answer; Ctrl-C and SIGTERM interrupt it.
+
+    It looks up again and again: a wait without end may not see a signal that arrived just before
+    it, or whose handler another library set.
+    """
+    while not future.done():
+        wait([future], timeout=_LOOK_UP_S)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import click
 
 from demandops import strict_yaml
 from demandops.cli.actions.ledger_change import (
+    await_answer,
     print_consequences,
     print_refusal,
     started_generator,
@@ -161,7 +162,7 @@ def _book(
             for document in documents:
                 answers.append(_submitted(generator, document, wait))
             for done, answer in enumerate(answers, start=1):
-                answer.exception()
+                await_answer(answer)
                 report(done, len(documents))
     except KeyboardInterrupt:
         if not answers:

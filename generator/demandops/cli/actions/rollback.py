@@ -9,7 +9,12 @@ from typing import Any
 
 import click
 
-from demandops.cli.actions.ledger_change import claim_text, print_refusal, started_generator
+from demandops.cli.actions.ledger_change import (
+    await_answer,
+    claim_text,
+    print_refusal,
+    started_generator,
+)
 from demandops.cli.json_output import claim_data, faults_of, output_option, show
 from demandops.cli.output import progress, signing_option, state_repo_option
 from demandops.cli.views.diff import release_lines
@@ -100,7 +105,9 @@ def _roll_back(
     """Roll back with a generator; return what differs from the dry run on ``base``."""
     try:
         with started_generator(state_repo, signing_key) as generator:
-            receipt = generator.submit(goal).future.result()
+            ticket = generator.submit(goal)
+            await_answer(ticket.future)
+            receipt = ticket.future.result()
     except InvalidInput as error:
         return {"outcome": "refused", **_consequences(None), "faults": faults_of(error)}
     result: dict[str, Any] = {"outcome": receipt.outcome, "commit": receipt.commit}
