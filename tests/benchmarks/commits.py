@@ -48,8 +48,8 @@ class Floor:
     """The same objects, loose, by bare pygit2: what one file for each object cannot go below."""
 
     def __init__(self, path: Path) -> None:
-        self._repo = pygit2.Repository(str(path))
-        self._new = NewObjects(pygit2.Repository(str(path)))
+        self._repo, self._other = pygit2.Repository(str(path)), pygit2.Repository(str(path))
+        self._new = NewObjects(self._other)
 
     def commit(self, base: pygit2.Commit, files: Mapping[str, str | None], text: str) -> float:
         """Write blobs, trees, commit and branch; return the seconds."""

@@ -1,6 +1,6 @@
 """``make simulate``: plays histories for ``SIMULATE_S`` seconds, from ``SEED`` or any.
 
-A history that fails is told with the command that plays it again, and the run goes on.
+A history that fails is told with the command that plays it again, and the run goes on until ten do.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def main() -> int:
     end = time.monotonic() + float(os.environ.get("SIMULATE_S") or 60)
     counts = Counter[str](histories=0, demands=0, commits=0, failures=0)
     try:
-        while time.monotonic() < end and counts["histories"] < most:
+        while time.monotonic() < end and counts["histories"] < most and counts["failures"] < 10:
             try:
                 tip, demands, commits = play(seed)
                 counts.update(demands=demands, commits=commits)

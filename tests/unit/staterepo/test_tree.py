@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import tempfile
+import weakref
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -195,3 +197,11 @@ def test_git_reads_packed_files_of_every_size(tmp_path: Path) -> None:
     git(tmp_path, "verify-pack", str(index))
     git(tmp_path, "fsck", "--strict")
     assert {path: git(tmp_path, "show", f"main:{path}") for path in files} == files
+
+
+def test_a_repo_that_nobody_holds_is_closed(tmp_path: Path) -> None:
+    repo = pygit2.init_repository(tmp_path, bare=True)
+    new, seen = NewObjects(repo), weakref.ref(repo)
+    del repo, new
+    gc.collect()
+    assert seen() is None

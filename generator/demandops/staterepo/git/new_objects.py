@@ -14,6 +14,7 @@ import os
 import re
 import shutil
 import subprocess
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -47,9 +48,17 @@ class NewObjects(pygit2.OdbBackend):
 
     def __init__(self, repo: Repository) -> None:
         super().__init__()
-        self.repo = repo
+        # the repo holds this object where Python does not see it, so holding it too would leak both
+        self._repo = weakref.ref(repo)
         self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
         repo.odb.add_backend(self, _LAST)
+
+    @property
+    def repo(self) -> Repository:
+        """The repository, as long as its owner holds it."""
+        repo = self._repo()
+        assert repo is not None  # noqa: S101 - whoever writes to it holds it
+        return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
         """Keep an object and return its id."""
