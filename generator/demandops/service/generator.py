@@ -21,6 +21,7 @@ from demandops.service.worker import Worker
 from demandops.staterepo.git.address import connect
 from demandops.staterepo.git.repository import access_error
 from demandops.staterepo.git.signing import Signer
+from demandops.staterepo.history import revisions
 from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.slot import Slot
@@ -91,7 +92,6 @@ class Generator:
                 raise access_error(error, state_repo) from None
             raise
         self._repository, self._runtime = repository, runtime
-        self.given_address = state_repo
         self.address = repository.address
         self.queue_limit = queue_limit
         self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
@@ -114,6 +114,20 @@ class Generator:
     def snapshot(self) -> Snapshot:
         """The newest published state; any thread may read it."""
         return self._worker.snapshot
+
+    def snapshot_at(self, revision: str) -> Snapshot:
+        """Return the state in effect at a commit or a time, as far as it is fetched.
+
+        From any thread; it may take seconds.
+
+        Raises:
+            InvalidInput, StateRepoError: if there is no such commit, or it is not valid.
+        """
+        objects = self._repository.reopened()
+        tip, now = self.snapshot.commit, self._runtime.now()
+        return state_in_effect.snapshot_at(
+            objects, revisions.resolve(objects, tip, revision, now).id
+        )
 
     @property
     def remote_status(self) -> RemoteStatus:
