@@ -25,15 +25,13 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
+from demandops_ros.action_endpoints import DEEP_QOS, OtherServers
 from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
 from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
-DEEP_QOS = QoSProfile(depth=2000)
-"""For the actions' services: with ROS's default of 10, goals that arrive at once are lost."""
 _RESULT_KEPT_S = 900
 """How long a client may ask for a result; rclpy keeps it for ten seconds."""
 _MOST_READERS = 4
@@ -83,7 +81,8 @@ class DemandNode(Node):  # type: ignore[misc]
             callback_group=ReentrantCallbackGroup(),
         )
         self._bookkeeping_topic = BookkeepingTopic(self, generator, self._from_worker)
-        self._diagnostics = Diagnostics(self, generator)
+        others = OtherServers(self, (action_name, demand_action_name))
+        self._diagnostics = Diagnostics(self, generator, others)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> ActionServer:
         return ActionServer(

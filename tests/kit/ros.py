@@ -25,8 +25,8 @@ from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.cli.main import run
 from demandops.settings import DEFAULT_ACTION_NAME
+from demandops_ros.action_endpoints import DEEP_QOS
 from demandops_ros.messages import fill_message
-from demandops_ros.node import DEEP_QOS
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
