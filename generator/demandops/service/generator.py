@@ -93,7 +93,6 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        self.queue_limit = queue_limit
         self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
@@ -108,6 +107,7 @@ class Generator:
         self._stop_lock = runtime.lock()
         for operation in self.operations:
             log.info("resuming demand %s from the journal", operation)
+        runtime.keep_running("journal", self._demands.journal_arrivals)
         self._thread = runtime.keep_running("writer", self._worker.run)
 
     @property
@@ -168,10 +168,10 @@ class Generator:
 
         Returns:
             A ticket whose future returns the :class:`Receipt`, or raises ``Refused`` with every
-            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``.
+            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``; ``ShuttingDown`` or
+            ``QueueFull`` if the demand is not accepted at all.
 
         Raises:
-            ShuttingDown, QueueFull: if the demand is not accepted at all.
             ValueError: for an operation id that a commit trailer cannot carry.
         """
         operation = operation or self._runtime.fresh_id()
@@ -182,7 +182,7 @@ class Generator:
         try:
             ticket.goal = json.loads(json.dumps(goal))
         except (TypeError, ValueError, RecursionError):
-            ticket.future.set_exception(Refused([fault("", "the goal is not plain data")]))
+            ticket.refuse(Refused([fault("", "the goal is not plain data")]))
             return ticket
         ticket.base = str(self.snapshot.commit)
         self._demands.arrive(ticket)
