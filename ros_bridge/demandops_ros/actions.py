@@ -15,7 +15,6 @@ from demandops.errors import (
     DemandOpsError,
     InvalidInput,
     NotReached,
-    QueueFull,
     ShuttingDown,
     TurnedDown,
     Withdrawn,
@@ -30,7 +29,6 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
     (Withdrawn, "withdrawn"),
     (TurnedDown, "turned-down"),
     (ShuttingDown, "shutting-down"),
-    (QueueFull, "queue-full"),
     (DemandOpsError, "state-repo"),
     (BaseException, "fault"),
 )

@@ -12,7 +12,6 @@ from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops.service import Generator
-from demandops.staterepo import reader
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops_interfaces.msg import Bookkeeping as BookkeepingMessage
 from rclpy.node import Node
@@ -22,11 +21,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
     """Fill and return the response: the bookkeeping at ``request.at``, or at the tip if empty."""
     try:
-        if request.at:
-            with reader.opened(generator.given_address) as repo:
-                snapshot = repo.snapshot(request.at)
-        else:
-            snapshot = generator.snapshot
+        snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
         response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
         response.ok = True
     except DemandOpsError as error:

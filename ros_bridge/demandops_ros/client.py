@@ -26,8 +26,8 @@ from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import QoSProfile
 
+from demandops_ros.action_endpoints import DEEP_QOS
 from demandops_ros.messages import demand_goal_from_data
 
 log = logging.getLogger("demandops.client")
@@ -91,15 +91,14 @@ class DemandClient:
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain_id)
         self._node = rclpy.create_node(node_name, context=self._context)
-        deep = QoSProfile(depth=100)
         self._client = ActionClient(
             self._node,
             Demand,
             action_name,
-            goal_service_qos_profile=deep,
-            result_service_qos_profile=deep,
-            cancel_service_qos_profile=deep,
-            feedback_sub_qos_profile=deep,
+            goal_service_qos_profile=DEEP_QOS,
+            result_service_qos_profile=DEEP_QOS,
+            cancel_service_qos_profile=DEEP_QOS,
+            feedback_sub_qos_profile=DEEP_QOS,
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -187,7 +186,8 @@ class DemandClient:
             )
         handle, lost = self._send_until_heard(goal, on_stage, deadline)
         if not handle.accepted:
-            raise DemandError("rejected", "the node accepts no demands now; send it again later")
+            message = "the node accepts no demands now, and its log says why; send it again later"
+            raise DemandError("rejected", message)
         answer = self._await(handle.get_result_async(), deadline)
         result = answer.result
         if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:

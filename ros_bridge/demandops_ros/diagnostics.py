@@ -1,7 +1,8 @@
 """The node's status on ``/diagnostics``, for ROS 2's own tools.
 
-Publishes three statuses once a second: whether the state repo can be reached and written, whether
-its configuration is valid, and whether all parts of the generator work.
+Publishes four statuses once a second: whether the state repo can be reached and written, whether
+its configuration is valid, whether all parts of the generator work, and whether this node alone
+serves its actions.
 """
 
 from __future__ import annotations
@@ -13,15 +14,17 @@ from demandops.service import Generator
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from demandops_ros.action_endpoints import OtherServers
+
 _PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
 class Diagnostics:
-    """Publishes the status of a generator's state repo."""
+    """Publishes the status of a node and of its generator's state repo."""
 
-    def __init__(self, node: Node, generator: Generator) -> None:
-        self._node, self._generator = node, generator
+    def __init__(self, node: Node, generator: Generator, others: OtherServers) -> None:
+        self._node, self._generator, self._others = node, generator, others
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._timer = node.create_timer(_PERIOD_S, self._publish)
 
@@ -30,6 +33,7 @@ class Diagnostics:
         message.header.stamp = self._node.get_clock().now().to_msg()
         of_each = (_of_state_repo, _of_configuration, _of_parts)
         message.status = [status(self._generator) for status in of_each]
+        message.status.append(_of_actions(self._generator, self._others.find()))
         self._publisher.publish(message)
 
 
@@ -71,6 +75,14 @@ def _of_parts(generator: Generator) -> DiagnosticStatus:
     if failures:
         level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
     return _status("demandops: generator", generator.address, level, text, failures)
+
+
+def _of_actions(generator: Generator, others: dict[str, list[str]]) -> DiagnosticStatus:
+    level, text = DiagnosticStatus.OK, "no other node serves them"
+    if any(others.values()):
+        level, text = DiagnosticStatus.WARN, "another node serves them too; see the log"
+    values = {action: ", ".join(nodes) for action, nodes in others.items()}
+    return _status("demandops: actions", generator.address, level, text, values)
 
 
 def _status(

@@ -1,8 +1,8 @@
 """The ROS 2 node: action servers that submit demands to the generator.
 
-Many goals may be open: each waits for its receipt without blocking the executor. Stages and
-receipts from the generator's worker thread are queued, and a guard condition wakes the executor to
-handle them.
+A goal is accepted once its demand is in the generator's journal. Many goals may be open without
+blocking the executor. What the generator's threads tell is queued, and a guard condition wakes the
+executor to handle it. A goal is executed, in ROS's sense, when its outcome is known.
 """
 
 from __future__ import annotations
@@ -10,34 +10,56 @@ from __future__ import annotations
 import uuid
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-from demandops.cluster.health.release_health import Level
+from demandops.cluster.health.release_health import Health, Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
-from demandops.errors import NotReached, QueueFull, ShuttingDown, Unsound, Withdrawn
+from demandops.errors import NotReached, Unsound, Withdrawn
 from demandops.quoting import one_line, quoted
 from demandops.runtime import REAL
-from demandops.service import Generator, Receipt
+from demandops.service import Generator, Receipt, Ticket
 from demandops_interfaces.srv import GetBookkeeping
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
+from demandops_ros.action_endpoints import DEEP_QOS, OtherServers
 from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
 from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
-DEEP_QOS = QoSProfile(depth=2000)
-"""For the actions' services: with ROS's default of 10, goals that arrive at once are lost."""
 _RESULT_KEPT_S = 900
 """How long a client may ask for a result; rclpy keeps it for ten seconds."""
+_DEFAULT_DEPTH = 10
+"""How many answers ROS 2 queues for a client by default; it drops the oldest of more."""
+_SHALLOW = (
+    f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
+    f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
+)
 _MOST_READERS = 4
 """How many calls of the bookkeeping's service to answer at once; each may read all of history."""
+
+
+@dataclass(eq=False)
+class _Goal:
+    """A goal, its demand, and its handle once it is accepted; ``feedback`` waits for the handle."""
+
+    adapter: DeploymentRequestAdapter
+    message: Any
+    ticket: Ticket = field(init=False)
+    handle: Any = None
+    outcome: Receipt | BaseException = field(init=False)
+    reached: Level = "pushed"
+    feedback: list[Any] = field(default_factory=list)
+    is_refused: bool = False
+
+    def __str__(self) -> str:
+        """Return how the log names it."""
+        return f"goal {quoted(self.adapter.name(self.message))}"
 
 
 class DemandNode(Node):  # type: ignore[misc]
@@ -64,9 +86,9 @@ class DemandNode(Node):  # type: ignore[misc]
         super().__init__("demandops")
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
-        self._open: dict[str, ServerGoalHandle] = {}
+        self._goals: dict[int, _Goal] = {}
+        """Those without a result, by the identity of their messages."""
         self._events: deque[Callable[[], None]] = deque()
-        self._stopping = False
         self._readers = 0
         # a group of its own, so that a service that waits for an event does not block events
         self._wake = self.create_guard_condition(
@@ -82,17 +104,20 @@ class DemandNode(Node):  # type: ignore[misc]
             self._bookkeeping,
             callback_group=ReentrantCallbackGroup(),
         )
-        self._bookkeeping_topic = BookkeepingTopic(self, generator, self._from_worker)
-        self._diagnostics = Diagnostics(self, generator)
+        self._bookkeeping_topic = BookkeepingTopic(self, generator, self._in_executor)
+        others = OtherServers(self, (action_name, demand_action_name))
+        self._diagnostics = Diagnostics(self, generator, others)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> ActionServer:
         return ActionServer(
             self,
             adapter.action,
             name,
-            execute_callback=partial(self._execute, adapter),
+            execute_callback=self._execute,
             goal_callback=partial(self._accept_or_reject, adapter),
+            handle_accepted_callback=self._accepted,
             cancel_callback=self._cancel,
+            callback_group=ReentrantCallbackGroup(),  # goals come while others are journaled
             goal_service_qos_profile=DEEP_QOS,
             result_service_qos_profile=DEEP_QOS,
             cancel_service_qos_profile=DEEP_QOS,
@@ -107,11 +132,7 @@ class DemandNode(Node):  # type: ignore[misc]
     @property
     def open_goals(self) -> int:
         """How many goals have no result yet."""
-        return len(self._open)
-
-    def stop_accepting(self) -> None:
-        """Reject further goals; open goals continue."""
-        self._stopping = True
+        return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
         """Answer from a thread of its own: an old revision may take seconds to read."""
@@ -123,7 +144,7 @@ class DemandNode(Node):  # type: ignore[misc]
 
         def work() -> None:
             filled = fill_response(self._generator, request, response)
-            self._from_worker(partial(done.set_result, filled))
+            self._in_executor(partial(done.set_result, filled))
 
         REAL.start_thread("bookkeeping", work)
         try:
@@ -133,98 +154,141 @@ class DemandNode(Node):  # type: ignore[misc]
 
     # ---- callbacks of the action server, in the executor's thread ----
 
-    def _accept_or_reject(self, adapter: DeploymentRequestAdapter, goal: Any) -> GoalResponse:  # noqa: ANN401
-        """Accept every goal unless overloaded: a rejection cannot carry a reason, a result can."""
-        reason = "shutting down" if self._stopping else ""
-        if len(self._open) >= self._generator.queue_limit:
-            reason = "too many are waiting"
-            unreachable = self._generator.remote_status.unreachable
-            reason += f" for the state repo: {unreachable}" if unreachable else ""
-        if reason:
-            self.get_logger().warning(f"goal {quoted(adapter.name(goal))} rejected: {reason}")
-            return GoalResponse.REJECT
-        return GoalResponse.ACCEPT
+    async def _accept_or_reject(
+        self,
+        adapter: DeploymentRequestAdapter,
+        message: Any,  # noqa: ANN401
+    ) -> GoalResponse:
+        """Accept a goal once its demand is in the journal, so that no crash loses an accepted goal.
+
+        Goals that come meanwhile share the next sync. A goal that names what does not exist is
+        accepted too: a result can carry the reason, a rejection cannot.
+        """
+        goal = self._goals[id(message)] = _Goal(adapter, message)
+        journaled = Future(executor=self.executor)
+        try:
+            goal.ticket = self._generator.submit(
+                adapter.to_data(message), listener=partial(self._tell, goal)
+            )
+            goal.ticket.journaled.add_done_callback(
+                lambda future: self._in_executor(partial(journaled.set_result, future.result()))
+            )
+            if await journaled:
+                if len(self._goals) == _DEFAULT_DEPTH + 1:
+                    self.get_logger().warning(_SHALLOW, once=True)
+                self.executor.create_task(self._forget_unless_accepted, goal)
+                return GoalResponse.ACCEPT
+            error = goal.ticket.future.exception()
+            if isinstance(error, Unsound):  # nobody may be told anything; the process ends
+                await Future(executor=self.executor)
+            self.get_logger().error(f"{goal} rejected: {one_line(str(error))}")
+        except Exception as error:
+            REAL.failed(f"acceptance of {adapter.action.__name__}", error)
+        del self._goals[id(message)]
+        return GoalResponse.REJECT
+
+    def _accepted(self, handle: ServerGoalHandle) -> None:
+        """Join a goal's id, which the callback before is not given, to its demand."""
+        goal = self._goals[id(handle.request)]
+        goal.handle = handle
+        for feedback in goal.feedback:
+            handle.publish_feedback(feedback)
+        goal_id = uuid.UUID(bytes=bytes(handle.goal_id.uuid))
+        self.get_logger().debug(f"{goal} ({goal_id}) is demand {goal.ticket.operation}")
+        self._after(goal, goal.ticket.future, self._answer)
+
+    def _forget_unless_accepted(self, goal: _Goal) -> None:
+        """Let a demand run without a goal, because the client could not be told of it."""
+        if goal.handle is None:
+            del self._goals[id(goal.message)]
+            self.get_logger().warning(f"{goal}: nobody gets the answer of {goal.ticket.operation}")
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         """Withdraw a demand, which is possible until it is committed."""
-        if self._generator.withdraw(_operation(handle)):
+        goal = self._goals.get(id(handle.request))
+        if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
-    async def _execute(self, adapter: DeploymentRequestAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
-        """Return the result of a goal; an internal error is a result too."""
-        self._open[_operation(handle)] = handle
-        try:
-            return await self._answer(adapter, handle)
-        except Exception as error:
-            REAL.failed(f"goal of {adapter.action.__name__}", error)
-            return self._finish(adapter, handle, error)
-        finally:
-            self._open.pop(_operation(handle), None)
+    def _execute(self, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
+        """End a goal whose outcome is known, and return its result."""
+        goal = self._goals.pop(id(handle.request))
+        outcome = goal.outcome
+        result = goal.adapter.result(outcome, goal.reached)
+        text = _one_line(result.message)
+        if isinstance(outcome, Receipt):
+            handle.succeed()
+            self.get_logger().info(f"{goal}: {text}")
+        elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
+            handle.canceled()
+            self.get_logger().info(f"{goal}: cancelled")
+        else:
+            handle.abort()
+            if not goal.is_refused:  # else the log has it
+                self.get_logger().error(f"{goal}: {text}")
+        return result
 
-    async def _answer(self, adapter: DeploymentRequestAdapter, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
-        operation, goal = _operation(handle), handle.request
-        done = Future(executor=self.executor)
+    # ---- an accepted goal, in the executor's thread ----
 
-        def notify(stage: str, text: str) -> None:
-            self._from_worker(partial(_give_feedback, handle, adapter.feedback(stage, text)))
+    def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
+        """Take the next step of a goal with a future's result; an internal error is a result too.
 
-        try:
-            ticket = self._generator.submit(adapter.to_data(goal), operation, notify)
-        except (ShuttingDown, QueueFull) as error:
-            return self._finish(adapter, handle, error)
-        ticket.future.add_done_callback(
-            lambda future: self._from_worker(partial(done.set_result, future))
-        )
-        outcome = (await done).exception() or ticket.future.result()
+        No coroutine waits, because rclpy's executor resumes each one that waits at each event.
+        """
+
+        def take() -> None:
+            try:
+                step(goal, future.exception() or future.result())
+            except Exception as error:
+                REAL.failed(f"goal of {goal.adapter.action.__name__}", error)
+                self._finish(goal, error)
+
+        future.add_done_callback(lambda _: self._in_executor(take))
+
+    def _answer(self, goal: _Goal, outcome: Receipt | BaseException) -> None:
         if isinstance(outcome, Unsound):  # nobody may be told anything; the process ends
-            await Future(executor=self.executor)
-        level = adapter.answer_level(goal) or self._level
+            return
+        level = goal.adapter.answer_level(goal.message) or self._level
         if not isinstance(outcome, Receipt) or level == "pushed":
-            return self._finish(adapter, handle, outcome)
+            self._finish(goal, outcome)
+            return
         status, problem = self._status, "this node has no access to the clusters"
         if status is not None:
             problem = status.why_unreachable(target.domain for target in outcome.targets)
         if problem or status is None:
             warnings = (*outcome.warnings, f"answered at pushed: {problem}")
-            return self._finish(adapter, handle, replace(outcome, warnings=warnings))
-        rolled_out = Future(executor=self.executor)
-        status.follow(
-            outcome.commit, outcome.targets, level, self._timeout_s, notify
-        ).add_done_callback(
-            lambda future: self._from_worker(partial(rolled_out.set_result, future.result()))
+            self._finish(goal, replace(outcome, warnings=warnings))
+            return
+        rolled_out = status.follow(
+            outcome.commit, outcome.targets, level, self._timeout_s, partial(self._tell, goal)
         )
-        health = await rolled_out
+        self._after(goal, rolled_out, partial(self._answer_rollout, outcome, level))
+
+    def _answer_rollout(self, receipt: Receipt, level: Level, goal: _Goal, health: Health) -> None:
         if health.reaches(level):
-            return self._finish(adapter, handle, outcome, level)
+            self._finish(goal, receipt, level)
+            return
         prefix = f"{health.object}: " if health.object else ""
-        message = f"{prefix}{health.reason}; it is booked in {outcome.commit}"
-        return self._finish(adapter, handle, NotReached(level, message))
+        message = f"{prefix}{health.reason}; it is booked in {receipt.commit}"
+        self._finish(goal, NotReached(level, message))
 
     def _finish(
-        self,
-        adapter: DeploymentRequestAdapter,
-        handle: ServerGoalHandle,
-        outcome: Receipt | BaseException,
-        reached: Level = "pushed",
-    ) -> Any:  # noqa: ANN401
-        result = adapter.result(outcome, reached)
-        text = one_line(result.message.replace("\n", "; "))
-        prefix = f"goal {quoted(adapter.name(handle.request))}: "
-        if isinstance(outcome, Receipt):
-            handle.succeed()
-            self.get_logger().info(prefix + text)
-        elif isinstance(outcome, Withdrawn) and handle.is_cancel_requested:
-            handle.canceled()
-            self.get_logger().info(prefix + "cancelled")
+        self, goal: _Goal, outcome: Receipt | BaseException, reached: Level = "pushed"
+    ) -> None:
+        goal.outcome, goal.reached = outcome, reached
+        goal.handle.execute()
+
+    # ---- from other threads into the executor's ----
+
+    def _tell(self, goal: _Goal, stage: str, text: str) -> None:
+        """Give feedback; log a refusal at once, because a crash may come before the result."""
+        if stage == "refused":
+            goal.is_refused = True
+            self.get_logger().error(f"{goal}: {_one_line(text)}")
         else:
-            handle.abort()
-            self.get_logger().error(prefix + text)
-        return result
+            self._in_executor(partial(_give_feedback, goal, goal.adapter.feedback(stage, text)))
 
-    # ---- from the worker thread into the executor's ----
-
-    def _from_worker(self, event: Callable[[], None]) -> None:
+    def _in_executor(self, event: Callable[[], None]) -> None:
         self._events.append(event)
         self._wake.trigger()
 
@@ -236,10 +300,12 @@ class DemandNode(Node):  # type: ignore[misc]
                 REAL.failed("events of goals", error)
 
 
-def _operation(handle: ServerGoalHandle) -> str:
-    return str(uuid.UUID(bytes=bytes(handle.goal_id.uuid)))
+def _one_line(text: str) -> str:
+    return one_line(text.replace("\n", "; "))
 
 
-def _give_feedback(handle: ServerGoalHandle, feedback: Any) -> None:  # noqa: ANN401
-    if handle.is_active:
-        handle.publish_feedback(feedback)
+def _give_feedback(goal: _Goal, feedback: Any) -> None:  # noqa: ANN401
+    if goal.handle is None:
+        goal.feedback.append(feedback)
+    elif goal.handle.is_active:
+        goal.handle.publish_feedback(feedback)

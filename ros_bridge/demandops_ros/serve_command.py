@@ -227,7 +227,6 @@ def _drain(
     status: RolloutWatcher | None,
 ) -> None:
     """Send the results of all open goals before the node is destroyed."""
-    node.stop_accepting()
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
     published = generator.stop().result()
     if status is not None:

@@ -16,11 +16,11 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from demandops.service import Generator, Receipt
+from demandops.service import Generator, Receipt, Ticket
 from demandops.staterepo.git.local_repository import LocalRepository
 from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.write.commit_batch import CommitBatch
@@ -116,16 +116,16 @@ class Lanes:
             self.ended.set()
 
     def start(self) -> None:
-        for lane in self._lanes:
-            self._next(lane, 0)
+        """Send the first demand of each lane; return when all of them are journaled."""
+        wait([ticket.journaled for lane in self._lanes if (ticket := self._next(lane, 0))])
 
-    def _next(self, lane: list[Demand], index: int) -> None:
+    def _next(self, lane: list[Demand], index: int) -> Ticket | None:
         if index == len(lane):
             with self._lock:
                 self._left -= 1
                 if not self._left:
                     self.ended.set()
-            return
+            return None
         tell(sent=lane[index]["name"])
         if lane[index].get("withdraw"):
             self._to_withdraw.append(lane[index])
@@ -135,6 +135,7 @@ class Lanes:
             lambda stage, text: self._take_back() if stage == "admitted" else None,
         )
         ticket.future.add_done_callback(lambda future: self._answered(lane, index, future))
+        return ticket
 
     def _take_back(self) -> None:
         while self._to_withdraw:

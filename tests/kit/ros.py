@@ -25,8 +25,8 @@ from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.cli.main import run
 from demandops.settings import DEFAULT_ACTION_NAME
+from demandops_ros.action_endpoints import DEEP_QOS
 from demandops_ros.messages import fill_message
-from demandops_ros.node import DEEP_QOS
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
@@ -36,6 +36,7 @@ STATUS = {
     GoalStatus.STATUS_SUCCEEDED: "succeeded",
     GoalStatus.STATUS_ABORTED: "aborted",
     GoalStatus.STATUS_CANCELED: "cancelled",
+    GoalStatus.STATUS_UNKNOWN: "",  # the node that knew the goal was killed
 }
 
 _LAST = 100
@@ -90,6 +91,13 @@ class Served:
     def bookkeeping(self) -> dict[str, Any]:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
         return data
+
+    def wait_for(self, text: str) -> None:
+        """Wait until the log has a text."""
+        end = time.monotonic() + DEADLINE_S
+        while text not in self.log.read_text():
+            assert time.monotonic() < end, f"the log does not say: {text}"
+            time.sleep(0.05)
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
         self.process.send_signal(number)

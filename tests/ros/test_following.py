@@ -7,14 +7,18 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+from application_manager_interfaces.action import DeploymentRequest
+from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.action import ActionServer
 
 from tests.kit.goals import link as connection
 from tests.kit.repo import GitRepo, git, read
-from tests.kit.ros import Client, Serve
+from tests.kit.ros import Client, Serve, Served
 
 NODES = "inventory/nodes.yaml"
 STATE, CONFIGURATION = "demandops: state repo", "demandops: configuration"
+ACTIONS = "demandops: actions"
 
 
 class Diagnostics:
@@ -75,6 +79,31 @@ def test_diagnostics_report_invalid_configuration_and_an_unreachable_remote(
     log = served.log.read_text()
     assert log.count("trying again until it is back") == 1
     assert log.count("is back after") == 1
+
+
+def test_another_node_that_serves_the_same_action_is_noticed(
+    shared: Served, caller: Client
+) -> None:
+    def told() -> list[str]:
+        log = shared.log.read_text().splitlines()
+        return [line.partition("]: ")[2] for line in log if f"serves {DEFAULT_ACTION_NAME}" in line]
+
+    heard = Diagnostics(caller)
+    caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.OK))
+    server = ActionServer(caller.node, DeploymentRequest, DEFAULT_ACTION_NAME, lambda goal: None)
+    caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.WARN))
+    assert heard.values(ACTIONS) == {
+        DEFAULT_ACTION_NAME: "/test_client",
+        DEFAULT_DEMAND_ACTION_NAME: "",
+    }
+    server.destroy()
+    caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.OK))
+    caller.wait(lambda: len(told()) == 2)
+    assert told() == [
+        f"/test_client serves {DEFAULT_ACTION_NAME} too: a client may get an answer of either; "
+        "give each node an action name of its own",
+        f"no other node serves {DEFAULT_ACTION_NAME} any more",
+    ]
 
 
 def test_a_push_that_the_webhook_reports_is_followed_at_once(

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import re
+import resource
 import signal
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -87,6 +90,30 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
     context.try_shutdown()
     printed, told = capfd.readouterr()
     assert [f"of level {level}" in printed + told for level in (10, 20, 40)] == [False, True, True]
+
+
+def test_a_goal_that_the_journal_cannot_keep_is_rejected_and_the_log_says_why(
+    serve: Serve, client: Client
+) -> None:
+    served = serve()
+    client.ready()
+    assert client.call(connection(1)).status == "succeeded"
+    resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
+    assert client.call({**connection(2), "id": "x" * (2 << 20)}).accepted is False
+    assert re.search(
+        r"goal 'x+.* rejected: the journal \S+/outbox\.jsonl cannot be written: File too large; "
+        "check its disk, then send the demand again",
+        served.log.read_text(),
+    )
+    assert client.call(connection(3)).status == "succeeded"
+
+
+def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy(caller: Client) -> None:
+    first = caller.call(connection(1005))
+    caller.wait(lambda: time.monotonic() > first.at + 12)
+    again = first.handle.get_result_async()
+    caller.wait(again.done)
+    assert again.result().result.message == first.message
 
 
 def test_a_goal_sent_again_succeeds_without_a_commit(shared: Served, caller: Client) -> None:

@@ -2,7 +2,7 @@
 
 | state | the demand | next |
 | --- | --- | --- |
-| arrived | was submitted | waiting, withdrawn, done |
+| arrived | was submitted | waiting, done |
 | waiting | is in the journal and may be evaluated | committed, proposed, withdrawn, done |
 | committed | has a commit that may be published, so it gets an answer | committed, proposed, done |
 | proposed | awaits a person's approval | proposed, waiting, withdrawn, done |
@@ -10,14 +10,15 @@
 | done | is answered | |
 
 A method writes to the journal, then changes the state, then wakes the worker, all under one lock.
-So a committed demand can no longer be withdrawn. Any thread may submit or withdraw a demand. Only
-the worker's thread makes the other changes.
+So a committed demand can no longer be withdrawn. Any thread may submit or withdraw a demand. One
+thread journals those that arrive, also while the worker publishes others. Only the worker's thread
+makes the other changes.
 """
 
 from __future__ import annotations
 
 import logging
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -32,7 +33,7 @@ from demandops.errors import (
 from demandops.quoting import quoted
 from demandops.runtime import Runtime
 from demandops.service.fair_queue import FairQueue, requester_of
-from demandops.service.ticket import Receipt, State, Ticket, ticket_from_journal
+from demandops.service.ticket import Receipt, State, Ticket, reason_of, ticket_from_journal
 from demandops.staterepo.write.journal import Journal, ProposalRecord
 
 log = logging.getLogger("demandops")
@@ -40,7 +41,7 @@ log = logging.getLogger("demandops")
 TAKEN_BACK = "the demand was taken back before it was committed"
 
 _NEXT: dict[State, tuple[State, ...]] = {
-    "arrived": ("waiting", "withdrawn", "done"),
+    "arrived": ("waiting", "done"),
     "waiting": ("committed", "proposed", "withdrawn", "done"),
     "committed": ("committed", "proposed", "done"),
     "proposed": ("proposed", "waiting", "withdrawn", "done"),
@@ -65,7 +66,9 @@ class Demands:
         self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
-        self._arrived: list[Ticket] = []
+        self._arrived = deque[Ticket]()
+        self._arrival = runtime.event()
+        self._new: list[Ticket] = []
         self._waiting = FairQueue(in_order=requester_limit is None)
         for ticket in resumed:
             if ticket.proposal is None:
@@ -107,10 +110,13 @@ class Demands:
     # ---- waiting for demands ----
 
     def close(self) -> None:
-        """Accept no more demands."""
+        """Accept no more demands than those that arrived before."""
+        self._take_in()
         with self._changed:
             self._closed = True
             self._changed.notify()
+        self._take_in()
+        self._arrival.set()
 
     def wake(self) -> None:
         """End the worker's wait without a demand; from any thread."""
@@ -124,15 +130,19 @@ class Demands:
             self._wait(timeout, self.must_not_wait)
             return self.has_waiting or not self._closed
 
-    def journal_arrivals(self, timeout: float) -> list[Ticket]:
-        """Wait for new demands and journal them, while nothing can be published.
+    def new_demands(self, timeout: float) -> list[Ticket]:
+        """Return the demands that are new since the last call or :meth:`take`; wait for one.
 
-        Returns:
-            The new demands; none after ``timeout`` seconds, a withdrawal or :meth:`wake`.
+        None are returned after ``timeout`` seconds, a withdrawal or :meth:`wake`.
+
+        Raises:
+            Unsound: nobody knows what is in the journal.
         """
         with self._changed:
-            self._wait(timeout, bool(self._arrived))
-            return self._journal_arrived()
+            self._wait(timeout, bool(self._new))
+            self._journal.require_sound()
+            new, self._new = self._new, []
+            return new
 
     def _wait(self, timeout: float | None, has_work: bool) -> None:
         if not has_work and not self._woken:
@@ -140,65 +150,88 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal all arrived demands, and fill ``batch`` with up to ``limit`` demands.
+        """Take in what arrived, and fill ``batch`` with up to ``limit`` demands.
 
         Raises:
             Unsound: nobody knows what is in the journal.
         """
+        self._take_in()
         with self._changed:
             self._journal.require_sound()
-            self._journal_arrived()
+            self._new.clear()
             room = min(limit - len(batch), len(self._waiting))
             batch += [self._waiting.popleft() for _ in range(room)]
 
     # ---- changes of state ----
 
     def arrive(self, ticket: Ticket) -> None:
-        """Add a demand.
+        """Add a demand without waiting; :meth:`journal_arrivals` takes it in."""
+        ticket.state = "arrived"
+        self._arrived.append(ticket)
+        self._arrival.set()
+        if self._closed:
+            self._take_in()
 
-        Raises:
-            ShuttingDown, QueueFull: if no demand is accepted, or too many wait.
+    def journal_arrivals(self) -> None:
+        """Journal demands as they arrive, until no more are accepted.
+
+        Those that arrive during a sync share the next one.
         """
-        with self._changed:
-            if self._closed:
-                raise ShuttingDown("the generator is shutting down; send the demand again later")
-            if len(self._arrived) + len(self._waiting) >= self._limit:
-                why = f" for the state repo: {self.blocked}" if self.blocked else ""
-                raise QueueFull(
-                    f"{self._limit} demands are waiting already{why}; send it again later"
-                )
-            who = requester_of(ticket.goal)
-            limit = self._requester_limit
-            if limit is not None and self._of_requester[who] >= limit:
-                raise QueueFull(
-                    f"{limit} demands of {quoted(who)} have no answer yet; send it "
-                    "again later, or raise the node's parameter requester_queue_limit"
-                )
-            self._of_requester[who] += 1
-            ticket.state = "arrived"
-            self._arrived.append(ticket)
-            self._tickets[ticket.operation] = ticket
-            self._changed.notify()
+        while not self._closed:
+            self._arrival.wait()
+            self._arrival.clear()
+            self._take_in()
 
-    def _journal_arrived(self) -> list[Ticket]:
-        """Journal the arrived demands; if that fails, answer them with the error."""
-        arrived, self._arrived = self._arrived, []
-        new = [
-            ticket
-            for ticket in arrived
-            if ticket.state == "arrived" and ticket.operation not in self._journal.pending
-        ]
-        try:
-            self._journal.append(ticket.journal_entry() for ticket in new)
-        except StateRepoError as error:
-            log.error("%s", error)
-            self.fail(new, error)
-            new = []
-        for ticket in arrived:
-            _change(ticket, "waiting")
-            if ticket.state != "done":
+    def _take_in(self) -> None:
+        """Journal what arrived, and refuse what cannot be accepted or journaled."""
+        if not self._arrived:
+            return
+        taken, refused = list[Ticket](), list[tuple[Ticket, DemandOpsError]]()
+        with self._changed:
+            for _ in range(len(self._arrived)):
+                ticket = self._arrived.popleft()
+                error = self._why_refused(ticket, len(taken))
+                if error is None:
+                    self._of_requester[requester_of(ticket.goal)] += 1
+                    taken.append(ticket)
+                else:
+                    refused.append((ticket, error))
+            new = [each for each in taken if each.operation not in self._journal.pending]
+            try:
+                self._journal.append(ticket.journal_entry() for ticket in new)
+            except (StateRepoError, Unsound) as failure:
+                log.error("%s", failure)
+                self.wake()  # the worker ends the process, if it must
+                for ticket in new:
+                    taken.remove(ticket)
+                    self._of_requester[requester_of(ticket.goal)] -= 1
+                    refused.append((ticket, failure))
+            for ticket in taken:
+                self._tickets[ticket.operation] = ticket
+                _change(ticket, "waiting")
                 self._waiting.append(ticket)
-        return new
+            self._new += taken
+            self._changed.notify()
+        for ticket in taken:
+            ticket.journaled.set_result(True)
+        for ticket, error in refused:
+            ticket.refuse(error)
+
+    def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
+        """Return why a demand that arrived after ``others`` is not accepted, or None."""
+        if self._closed:
+            return ShuttingDown("the generator is shutting down; send the demand again later")
+        if others + len(self._waiting) >= self._limit:
+            why = f" for the state repo: {self.blocked}" if self.blocked else ""
+            return QueueFull(f"{self._limit} demands are waiting already{why}; send it again later")
+        who = requester_of(ticket.goal)
+        limit = self._requester_limit
+        if limit is not None and self._of_requester[who] >= limit:
+            return QueueFull(
+                f"{limit} demands of {quoted(who)} have no answer yet; send it again later, or "
+                "raise the node's parameter requester_queue_limit"
+            )
+        return None
 
     def commit(self, ticket: Ticket) -> bool:
         """Refuse further withdrawals of a demand; return False if it is already withdrawn."""
@@ -234,6 +267,7 @@ class Demands:
 
     def withdraw(self, operation: str) -> bool:
         """Withdraw a demand; return False if that is not possible any longer."""
+        self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
             if ticket is None or not _may_become(ticket, "withdrawn"):
@@ -283,11 +317,18 @@ class Demands:
     ) -> None:
         """Answer each demand with its result and remove it from the journal, unless ``keep``.
 
-        A demand is answered once: a later result is dropped.
+        A demand is answered once: a later result is dropped. A listener is told of a refusal before
+        the journal forgets the demand, because no commit shows it after a crash.
 
         Raises:
             Unsound: nobody knows what is in the journal; nobody is answered.
         """
+        results = list(results)
+        for ticket, result in results if not keep else ():
+            if isinstance(result, Receipt) or ticket.state == "done":
+                continue
+            if str(result) != TAKEN_BACK:  # nobody but its client wanted that
+                ticket.notify("refused", reason_of(result))
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
             if not keep:

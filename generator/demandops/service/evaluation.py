@@ -12,7 +12,7 @@ from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals, Result
-from demandops.service.approvals.proposal import is_release, name_of
+from demandops.service.approvals.proposal import is_release
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket, receipt_of
@@ -83,7 +83,7 @@ class Evaluator:
             if ticket.has_released:  # a proposal, which held no claims yet
                 commits.note_settled(ticket.operation, "Unchanged")
                 commit = str(commits.head.commit)
-                return Receipt(ticket.operation, name_of(ticket.goal), "released", commit)
+                return Receipt(ticket.operation, ticket.name, "released", commit)
             commits.note_settled(ticket.operation, "Refused")
             return error
         except SigningFailed as error:
@@ -118,7 +118,7 @@ class Evaluator:
 
 def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
-        message = "was refused, but the reason was lost with the connection; send it again"
+        message = "was refused, but the reason was lost; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
     outcome: Outcome = "booked"
@@ -128,4 +128,4 @@ def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt |
         outcome = "restored"
     elif is_release(goal) or Decommission.is_goal(goal):
         outcome = "released"
-    return Receipt(ticket.operation, name_of(goal), outcome, arrival.commit)
+    return Receipt(ticket.operation, ticket.name, outcome, arrival.commit)

@@ -21,6 +21,7 @@ from demandops.service.worker import Worker
 from demandops.staterepo.git.address import connect
 from demandops.staterepo.git.repository import access_error
 from demandops.staterepo.git.signing import Signer
+from demandops.staterepo.history import revisions
 from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.slot import Slot
@@ -91,9 +92,7 @@ class Generator:
                 raise access_error(error, state_repo) from None
             raise
         self._repository, self._runtime = repository, runtime
-        self.given_address = state_repo
         self.address = repository.address
-        self.queue_limit = queue_limit
         self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
@@ -108,12 +107,27 @@ class Generator:
         self._stop_lock = runtime.lock()
         for operation in self.operations:
             log.info("resuming demand %s from the journal", operation)
+        runtime.keep_running("journal", self._demands.journal_arrivals)
         self._thread = runtime.keep_running("writer", self._worker.run)
 
     @property
     def snapshot(self) -> Snapshot:
         """The newest published state; any thread may read it."""
         return self._worker.snapshot
+
+    def snapshot_at(self, revision: str) -> Snapshot:
+        """Return the state in effect at a commit or a time, as far as it is fetched.
+
+        From any thread; it may take seconds.
+
+        Raises:
+            InvalidInput, StateRepoError: if there is no such commit, or it is not valid.
+        """
+        objects = self._repository.reopened()
+        tip, now = self.snapshot.commit, self._runtime.now()
+        return state_in_effect.snapshot_at(
+            objects, revisions.resolve(objects, tip, revision, now).id
+        )
 
     @property
     def remote_status(self) -> RemoteStatus:
@@ -154,10 +168,10 @@ class Generator:
 
         Returns:
             A ticket whose future returns the :class:`Receipt`, or raises ``Refused`` with every
-            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``.
+            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``; ``ShuttingDown`` or
+            ``QueueFull`` if the demand is not accepted at all.
 
         Raises:
-            ShuttingDown, QueueFull: if the demand is not accepted at all.
             ValueError: for an operation id that a commit trailer cannot carry.
         """
         operation = operation or self._runtime.fresh_id()
@@ -168,7 +182,7 @@ class Generator:
         try:
             ticket.goal = json.loads(json.dumps(goal))
         except (TypeError, ValueError, RecursionError):
-            ticket.future.set_exception(Refused([fault("", "the goal is not plain data")]))
+            ticket.refuse(Refused([fault("", "the goal is not plain data")]))
             return ticket
         ticket.base = str(self.snapshot.commit)
         self._demands.arrive(ticket)

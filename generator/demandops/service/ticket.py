@@ -10,14 +10,19 @@ from datetime import datetime
 from typing import Any, Literal
 
 from demandops.cluster.health.release_health import Target
-from demandops.decision import Decision, Outcome
+from demandops.decision import Decision, Outcome, refusal_text
+from demandops.errors import DemandOpsError, InvalidInput
 from demandops.ledger.ledger import ClaimChange
+from demandops.quoting import quoted
 from demandops.staterepo.write.journal import JournalEntry, ProposalRecord
 
 log = logging.getLogger("demandops")
 
-Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed"]
-"""``away``: the state repo cannot be reached or written; the text says why."""
+Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed", "refused"]
+"""``away``: the state repo cannot be reached or written; the text says why.
+
+``refused``: the demand gets an error as its answer, with this text.
+"""
 Listener = Callable[[Stage, str], None]
 
 State = Literal["arrived", "waiting", "committed", "proposed", "withdrawn", "done"]
@@ -48,6 +53,9 @@ class Receipt:
 class Ticket:
     """A demand under way. ``future`` returns its receipt or raises its error.
 
+    ``journaled`` returns whether the demand is in the journal, so that a crash does not lose it;
+    False if it was refused before. Then ``future`` raises why.
+
     ``base`` is the tip that was known when it arrived. ``maybe_published``: the remote may have
     accepted a push of it although no answer arrived. ``has_released``: it released a demand that
     awaited approval; then it may hold no claims.
@@ -58,6 +66,7 @@ class Ticket:
     received: datetime
     listener: Listener = lambda stage, text: None
     future: Future[Receipt] = field(default_factory=Future)
+    journaled: Future[bool] = field(default_factory=Future)
     base: str = ""
     maybe_published: bool = False
     has_released: bool = False
@@ -67,6 +76,19 @@ class Ticket:
 
     def __post_init__(self) -> None:
         self.future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
+
+    @property
+    def name(self) -> str:
+        """The id in the goal, even if the goal is not valid."""
+        fields = self.goal if isinstance(self.goal, dict) else {}
+        keys = ("id", "request", "demand", "name")
+        return str(next((fields[key] for key in keys if fields.get(key)), ""))
+
+    def refuse(self, error: DemandOpsError) -> None:
+        """Answer a demand that is not journaled."""
+        self.state = "done"
+        self.future.set_exception(error)
+        self.journaled.set_result(False)
 
     def notify(self, stage: Stage, text: str) -> None:
         """Report each stage once, even if the demand is evaluated again.
@@ -110,9 +132,23 @@ def receipt_of(
     )
 
 
+def reason_of(error: DemandOpsError) -> str:
+    """Return why a demand was refused, for people."""
+    return refusal_text(error) if isinstance(error, InvalidInput) else str(error)
+
+
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket for a demand that an earlier run left in the journal."""
+    """Return a ticket for a demand that an earlier run left in the journal; the log tells of it."""
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
+    demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
+
+    def tell(stage: Stage, text: str) -> None:
+        if stage in ("proposed", "pushed"):
+            log.info("%s: %s", demand, text)
+        elif stage == "refused":
+            log.error("%s: refused: %s", demand, text)
+
+    ticket.listener = tell
     ticket.mark_maybe_published(entry.base)
     if entry.proposal is not None:
         ticket.proposal = entry.proposal

@@ -296,7 +296,7 @@ class Worker:
         return True
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Wait; meanwhile journal new demands and report to them why they wait."""
+        """Wait; meanwhile report to new demands why they wait."""
         end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._ends_soon.is_set():
@@ -307,7 +307,7 @@ class Worker:
             left = end - self._runtime.monotonic()
             if left <= 0:
                 return
-            to_notify = self._demands.journal_arrivals(left)
+            to_notify = self._demands.new_demands(left)
 
     # ---- following the state repo ----
 

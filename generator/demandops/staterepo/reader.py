@@ -28,7 +28,6 @@ from demandops.staterepo.load import (
     problem_report,
     state_in_effect,
 )
-from demandops.staterepo.load import snapshot as snapshots
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.slot import Slot
 
@@ -68,16 +67,8 @@ class Reader:
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load the ledger and the configuration that are in effect at a commit.
-
-        Raises:
-            InvalidInput, StateRepoError: the commit is not valid, and no generator quarantined its
-                files.
-        """
-        commit = self.commit(revision)
-        if state_in_effect.record_at(self._objects, commit).first("In-Force"):
-            return state_in_effect.state_at(self._objects, commit, progress)
-        return snapshots.load(self._objects, commit, progress)
+        """Load the state in effect at a commit (:func:`state_in_effect.snapshot_at`)."""
+        return state_in_effect.snapshot_at(self._objects, self.commit(revision), progress)
 
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None

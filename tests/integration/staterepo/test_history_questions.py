@@ -50,3 +50,11 @@ def test_the_paths_that_differ_are_told(bare: Path, tmp_path: Path, line: list[s
     assert repository.changed_paths(line[2], line[2]) == []
     assert repository.changed_paths("", line[2]) is None
     assert repository.changed_paths("f" * 40, line[2]) is None
+
+
+def test_a_generator_answers_for_the_past_without_another_clone(url: str, data_home: Path) -> None:
+    with rig.running(url) as generator:
+        first, _ = rig.book(generator, rig.goal(1), rig.goal(2))
+        ledger = generator.snapshot_at(first.commit).state.ledger
+        assert ledger.claims_of_requester("user1") and not ledger.claims_of_requester("user2")
+    assert [path.name for path in next(data_home.iterdir()).iterdir()] == ["slot-0"]

@@ -85,7 +85,6 @@ def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
 
 
 POINTS = [
-    ("journaled", "the demand is in the journal and nowhere else", False),
     ("committed", "a commit object stands that no branch knows", False),
     ("publishing", "all commits of the batch stand, none is published", False),
     ("published", "the remote has it, the outbox does not know", True),
@@ -120,12 +119,39 @@ def test_a_demand_that_was_taken_up_again_is_not_taken_up_a_third_time(
     with caplog.at_level("INFO", "demandops"):
         assert rig.restart(url) is True
     assert "resuming demand op-join-1 from the journal" in caplog.text
+    assert rig.operations(bare) == ["op-join-1"]
     tip = rig.tip(bare)
+    told = f"demand op-join-1 ('demand-1') from the journal: pushed {tip}"
+    assert told in caplog.text
     caplog.clear()
     with caplog.at_level("INFO", "demandops"):
         assert rig.restart(url) is True
     assert "from the journal" not in caplog.text
     assert rig.tip(bare) == tip
+
+
+@pytest.mark.parametrize(
+    ("point", "reason"),
+    [
+        ("publishing:2", "unknown-node: apps[0].header.node_id: 'nowhere' is not in inventory/"),
+        ("published:2", "refused: was refused, but the reason was lost; send it again"),
+    ],
+)
+def test_a_demand_that_is_refused_around_a_kill_is_refused_in_the_log(
+    drivers: Drivers,
+    address: str,
+    bare: Path,
+    point: str,
+    reason: str,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lanes = [[demand("wrong", rig.impossible())], [demand("right", goal(2))]]
+    opening = demand("opening", goal(1))
+    drivers.start(address, lanes, opening=opening, die_at=point).listen()
+    with caplog.at_level("INFO", "demandops"):
+        assert rig.restart(address) is True
+    assert f"demand op-wrong ('demand-0') from the journal: refused: {reason}" in caplog.text
+    assert sorted(rig.operations(bare)) == ["op-opening", "op-right"]
 
 
 # ---- what was released stays released ----

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -118,8 +119,10 @@ def test_closing_finishes_what_is_in_hand(address: str, bare: Path) -> None:
 def test_a_demand_after_closing_is_told_so(bare: Path) -> None:
     generator = Generator(str(bare))
     generator.close()
+    ticket = generator.submit(goal(1))
     with pytest.raises(ShuttingDown) as error:
-        generator.submit(goal(1))
+        rig.receipt(ticket)
+    assert ticket.journaled.result() is False
     assert str(error.value) == "the generator is shutting down; send the demand again later"
 
 
@@ -139,11 +142,8 @@ def test_a_demand_handed_in_while_closing_is_answered_or_not_taken(bare: Path) -
         tickets: list[Ticket] = []
 
         def hand_in(generator: Generator = generator, tickets: list[Ticket] = tickets) -> None:
-            for number in range(100_000):
-                try:
-                    tickets.append(generator.submit(goal(number % 20)))
-                except ShuttingDown:
-                    return
+            while not (tickets and isinstance(_error(tickets[-1]), ShuttingDown)):
+                tickets.append(generator.submit(goal(len(tickets) % 20)))
 
         thread = threading.Thread(target=hand_in, daemon=True)
         thread.start()
@@ -152,6 +152,45 @@ def test_a_demand_handed_in_while_closing_is_answered_or_not_taken(bare: Path) -
         thread.join(rig.PATIENCE_S)
         for ticket in tickets:
             assert ticket.future.done(), "closed, but never answered"
+
+
+def _error(ticket: Ticket) -> BaseException | None:
+    return ticket.future.exception() if ticket.future.done() else None
+
+
+# ---- journaling ----
+
+
+def test_demands_that_arrive_during_a_sync_share_the_next_one(
+    bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = threading.Event()
+    syncs: list[int] = []
+
+    def sync(file: int) -> None:
+        syncs.append(file)
+        assert synced.wait(rig.PATIENCE_S)
+
+    with rig.running(bare) as generator:
+        monkeypatch.setattr(os, "fdatasync", sync)
+        tickets = [generator.submit(goal(0))]
+        rig.wait_until(lambda: syncs, "the first is being synced")
+        tickets += [generator.submit(goal(number)) for number in range(1, 40)]
+        assert not any(ticket.journaled.done() for ticket in tickets)
+        synced.set()
+        assert all(ticket.journaled.result(rig.PATIENCE_S) for ticket in tickets)
+        assert len(syncs) == 2
+        for ticket in tickets:
+            rig.receipt(ticket)
+
+
+def test_a_demand_is_journaled_while_another_is_evaluated(bare: Path) -> None:
+    gate = Gate()
+    with rig.running(bare) as generator:
+        generator.submit(goal(0), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        assert generator.submit(goal(1)).journaled.result(rig.PATIENCE_S) is True
+        gate.open.set()
 
 
 # ---- limits ----
@@ -164,7 +203,7 @@ def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(bare: Pat
         assert gate.reached.wait(rig.PATIENCE_S)
         waiting = [generator.submit(goal(n)) for n in (1, 2, 3)]
         with pytest.raises(QueueFull) as error:
-            generator.submit(goal(4))
+            rig.receipt(generator.submit(goal(4)))
         assert str(error.value) == "3 demands are waiting already; send it again later"
         gate.open.set()
         for ticket in (first, *waiting):
@@ -180,7 +219,7 @@ def test_a_requester_may_have_only_so_many_demands_waiting(bare: Path) -> None:
         assert gate.reached.wait(rig.PATIENCE_S)
         second = generator.submit(goal(1), "again")
         with pytest.raises(QueueFull, match=r"^2 demands of 'user1' .* requester_queue_limit$"):
-            generator.submit(goal(1), "op-3")
+            rig.receipt(generator.submit(goal(1), "op-3"))
         other = generator.submit(goal(2))
         gate.open.set()
         for ticket in (first, second, other):
@@ -323,7 +362,7 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
         assert ended.wait(rig.PATIENCE_S)
         assert isinstance(runtime.unsound, Unsound)
         with pytest.raises(ShuttingDown):
-            generator.submit(goal(2))
+            rig.receipt(generator.submit(goal(2)))
         file.close()
     assert rig.operations(bare) == []
 

@@ -27,7 +27,6 @@ from demandops.service.approvals.proposal import (
     decide_in_turn,
     is_release,
     key_of,
-    name_of,
     pull_request_body,
     push_options,
     releases,
@@ -290,7 +289,7 @@ class Approvals:
     ) -> Receipt:
         commit = recorded.commit if recorded else str(snapshot.commit)
         if isinstance(decision, InvalidInput) or decision.files:  # merged, and changed since
-            return Receipt(ticket.operation, name_of(ticket.goal), "booked", commit)
+            return Receipt(ticket.operation, ticket.name, "booked", commit)
         before = snapshot.state
         targets = targets_of_decision(before, decision) if self._with_targets else ()
         return replace(receipt_of(ticket, decision, commit, targets), outcome="booked")

@@ -178,13 +178,6 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
     return steps, failed
 
 
-def name_of(goal: object) -> str:
-    """Return the id in a goal, even if the goal is no longer valid."""
-    fields = goal if isinstance(goal, dict) else {}
-    keys = ("id", "request", "demand", "name")
-    return str(next((fields[key] for key in keys if fields.get(key)), ""))
-
-
 def is_release(goal: object) -> bool:
     """Return whether a goal that is not parsed yet is a release."""
     fields = goal if isinstance(goal, dict) else {}

@@ -140,15 +140,19 @@ class StateRepository(ABC):
         Raises Unavailable or Unsound if that fails.
         """
 
+    def reopened(self) -> Repository:
+        """Return the repository opened again, for a thread that is not the owner's."""
+        return Repository(self.objects.path)
+
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant; false if one is not here.
 
-        May be called from any thread: it opens the repository again.
+        May be called from any thread.
         """
         if commit == other:
             return True
         try:
-            return Repository(self.objects.path).descendant_of(commit, other)
+            return self.reopened().descendant_of(commit, other)
         except (pygit2.GitError, KeyError, ValueError):
             return False
 
@@ -167,7 +171,7 @@ class StateRepository(ABC):
         return None if found is None else sorted(path for path, _ in trees.differences(*found))
 
     def _trees(self, one: str, other: str) -> tuple[Tree, Tree] | None:
-        objects = Repository(self.objects.path)  # opened again, so any thread may ask
+        objects = self.reopened()
         try:
             return trees.commit_of(objects, one).tree, trees.commit_of(objects, other).tree
         except StateRepoError:

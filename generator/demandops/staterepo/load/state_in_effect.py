@@ -114,6 +114,20 @@ def start_at(
     raise faults[0]
 
 
+def snapshot_at(
+    repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
+) -> Snapshot:
+    """Return the ledger and the configuration that are in effect at a commit.
+
+    Raises:
+        InvalidInput, StateRepoError: the commit is not valid, and no generator quarantined its
+            files.
+    """
+    if record_at(repo, revision).first("In-Force"):
+        return state_at(repo, revision, progress)
+    return snapshots.load(repo, revision, progress)
+
+
 def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
     """Return the generator's newest commit up to a commit, else that commit without trailers."""
     commit = trees.commit_of(repo, revision)

@@ -1,0 +1,76 @@
+"""kill -9 in a burst of goals: what a client was told to be accepted is booked, or refused aloud.
+
+Three kills by default; ``GOAL_KILLS=100`` kills a hundred times.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.kit import rig
+from tests.kit.cli import Run
+from tests.kit.goals import link as connection
+from tests.kit.repo import git
+from tests.kit.ros import Client, Sent, Serve, Served
+
+KILLS = int(os.environ.get("GOAL_KILLS", "3"))
+BURST = 40
+
+
+def _goal(number: int) -> rig.Goal:
+    """Return a goal; every fourth is refused."""
+    wrong = {} if number % 4 else {"target_node_id": "egde"}
+    return {**connection(number % BURST, **wrong), "id": f"request{number}"}
+
+
+def _killed_in_a_burst(served: Served, client: Client, goals: range, pause: float) -> list[Sent]:
+    """Kill a node that has accepted a goal, and return the goals."""
+    served.wait_for("taking demands")
+    while True:  # it may still know only the node that was killed
+        first = client.send(_goal(0))
+        with suppress(AssertionError):
+            client.wait(lambda: first.answered, 2)  # noqa: B023
+            break
+    sent = [client.send(_goal(number)) for number in goals]
+    end = time.monotonic() + pause
+    client.wait(lambda: time.monotonic() >= end and any(goal.accepted for goal in sent))
+    served.process.kill()
+    served.process.wait()
+    return sent
+
+
+@pytest.mark.limit(60 + 30 * KILLS)
+def test_killed_in_a_burst_each_accepted_goal_is_booked_or_refused_in_the_log(
+    serve: Serve, client: Client, bare: Path, demandops: Run
+) -> None:
+    random, answered = Random(KILLS), dict[int, bool]()
+    for kill in range(KILLS):
+        goals = range(1 + kill * BURST, 1 + (kill + 1) * BURST)
+        sent = _killed_in_a_burst(serve(bare), client, goals, random.uniform(0.01, 1.5))
+        of_each = zip(goals, sent, strict=True)
+        answered |= {number: goal.answered for number, goal in of_each if goal.accepted}
+    served = serve(bare)
+    served.wait_for("taking demands")
+    none = "0 demands are accepted and not published\n"
+    listed = ("journal", "--state-repo", bare)
+    rig.wait_until(lambda: demandops(*listed).out == none, "the journal is empty", 60)
+    assert served.stop() == 0
+
+    trailer = "--format=%(trailers:key=Request-Id,valueonly)"
+    booked = git(bare, "log", trailer, "main").split()
+    log = "".join(path.read_text() for path in served.log.parent.glob("node-*.log"))
+    reasons = ("unknown-node: ", "was refused, but the reason was lost; send it again")
+    refused = [line for line in log.splitlines() if any(reason in line for reason in reasons)]
+    shown = {n for n in answered if any(f"'request{n}'" in line for line in refused)}
+    assert shown == {number for number in answered if number % 4 == 0}
+    assert {f"request{number}" for number in answered.keys() - shown} <= set(booked)
+    assert len(booked) == len(set(booked)), "booked twice"
+    unanswered = [number for number, is_answered in answered.items() if not is_answered]
+    print(f"{KILLS} kills: {len(answered)} accepted, {len(unanswered)} of them not answered")
+    assert len(unanswered) >= KILLS
