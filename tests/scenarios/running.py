@@ -327,7 +327,7 @@ def same_faults(wanted: Iterable[Told], found: Iterable[Fault]) -> bool:
 
 
 def _of_connections(world: World, what: str) -> dict[str, list[str]]:
-    return {id: entry[what] for id, entry in world.books()["connections"].items()}
+    return {id: [*entry[what]] for id, entry in world.books()["connections"].items()}
 
 
 def _since_start(moment: datetime) -> str:
