@@ -48,8 +48,8 @@ _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 """What the short form tries, without and with a remote."""
 
 _MISSED = "not reached"
-_TRIES = 3
-"""How often to count the calls again if one is missed."""
+_TRIES = 8
+"""How often to count the calls again if one is missed: either thread may write the journal."""
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls of a demand, by the folder in which this process books it."""
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")

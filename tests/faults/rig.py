@@ -175,7 +175,8 @@ class Rig:
                     if strace is not None and name == strace.at:
                         tracer = _attach(strace, int(number), paths["trace"])
                         alone = 0 if "-f" in strace.options else int(number)
-                    os.write(go, b".")
+                    with suppress(BrokenPipeError):  # the process ended as a thread began
+                        os.write(go, b".")
             if handle in ready:
                 status = os.waitpid(process, 0)[1]
                 break
@@ -227,11 +228,14 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
 
+        one_begins = threading.Lock()
+
         def begin(name: str) -> None:
-            if select.select([waits], [], [], 0)[0]:
-                os.read(waits, 1)  # of the thread before: strace must count no read of this one
-            os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
-            select.select([waits], [], [])
+            with one_begins:
+                if select.select([waits], [], [], 0)[0]:
+                    os.read(waits, 1)  # of the thread before: strace must count no read of this one
+                os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
+                select.select([waits], [], [])
             with suppress(OSError):
                 Path(BEGIN).stat()
 
