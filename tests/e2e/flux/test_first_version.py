@@ -20,7 +20,9 @@ def test_an_upgrade_from_the_first_version_restarts_the_fusion_alone(
     world = make_world()
     old = first_version(tmp_path / "first.git", "three-joins").files()
     url = rig.git_url(world.name)
-    laid_down = {path: None for path in world.person.git("ls-files").split("\n") if path}
+    world.person.git("fetch", "--quiet", "origin", "main")
+    listed = world.person.git("ls-tree", "-r", "-z", "--name-only", "FETCH_HEAD")
+    laid_down = dict.fromkeys(filter(None, listed.split("\0")))
     files = {path: text.replace(URL, url) for path, text in old.items()}
     world.push(laid_down | files, "As the first version left it")
     domain = world.bootstrap(CLUSTER, rig)
