@@ -23,7 +23,7 @@ from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
-from demandops.demand.goal_validation import parse_valid_part
+from demandops.demand.goal_validation import is_unicode, parse_valid_part
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
 from demandops.quoting import quoted
@@ -267,7 +267,7 @@ def _value_problem(value: object, depth: int) -> str:
         return f"is nested deeper than {_DEEPEST} levels; make it flatter"
     if isinstance(value, float) and not math.isfinite(value):
         return f"holds {value}, which is not a finite number; give one, or leave it out"
-    if isinstance(value, str) and any("\ud800" <= char <= "\udfff" for char in value):
+    if isinstance(value, str) and not is_unicode(value):
         return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
     if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
         return f"has the key {quoted(long[0])} of {len(long[0])} characters; at most {_LONGEST_KEY}"

@@ -47,7 +47,7 @@ def _with_keys_of_text(
     location: tuple[int | str, ...],
     faults: list[Fault],
 ) -> Any:  # noqa: ANN401
-    """Return ``data`` without the entries whose key is not text; add a fault for each."""
+    """Return ``data`` without the entries whose key is not Unicode text; add a fault for each."""
     if len(location) > _DEEPEST and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
@@ -58,12 +58,18 @@ def _with_keys_of_text(
         return data
     kept = {}
     for key, value in data.items():
-        if isinstance(key, str):
+        if isinstance(key, str) and is_unicode(key):
             kept[key] = _with_keys_of_text(value, (*location, key), faults)
         else:
-            message = f"the key {strict_yaml.short_repr(key)} must be text; put it in quotes"
+            remedy = "write whole characters" if isinstance(key, str) else "put it in quotes"
+            message = f"the key {strict_yaml.short_repr(key)} must be text; {remedy}"
             faults.append(fault(field_path(location), message))
     return kept
+
+
+def is_unicode(text: str) -> bool:
+    """Return whether text has no half of a surrogate pair, which cannot be stored."""
+    return not any("\ud800" <= char <= "\udfff" for char in text)
 
 
 def _blank(
@@ -74,8 +80,6 @@ def _blank(
     A field is removed, so that its default applies. An item of a list is replaced by an empty one,
     so that later items keep their positions.
     """
-    if not location:  # the fault concerns all of it, for example a key with a lone surrogate
-        return {}
     *parents, last = location
     node: Any = data
     within = ""

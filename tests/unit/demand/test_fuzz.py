@@ -150,3 +150,12 @@ def test_any_id_is_refused_or_booked_rendered_committed_and_released(
     assert parse(text).trailers["Requester"] == [who]
     books.send(asked | {"shutdown": True})
     assert books.rendered() == {}
+
+
+def test_a_name_with_half_a_character_is_refused_wherever_it_stands() -> None:
+    put = {"kind": "Demand", "demand": "d", "applications": [{"inputs": {"\ud800": {}}}]}
+    found = outcome(put)
+    assert isinstance(found, tuple)
+    assert "applications[0].inputs: the key '\\ud800' must be text; write whole characters" in [
+        str(one) for one in found
+    ]
