@@ -31,6 +31,14 @@ IMAGE_VARIABLE = "E2E_IMAGE_ROOT"
 _START = """
 root=$1 image=$2 folders=$3 python=$4 volumes=$5 user=$6 group=$7
 shift 7
+show_folders() {
+  for folder in $folders; do
+    [ ! -e "$root$folder" ] || continue
+    mkdir -p "$root$folder"
+    mount --bind "$folder" "$root$folder"
+    mount -o remount,bind,ro "$root$folder"
+  done
+}
 mount -t tmpfs -o mode=755 tmpfs "$root"
 if [ -n "$image" ]; then
   mkdir "$root/above" "$root/work" "$root/merged"
@@ -42,11 +50,7 @@ else
   mkdir "$root/image"
   printf '#!/bin/sh\nexec %s -m demandops.cli.main "$@"\n' "$python" >"$root/image/demandops"
   chmod 755 "$root/image/demandops"
-  for folder in $folders; do
-    mkdir -p "$root$folder"
-    mount --bind "$folder" "$root$folder"
-    mount -o remount,bind,ro "$root$folder"
-  done
+  show_folders
 fi
 mkdir -p "$root/proc" "$root/dev"
 mount --bind /proc "$root/proc"
@@ -59,6 +63,7 @@ for volume in $volumes; do
   mount --bind "${source%:*}" "$root$target"
   mount -o "remount,bind,$mode" "$root$target"
 done
+[ -n "$image" ] || show_folders  # a volume may hide one: this checkout may be below /tmp
 mount -o remount,bind,ro "$root"
 cd /
 exec chroot "$root" setpriv --reuid "$user" --regid "$group" --groups "$group" \
