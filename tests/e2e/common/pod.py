@@ -33,7 +33,7 @@ root=$1 image=$2 folders=$3 python=$4 volumes=$5 user=$6 group=$7
 shift 7
 show_folders() {
   for folder in $folders; do
-    [ ! -e "$root$folder" ] || continue
+    [ -z "$(ls -A "$root$folder" 2>/dev/null)" ] || continue
     mkdir -p "$root$folder"
     mount --bind "$folder" "$root$folder"
     mount -o remount,bind,ro "$root$folder"
