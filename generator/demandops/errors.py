@@ -115,7 +115,7 @@ class ShuttingDown(DemandOpsError):
 
 
 class Unsound(DemandOpsError):
-    """Raised when going on could lose or double a demand, or answer what another process answers.
+    """Raised when a demand could be lost or booked twice, or another process might answer it too.
 
     Nobody is answered, and the process ends with exit code 3. The next start goes by the journal.
     """

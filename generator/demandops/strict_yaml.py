@@ -31,12 +31,12 @@ MAX_LENGTH = 4_000_000
 """The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""Of a whole number; Python prints no more than 4,300 digits."""
+"""The bits of a whole number; Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-"""A text, or a JSON number like ``1e-09``: without a dot, YAML 1.1 reads text."""
+"""Matches a text, or the digits of a JSON number like ``1e-09``, which YAML 1.1 reads as text."""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -66,7 +66,7 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""Returns the value of a scalar, by its tag; JSON has no values of other tags."""
+"""Tag → the function that returns a scalar's value. Values of other tags do not fit JSON."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node

@@ -22,7 +22,7 @@ Place = Callable[[str], str]
 
 
 def place_in(field: str) -> Place:
-    """Return the place of an item whose fields have the same names in the goal's ``field``."""
+    """Return the place of the item at ``field`` of a goal that names its fields as we do."""
     return lambda path: f"{field}.{path}"
 
 

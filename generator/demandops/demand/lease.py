@@ -13,7 +13,7 @@ from datetime import datetime, timedelta, timezone
 LONGEST_S = 366 * 24 * 3600
 
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
-"""The end of a lease that starts at the approval of its proposed claim."""
+"""The end of a lease that has not started, because its claim awaits approval."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -205,7 +205,7 @@ class Ledger:
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the applications that are called ``part`` in names of topics, sorted."""
+        """Return the applications whose id becomes ``part`` in names of topics, sorted."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:

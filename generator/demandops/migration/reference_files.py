@@ -165,7 +165,7 @@ class _FusionBook(_Part):
 
 @dataclass
 class ReferenceFiles:
-    """What all files together say: of each resource its spec, its books and its versions."""
+    """What all files together say: the spec, the bookkeeping and the requests of each resource."""
 
     specs: dict[str, Spec] = field(default_factory=dict)
     books: dict[str, Counter[Hold]] = field(default_factory=dict)

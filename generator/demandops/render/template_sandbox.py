@@ -52,7 +52,7 @@ _FILTERS = re.findall(
 _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
 """Filters that take a step whatever the size: they only look at a value or return a part of it."""
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
-"""Filters that look at each item: what they ask of it takes steps of its own."""
+"""Filters that call a filter or test for each item; these calls take the steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
 """Filters that take more steps for the same size."""
 _PADDING = frozenset(
@@ -91,7 +91,7 @@ _budget: ContextVar[_Budget] = ContextVar("budget")
 
 @contextmanager
 def budget() -> Iterator[None]:
-    """Give the templates that are compiled or rendered inside a full budget."""
+    """Give templates that are compiled or rendered in the block a full budget."""
     token = _budget.set(_Budget())
     try:
         yield
@@ -100,9 +100,9 @@ def budget() -> Iterator[None]:
 
 
 def _size(value: object, *, data: bool = True) -> int:
-    """Return the size of a value with all that it contains, also what it contains twice.
+    """Return the size of a value with all that it contains; what it contains twice counts twice.
 
-    With ``data`` anything but data is refused, because its text would hold an address in memory.
+    With ``data``, any other object is refused, because its text would hold an address in memory.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -133,7 +133,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Return a new value if it is not too large; what is lazy becomes a list."""
+    """Return a new value, and take steps for its size; an iterator or a view becomes a list."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
@@ -157,7 +157,7 @@ def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
 
 
 def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
-    """Refuse a filter or a method of text whose result may be a product of what it is given."""
+    """Refuse a filter or a method of text whose result may be far larger than its arguments."""
     subject, *others = values or ("",)
     if name in _PADDING or name in ("ljust", "rjust", "zfill"):
         numbers = [abs(each) for each in others if isinstance(each, int)]

@@ -48,7 +48,8 @@ class PushWebhook:
 
         Args:
             address: ``host:port``; port 0 picks a free port.
-            secret: the key that signs notifications; empty: those of this machine are accepted.
+            secret: the key that signs notifications. If empty, they need no signature, and the
+                address must be on the loopback.
             on_push: called for each notification; must return at once.
 
         Raises:
@@ -120,7 +121,7 @@ class PushWebhook:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection; the server refuses it if there are too many, and cuts it off in time."""
+    """A connection that is cut off after some seconds, or at once if too many are open."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)

@@ -69,7 +69,7 @@ class Health:
     failing: bool = False
 
     def reaches(self, level: Level) -> bool:
-        """Report whether the state is at least ``level``."""
+        """Return whether the state is at least ``level``."""
         return _ORDER[self.state] >= _ORDER[level]
 
 
@@ -83,11 +83,11 @@ class History(Protocol):
     """Queries on the state repo's commits."""
 
     def includes(self, commit: str, other: str) -> bool:
-        """Report whether ``commit`` is ``other`` or comes after it."""
+        """Return whether ``commit`` is ``other`` or comes after it."""
         ...
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Report whether two commits have the same content under ``path``."""
+        """Return whether two commits have the same content under ``path``."""
         ...
 
 

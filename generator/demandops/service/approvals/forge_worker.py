@@ -24,7 +24,7 @@ POLL_S = 30.0
 
 _TOO_MANY_REQUESTS = 429
 _REST_S = 60.0
-"""How long to ask a forge nothing after it said that it was asked too often."""
+"""The pause after a forge answers that it got too many requests."""
 
 
 @dataclass(frozen=True, slots=True)

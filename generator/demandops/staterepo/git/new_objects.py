@@ -31,7 +31,7 @@ _LAST = 0
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-"""What file systems answer that have no hard links, or no more of them."""
+"""The errors of file systems that have no hard links, or allow no more to a file."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -55,7 +55,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository, as long as its owner holds it."""
+        """The repository; whoever writes to it keeps it alive."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - whoever writes to it holds it
         return repo
@@ -197,7 +197,7 @@ class NewObjects(pygit2.OdbBackend):
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return type, content and id of a new object; only full ids are looked up."""
+        """Return type, content and id of a new object; a shortened id finds none."""
         kind, data = self._known[oid]
         return kind, data, oid
 

@@ -129,7 +129,10 @@ def snapshot_at(
 
 
 def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
-    """Return the generator's newest commit up to a commit, else that commit without trailers."""
+    """Return the generator's newest commit at or before a revision.
+
+    If there is none, return the revision's own commit, without trailers.
+    """
     commit = trees.commit_of(repo, revision)
     made = commit_log.last_generator_commit(repo, commit.id)
     if made is None:
@@ -178,7 +181,8 @@ class Judgement:
 
     If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
     be planned with the new one only, the new configuration is at fault. If policy refuses a claim
-    that a person wrote, that claim is at fault (``refused``: with the new configuration).
+    that a person wrote, that claim is at fault. ``refused`` has these faults, with the new
+    configuration.
     """
 
     repo: Repository
@@ -246,7 +250,7 @@ def judge(
     """Return the subjects that people changed since ``before`` and that cannot be accepted.
 
     Args:
-        held_back: the claim files that were refused then, if a record says so; else policy decides.
+        held_back: the claim files that were refused, as a record says; without one, policy decides.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)
@@ -288,7 +292,7 @@ def _together(one: Faults, other: Faults) -> Faults:
 
 
 def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
-    """Return the subjects with claims that a record names, without the reasons."""
+    """Return a placeholder fault for each subject that has a claim file in ``held_back``."""
     ledger = advance.snapshot.state.ledger
     return {
         subject: (_TO_CHECK,)
