@@ -212,7 +212,7 @@ class OverrideFile(FileModel):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
                 yield (
-                    f"select[{index}].connections: {wrong[0]} is for services, and connections "
+                    f"select[{index}].connections: {wrong[0]} changes services, and connections "
                     "have none; remove one of the two"
                 )
             if selector.services and "keep" in effects:

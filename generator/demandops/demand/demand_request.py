@@ -22,7 +22,7 @@ Place = Callable[[str], str]
 
 
 def place_in(field: str) -> Place:
-    """Return the place of the item at ``field`` of a goal that names its fields as we do."""
+    """Return the place of an item at the goal's ``field``: its ``path`` is ``<field>.<path>``."""
     return lambda path: f"{field}.{path}"
 
 

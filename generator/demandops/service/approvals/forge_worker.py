@@ -60,7 +60,7 @@ class ForgeWorker:
             self._enqueue(task)
 
     def has_answered(self, branch: str) -> bool:
-        """Return whether the forge was queried for a branch, successfully or not."""
+        """Return whether a first query about a branch has ended, successfully or not."""
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
