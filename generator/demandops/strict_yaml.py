@@ -99,7 +99,7 @@ class _Parser:
         if kind is yaml.ScalarEvent:
             return self._scalar(event)
         if depth > _MAX_DEPTH:
-            raise InvalidInput.at("", f"is nested deeper than {_MAX_DEPTH} levels")
+            raise InvalidInput.at("", f"is nested deeper than {_MAX_DEPTH} levels; make it flatter")
         name = "seq" if kind is yaml.SequenceStartEvent else "map"
         if event.tag not in (None, "!", f"{_TAG}{name}"):
             raise _refused_tag(event.tag, event)

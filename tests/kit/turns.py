@@ -110,7 +110,7 @@ class _Event:
 
 
 class _Condition:
-    """Needs no lock, because a turn ends only with a wait."""
+    """A condition without a lock: no other thread runs before a wait."""
 
     def __init__(self, turns: Turns) -> None:
         self._turns, self._changes = turns, 0

@@ -145,7 +145,7 @@ class MqttEnd(End):
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Return the settings' and the broker's entries."""
+        """Return the entries of the clients' settings and of the broker."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"

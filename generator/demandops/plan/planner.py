@@ -227,7 +227,7 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             odd = next(value for value in given if value not in numbers)
             message = (
                 f"{odd!r} is not a number, but the application definition takes the "
-                f"{parameter.merge}"
+                f"{parameter.merge}; give a number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)

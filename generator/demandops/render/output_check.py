@@ -85,7 +85,7 @@ def check_files(files: Mapping[str, str | None]) -> None:
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
-            faults.append(fault("", "is not the generator's to write").within(path))
+            faults.append(fault("", "is not in a folder that the generator writes").within(path))
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):

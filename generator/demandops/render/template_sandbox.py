@@ -137,7 +137,7 @@ def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
-        raise SecurityError("a text is too large")
+        raise SecurityError(f"a text is longer than {MAX_LENGTH} characters")
     _budget.get().take(_size(value, data=data))
     return value
 

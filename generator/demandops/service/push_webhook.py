@@ -159,7 +159,7 @@ def _listening(address: str, *, local_only: bool) -> socket.socket:
     except OSError as error:
         listener.close()
         raise _invalid(
-            f"'{address}' cannot be listened on: {error.strerror}; choose another port"
+            f"cannot listen on '{address}': {error.strerror}; choose another port"
         ) from None
     return listener
 

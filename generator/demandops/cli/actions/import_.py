@@ -82,7 +82,8 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     for warning in warnings:
         errors.print(f"warning: {warning}")
     if not joins:
-        raise InvalidInput([fault("", "nobody holds anything in the given files")])
+        message = "nothing to import: nobody holds anything in the given files"
+        raise InvalidInput([fault("", message)])
     if not map_file.exists():
         _propose(joins, found, map_file, state_repo, output)
         return
