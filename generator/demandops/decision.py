@@ -55,7 +55,7 @@ _OUTCOMES: dict[str, Outcome] = {
     "renew": "booked",
     "rollback": "restored",
 }
-"""Operation → verb; all other operations release."""
+"""The outcomes of operations; that of any other is ``released``."""
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 """Yields a fault if a request comes too soon after others of its requesters."""

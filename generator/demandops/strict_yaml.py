@@ -48,7 +48,7 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes. The same words and topics come again and again."""
+    """Return the tag of a scalar without quotes; cached, because the same words come often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 

@@ -33,7 +33,7 @@ from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
 _RESULT_KEPT_S = 900
-"""How long a client may ask for a result; rclpy keeps it for ten seconds."""
+"""How long a client may ask for a result, instead of rclpy's ten seconds."""
 _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; it drops the oldest of more."""
 _SHALLOW = (
@@ -135,7 +135,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer from a thread of its own: an old revision may take seconds to read."""
+        """Answer a call of the service, in another thread: an old revision may take seconds."""
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response

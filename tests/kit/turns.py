@@ -110,7 +110,7 @@ class _Event:
 
 
 class _Condition:
-    """A condition without a lock: no other thread runs before a wait."""
+    """A condition that needs no lock: a thread keeps its turn until it waits."""
 
     def __init__(self, turns: Turns) -> None:
         self._turns, self._changes = turns, 0

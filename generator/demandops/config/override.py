@@ -48,7 +48,7 @@ _MOMENT = re.compile(
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("version", "replicas", "node", "keep")
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-"""The effects of overrides, in the order of messages."""
+"""The effects of overrides, in the order in which messages list them."""
 
 
 def parse_time(text: str) -> datetime:

@@ -43,7 +43,7 @@ class Connection:
 
     @property
     def nodes(self) -> tuple[str, str]:
-        """The nodes that a selector of an override matches."""
+        """The nodes that selectors of overrides are compared with."""
         return (self.source, self.target)
 
     @property

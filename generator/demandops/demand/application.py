@@ -61,7 +61,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The nodes that a selector of an override matches."""
+        """The nodes that selectors of overrides are compared with."""
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:

@@ -33,7 +33,7 @@ _TIMEOUT_S = 10.0
 _AT_ONCE = 16
 _STOP_TIMEOUT_S = 1
 _MAX_BODY = 25 << 20
-"""The most that GitHub sends; the body is hashed, not stored."""
+"""The largest body that GitHub sends, in bytes; a body is hashed and not stored."""
 _WARN_EVERY_S = 60.0
 
 _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature")

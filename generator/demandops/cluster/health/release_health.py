@@ -122,7 +122,7 @@ class HealthReader(ABC):
         """Return how far a domain has applied a commit."""
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return how far a commit has started or removed a release: first applied, then started."""
+        """Return how far a release is at a commit: first applied, then started or removed."""
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain

@@ -1,4 +1,4 @@
-"""The address of a state repo: a folder or a URL that Git can clone, and opening it."""
+"""The address of a state repo: a folder or a URL that Git can clone. Opens the repo."""
 
 from __future__ import annotations
 

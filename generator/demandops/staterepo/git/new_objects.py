@@ -26,7 +26,7 @@ from pygit2.enums import ObjectType
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 _LAST = 0
-"""The priority of the memory. It is asked last, because most objects that are read are not new."""
+"""The lowest priority among the places of objects: most objects that are read are not new."""
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
@@ -97,9 +97,10 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
-        """Build a pack and place it before its index: git removes an index without a pack.
+        """Build a pack, then move it and its index into place, in this order.
 
-        Its .keep begins like the index, so :meth:`clean` knows it.
+        Git removes an index without a pack. The pack's .keep begins like the index, by which
+        :meth:`clean` recognizes it.
         """
         packs = self._packs
         with (
