@@ -57,7 +57,7 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects text that ``parse`` cannot read; the rest stays text."""
+    """Return a validator that rejects text that ``parse`` cannot read; it changes no text."""
 
     def check(value: str) -> str:
         parse(value)

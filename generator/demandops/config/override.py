@@ -330,7 +330,7 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    """Return settings with an override's ``values``; only MQTT clients take their own fields.
+    """Return settings with an override's ``values``; others ignore the fields of MQTT clients.
 
     Raises:
         InvalidInput: if the result is not valid, naming the override's ``file``.

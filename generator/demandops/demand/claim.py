@@ -138,7 +138,7 @@ class Claim:
         return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
-        """Return the claim, booked when ``current`` was if they differ at most in the lease."""
+        """Return the claim, with the booking time of ``current`` if only their leases differ."""
         if current is None:
             return self
         kept = replace(self, booked=current.booked)

@@ -99,9 +99,9 @@ class RecentShutdowns:
     def forget(
         self, now: datetime, requesters: Iterable[str] = ()
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the shutdowns without some, and the digests of those that are gone.
+        """Return the shutdowns without the forgotten ones, and the digests of these.
 
-        Gone are those of ``requesters``, and some that are older than 15 minutes.
+        Forgotten are those of ``requesters`` and some that are older than 15 minutes.
         """
         first = _minute(now - REMEMBERED)
         ended = sorted(one for one in self.by_minute if one < first)
