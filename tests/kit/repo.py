@@ -130,7 +130,7 @@ class GitRepo:
 
 
 class Person:
-    """A person who changes the state repo at its forge, or in a clone and pushes it."""
+    """A person who changes the state repo at its forge, or in a clone and then pushes."""
 
     def __init__(self, remote: Path, folder: Path) -> None:
         self.bare, self.folder = remote, folder

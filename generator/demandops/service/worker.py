@@ -352,9 +352,9 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's changes up to the fetched tip; return if there were any.
+        """Publish the effects of people's changes up to the fetched tip; return whether there were any.
 
-        Does not fetch first.
+        It does not fetch first.
         """
         for _ in range(_TRIES):
             commits = self._new_commit_batch()
