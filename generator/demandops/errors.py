@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from demandops.quoting import clipped, one_line
 
 MOST_FAULTS = 100
-"""The faults of one file, or of a request, that are told; the others are counted."""
+"""How many faults of one file, or of a request, are listed; the others are counted."""
 _LONGEST_FIELD = 2_000
 
 

@@ -28,10 +28,10 @@ _WORDS = frozenset(
 )  # some parsers do not read these words as text
 
 MAX_LENGTH = 4_000_000
-"""The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
+"""The most characters of a file; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""The bits of a whole number; Python prints at most 4,300 digits."""
+"""The most bits of a whole number; Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 

@@ -72,7 +72,7 @@ def _hidden(value: str) -> str:
 
 
 Visible = without(_hidden)
-"""Rejects the control characters that hide or reorder text; lines and tabs are valid."""
+"""Rejects the control characters that hide or reorder text; line breaks and tabs are valid."""
 
 Text = Annotated[str, Visible]
 """Any visible text."""

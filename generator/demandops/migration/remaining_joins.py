@@ -31,7 +31,8 @@ def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join
     """Return the joins whose holds add up to ``book``, oldest first.
 
     The requests are undone, from the newest back to the one that created the resource. What is left
-    is what that first request asked for. Then the others are done again, each as a join of its own.
+    is what that first request asked for. Then the others are done again, and each join stays a join
+    of its own.
 
     Args:
         book: how often each hold is held.

@@ -33,11 +33,11 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
 MAX_STEPS = 1_000_000
-"""The steps of one rendering, at most a few seconds of work; 100 topics take some thousand."""
+"""The most steps of one rendering, a few seconds of work; 100 topics take some thousand."""
 MAX_LENGTH = 1_000_000
-"""The characters of a text. Kubernetes takes no object above 1.5 MB."""
+"""The most characters of a text. Kubernetes takes no object above 1.5 MB."""
 MAX_SIZE = 100_000
-"""The parts of a value: each item, key and 16 characters of text counts."""
+"""The most parts of a value. Each item, each key and every 16 characters of text are a part."""
 _MAX_BITS = 1024
 
 _DIGITS = re.compile(r"\d{1,9}")

@@ -16,7 +16,7 @@ from demandops.quoting import quoted
 _MAX_WORK = 100_000
 _MAX_VISITS = 1_000_000
 _MAX_DEPTH = 100
-"""The deepest values; strict YAML is not deeper."""
+"""The greatest depth of values; strict YAML is not deeper."""
 
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 _SAME_VALUE = ("allOf", "anyOf", "oneOf", "not", "if", "then", "else")

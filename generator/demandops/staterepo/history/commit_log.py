@@ -203,7 +203,7 @@ class PathHistory:
 def changes_to(
     repo: Repository, tip: str | Oid, path: str, until: str | None = None
 ) -> Iterator[PathChange]:
-    """Yield the commits after ``until`` that changed a file or folder, as ``git log`` does."""
+    """Yield the commits after ``until`` that changed a path, newest first, as ``git log`` does."""
     for revision in _git_log(repo, tip, until, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)

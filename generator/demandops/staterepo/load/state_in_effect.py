@@ -6,8 +6,8 @@ names a file that is in effect in another version, as path and blob. Each ``Held
 of the ledger that is not in effect. A restart and ``demandops verify`` start from these trailers.
 They then apply people's later changes with the same code as a running generator.
 
-People's changes that cannot be planned are not applied (quarantine). A claim that cannot be
-planned, for example because it names an unknown node, or that policy refuses stays in its file, and
+People's changes that cannot be planned are not applied (quarantine). If a claim cannot be planned,
+for example because it names an unknown node, or if policy refuses it, its file stays as it is and
 its last valid version is in effect. If the new configuration is the reason, the old configuration
 stays in effect.
 """
