@@ -128,7 +128,7 @@ class _Parser:
             if not isinstance(key, str):
                 raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
             if key in seen:
-                raise _problem(f"the key {key!r} appears twice", event)
+                raise _problem(f"the key {key!r} appears twice; remove one", event)
             seen[key] = self._value(self._next(), depth + 1)
         return seen
 

@@ -150,7 +150,7 @@ class Ledger:
         return None
 
     def has_usual_topic(self, role: str, source: str, *, but_of: str | None = None) -> bool:
-        """Return whether a topic of ``source`` in ``role`` is no further one.
+        """Return whether a claim has the usual topic of ``source`` in ``role``.
 
         The demand ``but_of`` does not count.
         """
@@ -158,7 +158,7 @@ class Ledger:
         return any(key.demand != but_of for key in keys)
 
     def usual_topics(self, role: str, source: str, *, but: str) -> Iterator[str]:
-        """Yield the topics of ``source`` in ``role`` that are no further ones, except ``but``."""
+        """Yield the usual topics of ``source`` in ``role`` that claims have, except ``but``."""
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("takes", source, but)) or ()):
             return  # all of them take that one

@@ -352,7 +352,7 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish what follows from people's changes up to the fetched tip; return whether anything did.
+        """Publish what follows from people's changes up to the fetched tip; return whether any did.
 
         It does not fetch first.
         """
