@@ -36,7 +36,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """A running lease: its term and its recorded end, in UTC."""
+    """The lease of a claim: its term and its recorded end, in UTC."""
 
     seconds: int
     slack: int
