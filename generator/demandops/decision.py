@@ -55,7 +55,7 @@ _OUTCOMES: dict[str, Outcome] = {
     "renew": "booked",
     "rollback": "restored",
 }
-"""Operation → verb; all other operations release."""
+"""The outcomes of operations; that of any other is ``released``."""
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 """Yields a fault if a request comes too soon after others of its requesters."""
@@ -80,7 +80,7 @@ class State(World):
         return cls(config, ledger, Engine(config.files))
 
     def followed_by(self, ledger: Ledger, plans: Mapping[ReleaseKey, Release | None]) -> State:
-        """Return the state after a decision that planned all releases that it affects."""
+        """Return the state after a decision; ``plans`` has every release that it affects."""
         known = self.plans
         for key, release in plans.items():
             known = known.insert(key, release) if release else known.discard(key)
@@ -241,7 +241,7 @@ def admit(
 
 
 def _refuse_large(request: DemandRequest, config: Config) -> None:
-    """Refuse a request that is too large, before anything looks at all that it lists."""
+    """Refuse a request that is too large, before other checks read all that it lists."""
     faults = list(admission.size_faults(request, config.repo_settings.limits))
     if faults:
         raise Refused(faults)
@@ -317,7 +317,7 @@ def _subject_of(field: str) -> tuple[str, int]:
 
 
 def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each input that no connection brings, each that needs none, each note."""
+    """Yield warnings: inputs without a connection, topics that are bridged already, and notes."""
     ledger = without_suspended(world).ledger
     for one in request.demanded if request.adds_claims else ():
         held = one.held

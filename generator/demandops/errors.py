@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from demandops.quoting import clipped, one_line
 
 MOST_FAULTS = 100
-"""The faults of one file, or of a request, that are told; the others are counted."""
+"""How many faults of one file, or of a request, are listed; the others are counted."""
 _LONGEST_FIELD = 2_000
 
 
@@ -115,7 +115,7 @@ class ShuttingDown(DemandOpsError):
 
 
 class Unsound(DemandOpsError):
-    """Raised when going on could lose or double a demand, or answer what another process answers.
+    """Raised when a demand could be lost or booked twice, or another process might answer it too.
 
     Nobody is answered, and the process ends with exit code 3. The next start goes by the journal.
     """

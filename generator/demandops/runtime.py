@@ -107,7 +107,7 @@ class Runtime:
     def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
         """Start a thread that is started again if it fails, after a pause that grows.
 
-        After :class:`Unsound` it is not: then the process must end.
+        After :class:`Unsound` it is not started again: the process must end.
         """
         return self.start_thread(name, lambda: self._supervise(name, target))
 

@@ -1,6 +1,7 @@
 """Constants of the program, and the locations of its own files.
 
-Files carry the versions below. A generator refuses a state repo with a higher version.
+Files carry the versions below. A generator refuses files of a newer format, and a state
+repo of another render version.
 """
 
 from __future__ import annotations

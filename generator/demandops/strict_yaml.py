@@ -28,15 +28,15 @@ _WORDS = frozenset(
 )  # some parsers do not read these words as text
 
 MAX_LENGTH = 4_000_000
-"""The characters of a file that is read; an inventory of 20,000 nodes has fewer."""
+"""The most characters of a file; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""Of a whole number; Python prints no more than 4,300 digits."""
+"""The most bits of a whole number; Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-"""A text, or a JSON number like ``1e-09``: without a dot, YAML 1.1 reads text."""
+"""Matches a text, or the digits of a JSON number like ``1e-09``, which YAML 1.1 reads as text."""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -48,7 +48,7 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes. The same words and topics come again and again."""
+    """Return the tag of a scalar without quotes; cached, because the same words come often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -66,7 +66,7 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""Returns the value of a scalar, by its tag; JSON has no values of other tags."""
+"""Tag → the function that returns a scalar's value. Values of other tags do not fit JSON."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -99,7 +99,7 @@ class _Parser:
         if kind is yaml.ScalarEvent:
             return self._scalar(event)
         if depth > _MAX_DEPTH:
-            raise InvalidInput.at("", f"is nested deeper than {_MAX_DEPTH} levels")
+            raise InvalidInput.at("", f"is nested deeper than {_MAX_DEPTH} levels; make it flatter")
         name = "seq" if kind is yaml.SequenceStartEvent else "map"
         if event.tag not in (None, "!", f"{_TAG}{name}"):
             raise _refused_tag(event.tag, event)
@@ -128,7 +128,7 @@ class _Parser:
             if not isinstance(key, str):
                 raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
             if key in seen:
-                raise _problem(f"the key {key!r} appears twice", event)
+                raise _problem(f"the key {key!r} appears twice; remove one", event)
             seen[key] = self._value(self._next(), depth + 1)
         return seen
 

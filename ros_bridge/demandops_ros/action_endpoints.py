@@ -8,8 +8,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 DEEP_QOS = QoSProfile(depth=2000)
-"""For goals, results, cancels and feedback. With ROS's default of 10, those of a burst are lost; a
-client's queue also takes the answers to other clients, which it then drops."""
+"""The queues for goals, results, cancels and feedback. ROS's default of 10 loses some of a burst. A
+client's queue also gets the answers to other clients, which the client drops."""
 
 
 class OtherServers:

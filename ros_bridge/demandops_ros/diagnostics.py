@@ -51,7 +51,7 @@ def _of_state_repo(generator: Generator) -> DiagnosticStatus:
         "away since": _time(remote.unreachable_since),
         "last reached": _time(remote.last_reached),
         "last push": _time(remote.last_push),
-        "demands in the outbox": str(unpublished),
+        "unpublished demands": str(unpublished),
         "commit": str(generator.snapshot.commit),
     }
     return _status("demandops: state repo", generator.address, level, text, values)

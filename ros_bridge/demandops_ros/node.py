@@ -33,7 +33,7 @@ from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
 _RESULT_KEPT_S = 900
-"""How long a client may ask for a result; rclpy keeps it for ten seconds."""
+"""How long a client may ask for a result, instead of rclpy's ten seconds."""
 _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; it drops the oldest of more."""
 _SHALLOW = (
@@ -87,7 +87,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
         self._goals: dict[int, _Goal] = {}
-        """Those without a result, by the identity of their messages."""
+        """The goals without a result, by the identity of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
         # a group of its own, so that a service that waits for an event does not block events
@@ -135,9 +135,9 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer from a thread of its own: an old revision may take seconds to read."""
+        """Answer a call of the service, in another thread: an old revision may take seconds."""
         if self._readers >= _MOST_READERS:
-            response.message = f"{_MOST_READERS} calls are answered already; try again later"
+            response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response
         self._readers += 1
         done = Future(executor=self.executor)
@@ -188,7 +188,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return GoalResponse.REJECT
 
     def _accepted(self, handle: ServerGoalHandle) -> None:
-        """Join a goal's id, which the callback before is not given, to its demand."""
+        """Give a goal its handle, which rclpy makes only after the goal is accepted."""
         goal = self._goals[id(handle.request)]
         goal.handle = handle
         for feedback in goal.feedback:
@@ -198,7 +198,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._after(goal, goal.ticket.future, self._answer)
 
     def _forget_unless_accepted(self, goal: _Goal) -> None:
-        """Let a demand run without a goal, because the client could not be told of it."""
+        """Let a demand run without its goal if the client could not be told that it is accepted."""
         if goal.handle is None:
             del self._goals[id(goal.message)]
             self.get_logger().warning(f"{goal}: nobody gets the answer of {goal.ticket.operation}")

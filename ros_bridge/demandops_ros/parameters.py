@@ -55,7 +55,9 @@ _RANGES = {
 
 
 def read(given: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return the value of each parameter, read by a probe: the generator starts before the node.
+    """Return the value of each parameter.
+
+    A temporary node reads them, because the generator starts before the node.
 
     Args:
         given: values in place of some defaults; None and "" leave the default.

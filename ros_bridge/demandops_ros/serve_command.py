@@ -266,15 +266,15 @@ class _Signals:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Leave the signals to who handled them before."""
+        """Restore the earlier handlers of the signals."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Wait for a signal, or until something holds; :meth:`wake` looks again.
+        """Wait for a signal, or until ``until`` holds; :meth:`wake` makes it look again.
 
-        Ends the process if it must end.
+        If the runtime is unsound, this ends the process.
         """
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)
@@ -283,7 +283,7 @@ class _Signals:
             os._exit(ExitCode.PROGRAM_ERROR)  # no goal may get an answer on the way
 
     def wake(self) -> None:
-        """Let the wait look again; from any thread."""
+        """Make :meth:`wait` look again; from any thread."""
         os.write(self._write, b"\0")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -144,11 +144,11 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
     ),
     "a key twice": (
         "id: a\napps: []\nid: b\n",
-        "error: {file}: line 3, column 1: not valid YAML: the key 'id' appears twice\n",
+        "error: {file}: line 3, column 1: not valid YAML: the key 'id' appears twice; remove one\n",
     ),
     "a key twice, deep down": (
         "apps:\n- header:\n    id: a\n    id: b\n",
-        "error: {file}: line 4, column 5: not valid YAML: the key 'id' appears twice\n",
+        "error: {file}: line 4, column 5: not valid YAML: the key 'id' appears twice; remove one\n",
     ),
     "an anchor": (
         "id: &a x\n",

@@ -215,7 +215,10 @@ def test_what_cannot_be_read_is_refused(migration: Migration, text: str, message
 
 def test_nothing_held_is_an_error(migration: Migration) -> None:
     refused = migration.run("-", files="no such file", stdin="{}")
-    assert (refused.code, refused.err) == (1, "error: nothing is held in what was given\n")
+    assert (refused.code, refused.err) == (
+        1,
+        "error: nothing to import: nobody holds anything in the given files\n",
+    )
     assert "nothing to import: give FILE or --cluster" in migration.run(files="no such file").err
 
 

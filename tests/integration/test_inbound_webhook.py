@@ -256,7 +256,7 @@ def test_an_address_that_will_not_do_is_told(address: str, message: str) -> None
 
 def test_a_port_in_use_is_told(unsigned: PushWebhook) -> None:
     taken = urlsplit(unsigned.url).netloc
-    with pytest.raises(InvalidInput, match=f"'{taken}' cannot be listened on: Address already"):
+    with pytest.raises(InvalidInput, match=f"cannot listen on '{taken}': Address already"):
         PushWebhook(taken, b"", lambda: None)
 
 

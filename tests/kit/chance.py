@@ -1,6 +1,6 @@
 """Settings of Hypothesis: the same examples every time, so that no build fails by chance.
 
-``DEMANDOPS_EXAMPLES=20`` tries twenty times as many, and others each time.
+``DEMANDOPS_EXAMPLES=20`` tries twenty times as many, and different ones each time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ visible = st.characters(exclude_categories=["C", "Z"], include_characters=" ")
 
 
 def examples(count: int) -> Callable[[Any], Any]:
-    """Try so many examples, the same ones every time unless more are asked for."""
+    """Return a decorator that tries ``count`` examples, times ``DEMANDOPS_EXAMPLES``."""
     return settings(
         max_examples=count * TIMES,
         derandomize=TIMES == 1,
@@ -40,7 +40,7 @@ def examples(count: int) -> Callable[[Any], Any]:
 
 
 def told(requests: list[Goal]) -> list[Goal]:
-    """Have the requests shown where a test fails."""
+    """Return the requests, which are shown if the test fails."""
     for request in requests:
         note(json.dumps(summary(request)))
     return requests

@@ -11,9 +11,9 @@ _LONGEST_WAIT_S = 0.05
 
 
 class Clock(Runtime):
-    """A runtime whose clocks a test moves; from a given start they stand still in between.
+    """A runtime whose clocks a test moves.
 
-    If they stand still, nothing is left to chance either.
+    With a ``start`` they move in no other way, and random numbers are always the highest.
     """
 
     def __init__(self, start: datetime | None = None) -> None:
@@ -36,7 +36,7 @@ class Clock(Runtime):
 
     @property
     def offset(self) -> float:
-        """By how much the wall clock was set in all."""
+        """By how many seconds the wall clock was set in all."""
         return self._set
 
     def pass_(self, seconds: float) -> None:

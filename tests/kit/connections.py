@@ -1,4 +1,4 @@
-"""Connections with all that a route can say, in short form, and nodes that can carry them."""
+"""Demands for connections, in a short form, and nodes that can carry them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NO_BROKERS = yaml.safe_dump({"apiVersion": "demandops/v1", "kind": "Brokers", "b
 def state(
     images: str = ZENOH_IMAGE + ROS_IMAGE, *, brokers: bool = True, **nodes: dict[str, Any]
 ) -> State:
-    """Return a state repo in which some nodes of the skeleton have more to say."""
+    """Return a state without claims, in which some nodes of the skeleton have more fields."""
     inventory = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     for node in inventory["nodes"]:
         node.update(deepcopy(nodes.get(node["id"], {})))

@@ -1,10 +1,10 @@
-"""Generators in processes of their own, made to be killed: each tells its receipts as they come.
+"""A program that runs generators for tests to kill; each run reports its events as lines of JSON.
 
-Imports once and forks for every run, which it reads from standard input as one line of JSON. A run
-has lanes of demands, each lane a client that waits for an answer before it sends the next. With an
-opening demand the lanes start while the worker is busy with it, so that their first demands are one
-batch. ``die_at`` (``<point>`` or ``<point>:<n>``) ends the process, as kill -9 would, at the n-th
-time that it comes to the point.
+It imports the modules once and forks for every run. It reads a run from standard input, as one
+line of JSON. A run has lanes of demands: each lane is a client that waits for an answer before it
+sends its next demand. With an opening demand the lanes start while the worker is busy with it, so
+that their first demands become one batch. ``die_at`` (``<point>`` or ``<point>:<n>``) ends the
+process with SIGKILL when it reaches the point for the n-th time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Demand = dict[str, Any]
 
 
 def tell(**event: object) -> None:
-    """Write one line whole: shorter than a pipe's buffer, it is there or it is not."""
+    """Report an event as one line; it is shorter than a pipe's buffer, so it is never cut."""
     os.write(1, (json.dumps(event)[:4000] + "\n").encode())
 
 
@@ -43,7 +43,7 @@ def die() -> None:
 
 
 class _At:
-    """Dies at the n-th call."""
+    """Kills the process at the n-th call."""
 
     def __init__(self, times: int, last_act: Callable[[], object]) -> None:
         self._left, self._last_act = times, last_act
@@ -80,7 +80,7 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""Whether after or before which calls."""
+"""The calls that each point follows (true) or precedes (false)."""
 
 
 def arm(where: str, address: str) -> None:
@@ -98,12 +98,12 @@ def arm(where: str, address: str) -> None:
 class Lanes:
     """Clients that each send a demand when the one before it is answered.
 
-    A demand marked ``withdraw`` is taken back when the next one is admitted.
+    A demand marked ``withdraw`` is withdrawn when the next one is admitted.
     """
 
     @staticmethod
     def withdrawn() -> None:
-        """Stand for the moment right after a demand was taken back."""
+        """Do nothing; :func:`arm` replaces it to die right after a withdrawal."""
 
     def __init__(self, generator: Generator, lanes: list[list[Demand]]) -> None:
         self._generator = generator

@@ -1,4 +1,4 @@
-"""A generator in this process, and what a client sees of it."""
+"""A generator in this process, and listeners to its demands."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from demandops.service import Generator, Receipt, Ticket
 from tests.kit.goals import Goal
 
 PATIENCE_S = 15.0
-"""How long an answer that has to come may take."""
+"""How long a test waits for an answer, in seconds."""
 
 
 @contextmanager
 def running(address: str | Path, **options: Any) -> Iterator[Generator]:
-    """A generator for the length of a block."""
+    """Run a generator for the length of a block."""
     generator = Generator(str(address), **options)
     try:
         yield generator
@@ -29,7 +29,7 @@ def running(address: str | Path, **options: Any) -> Iterator[Generator]:
 
 
 def restart(address: str | Path) -> bool:
-    """Start a generator that takes up what others left, and stop it; tell whether all is out."""
+    """Run a generator on what others left in their journals; return whether all is published."""
     return Generator(str(address)).close(timeout=PATIENCE_S)
 
 
@@ -38,12 +38,12 @@ def receipt(ticket: Ticket, timeout: float = PATIENCE_S) -> Receipt:
 
 
 def book(generator: Generator, *goals: Goal) -> list[Receipt]:
-    """Book demands one after another."""
+    """Book demands one after another; return their receipts."""
     return [receipt(generator.submit(made)) for made in goals]
 
 
 class Gate:
-    """Holds the worker at a stage of one demand, so that what comes next comes while it is busy."""
+    """A listener that keeps the worker busy at a stage of its demand until ``open`` is set."""
 
     def __init__(self, stage: str = "admitted") -> None:
         self._stage = stage
@@ -58,7 +58,7 @@ class Gate:
 
 @dataclass
 class Stages:
-    """A listener that remembers what it was told."""
+    """A listener that records stages and texts."""
 
     told: list[tuple[str, str]] = field(default_factory=list)
 
@@ -78,7 +78,7 @@ def wait_until(true: Callable[[], object], what: str, timeout: float = PATIENCE_
 
 
 class Proposed:
-    """A demand handed in, and the branch that it waits on."""
+    """A submitted demand that needs approval, and its branch."""
 
     def __init__(self, generator: Generator, made: Any, operation: str | None = None) -> None:
         stages = Stages()

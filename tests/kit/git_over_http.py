@@ -1,4 +1,4 @@
-"""The rig's smart-HTTP Git server in the test's own process, with faults to order."""
+"""The rig's smart-HTTP Git server in the test's own process, with faults that tests switch on."""
 
 from __future__ import annotations
 
@@ -17,36 +17,35 @@ _LOCK = threading.Lock()
 
 @dataclass
 class Faults:
-    """What goes wrong, until it is told otherwise."""
+    """The faults of a server; a test changes them at any time."""
 
     away: bool = False
-    """Everything is answered with 503."""
+    """Whether every request is answered with 503."""
     no_pushes: int = 0
-    """So many pushes are answered with this status instead of being taken; see ``status``."""
+    """How many of the next pushes to refuse with ``status``."""
     status: int = 503
     cut_answers: int = 0
-    """So many pushes are taken and the connection is cut before the answer."""
+    """How many of the next pushes to carry out, but cut off before the answer."""
     away_after_cut: bool = False
-    """With the cut, the server goes away."""
+    """Whether such a cut sets ``away``."""
     hang: threading.Event | None = None
-    """Requests wait for this before anything is done."""
+    """The event that each request waits for first."""
     cuts: Callable[[], bool] = lambda: False
-    """Asked twice for each request: whether the connection is cut before it is carried out, and
-    whether it is cut before the answer."""
+    """Called before each request is carried out and before its answer; true cuts the connection."""
 
 
 @dataclass
 class Server:
-    """A running server: where it is, what is wrong with it, what came."""
+    """A running server: its URL, its faults, and counts of what came."""
 
     url: str
     faults: Faults = field(default_factory=Faults)
     taken: int = 0
-    """Pushes that were carried out, whether or not the answer got through."""
+    """The pushes that were carried out, even if their answers were cut off."""
     refused: int = 0
-    """Requests answered with an error on order."""
+    """The requests that a fault answered with an error."""
     cut: int = 0
-    """Connections cut at random."""
+    """The connections that ``cuts`` cut."""
 
 
 @contextmanager

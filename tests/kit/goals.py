@@ -123,7 +123,7 @@ def impossible() -> Goal:
 
 
 def link(number: int, **more: Any) -> Goal:
-    """Return a goal of one connection, all named by a number."""
+    """Return a goal of one connection; every name in it has the number."""
     item = connection(f"c{number}", who=[f"r{number}"], topics=[f"/t{number}"], broker="")
     return goal([], [item | more], id=f"request{number}")
 

@@ -15,7 +15,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Call:
-    """A request that a server got."""
+    """A request that a server received."""
 
     method: str
     path: str
@@ -56,7 +56,7 @@ class Server:
 
 @contextmanager
 def running(server: ThreadingHTTPServer) -> Iterator[str]:
-    """Run a server for the length of a block; gives the URL."""
+    """Run a server for the length of a block; yield its URL."""
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()

@@ -1,4 +1,4 @@
-"""A full disk, as far as one process can have it."""
+"""A limit on the size of files, which acts on one process like a full disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def files_end_at(size: int) -> Iterator[None]:
-    """Let no file of this process grow beyond a size for the length of a block."""
+    """Keep this process from writing files beyond a size, for the length of a block."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))  # Python ignores its signal
     try:

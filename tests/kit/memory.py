@@ -98,7 +98,7 @@ class MemoryRepo:
         ]
 
     def forget_shutdowns(self) -> None:
-        """Let the recent shutdowns be forgotten."""
+        """Forget the recent shutdowns."""
         shutdowns = self.state.ledger.shutdowns
         self.state = replace(
             self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
@@ -134,7 +134,7 @@ class MemoryRepo:
         }
 
     def rendered(self) -> dict[str, str]:
-        """Return the files below ``clusters/`` that demands brought."""
+        """Return the files below ``clusters/`` that demands added."""
         return {
             path: text
             for path, text in self.files.items()
@@ -142,7 +142,7 @@ class MemoryRepo:
         }
 
     def objects(self, kind: str) -> dict[str, dict[str, Any]]:
-        """Return the objects of a kind that demands brought, by name."""
+        """Return the objects of a kind that demands added, by name."""
         documents = [
             document
             for text in self.rendered().values()
@@ -155,7 +155,7 @@ class MemoryRepo:
 
 
 def rebuilt(claims: Iterable[Claim]) -> Ledger:
-    """Return the ledger that holds ``claims``, put in one by one."""
+    """Return the ledger that holds ``claims``, added one by one."""
     ledger = Ledger()
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
@@ -168,7 +168,7 @@ def is_booked(path: str) -> bool:
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
-    """Return the ledger as one who has only the files reads it."""
+    """Return the ledger that the files alone give."""
     booked = {path: text for path, text in files.items() if is_booked(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)

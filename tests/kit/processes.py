@@ -1,4 +1,4 @@
-"""Generators in processes of their own, made to be killed."""
+"""Generators in processes of their own, which tests can kill."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ _SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
 
 
 def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any]:
-    """One demand of a driver's plan."""
+    """Return a demand for a run's lane."""
     return {"name": name, "goal": made, "operation": operation or f"op-{name}"}
 
 
 @dataclass
 class Told:
-    """What a driver said before its end."""
+    """The events that a run reported."""
 
     sent: list[str] = field(default_factory=list)
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
     waits: dict[str, float] = field(default_factory=dict)
-    """Seconds from a demand to its answer."""
+    """Seconds from sending a demand to its answer."""
     first: float = 0.0
     last: float = 0.0
     """When the first demand was sent and the last was answered, on this machine's clock."""
 
 
 class Run:
-    """A generator's process, and what it says."""
+    """A generator's process, and the events that it reports."""
 
     def __init__(self, pipe: Path) -> None:
         self._pipe = pipe
@@ -53,7 +53,7 @@ class Run:
         self.pid = 0
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Read what the process says to its end."""
+        """Read events until the process ends; return them all."""
         sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
@@ -79,7 +79,7 @@ class Run:
         return self._told
 
     def kill(self) -> None:
-        """Kill -9 it, if it is there."""
+        """Send SIGKILL to the process if it runs."""
         if self.pid and not self._ended:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -128,7 +128,7 @@ class Drivers:
         return self._runs[-1]
 
     def kill_runs(self) -> None:
-        """Kill what a failed test left running."""
+        """Kill the runs that a failed test left."""
         while self._runs:
             self._runs.pop().kill()
 
@@ -142,10 +142,10 @@ class Drivers:
 def listen_to_all(
     drivers: Drivers, runs: list[Run], on_ready: Callable[[], object] = lambda: None
 ) -> list[Told]:
-    """Hear every process to its end; where the test is stopped, so are they.
+    """Read the events of all runs until they end; if the test is interrupted, kill them.
 
     Args:
-        on_ready: called once, when all have their clones.
+        on_ready: called once, when all generators have started.
     """
     waited_for = threading.Barrier(len(runs), on_ready)
     with ThreadPoolExecutor(len(runs)) as pool:

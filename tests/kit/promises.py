@@ -1,4 +1,4 @@
-"""Demands and joins with leases by chance, and claims as the model of leases tells them."""
+"""Random demands and joins with leases, and claims in the words of the model of leases."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEASES = (None, 10, 60, 90)
 
 
 class Maker:
-    """Makes requests by chance: few demands, people and subjects, so that they meet."""
+    """Makes random requests with few demands, requesters and subjects, so that they often meet."""
 
     def __init__(self, random: Random) -> None:
         self._random = random
@@ -39,7 +39,7 @@ class Maker:
         return self._message(shutdown=kind > 17)
 
     def _of_known(self, kind: int) -> Goal:
-        """Return a renewal of what was put, the same again, the same with another lease."""
+        """Return a renewal of a recent put, the put again, or the put with another lease."""
         known = self._random.choice(self._puts[-2:])
         if kind < 3:
             return {key: known[key] for key in ("kind", "demand", "requesters")} | {
@@ -118,13 +118,13 @@ MESSAGES = {
 
 
 def name_of(claim: Claim) -> Name:
-    """Return what the model knows a claim by."""
+    """Return the name of a claim in the model."""
     demand = MESSAGES.get(claim.demand, claim.demand)
     return demand, (claim.subject.kind.value, claim.subject.id)
 
 
 def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
-    """Return what claims hold, as the model tells it."""
+    """Return what claims hold, in the model's words."""
     found = {}
     for claim in ledger:
         what: dict[str, Any]

@@ -1,8 +1,8 @@
-"""What the reference keeps of goals: its custom resources and the files of its operators.
+"""A stand-in for the reference: the custom resources and operators' files that goals lead to.
 
-A stand-in in our own words, with the names and shapes of its code. It was compared with the
-operators themselves, run over a stand-in for their cluster's API: after random goals, all files
-were equal. Where they are odd, they are odd here too: see :meth:`Reference._note`.
+It is our own code, with the reference's names and formats. It was compared with the operators
+themselves, which ran on a stand-in for their cluster's API: after random goals, all files were
+equal. The operators' oddities are here too: see :meth:`Reference._note`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Reference:
             self._apply(*_of_connection(connection, shutdown))
 
     def _apply(self, name: str, kind: str, spec: Item) -> None:
-        """Create a resource, or merge a patch into it; its operator hears of what changed."""
+        """Create a resource, or merge a patch into it; its operator notes a change."""
         known = self.resources.get(name)
         merged = _merged(known["spec"], spec) if known else copy.deepcopy(spec)
         if known and merged == known["spec"]:
@@ -69,8 +69,9 @@ class Reference:
     def _note(self, name: str, kind: str, request: Item, *, created: bool) -> None:
         """Write the versioning, then the bookkeeping.
 
-        The book of a new connection or detection *is* the list of its first request, so that the
-        versioning file shows there what the book was when that file was last written.
+        For a new connection or detection, the bookkeeping and the first request share one list. So
+        the first request in the versioning file shows the bookkeeping at the time that the file was
+        written.
         """
         self._versions[kind].setdefault(name, {})[str(self._version)] = request
         self._saved[kind] = copy.deepcopy(self._versions[kind])

@@ -1,6 +1,6 @@
-"""Real state repos: a bare one, a person with a clone, and what history says.
+"""Real state repos: a bare one, a person with a clone, and the history.
 
-History is read by git itself, so that no test trusts the generator's own reading of it.
+git itself reads the history, so that no test trusts the generator's own reading of it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ GIT_ENVIRONMENT = NO_GIT_CONFIG | {
 POLICY = "policy/access-domains.yaml"
 
 FORGER = (GENERATOR_NAME, GENERATOR_EMAIL, 1_770_000_000)
-"""A person who commits in the generator's name, which only a signature can tell."""
+"""A person who commits in the generator's name; only a signature can show that."""
 
 
 def init(path: Path, *, bare: bool = True) -> Path:
@@ -84,7 +84,7 @@ class GitRepo:
     """A bare state repo of one test, read with pygit2 and not with the program."""
 
     def __init__(self, path: Path) -> None:
-        """Open it."""
+        """Use the repository in a folder."""
         self.path = path
 
     @property
@@ -130,7 +130,7 @@ class GitRepo:
 
 
 class Person:
-    """A person who changes the state repo at its forge, or in a clone and pushes it."""
+    """A person who changes the state repo at its forge, or in a clone and then pushes."""
 
     def __init__(self, remote: Path, folder: Path) -> None:
         self.bare, self.folder = remote, folder
@@ -139,7 +139,7 @@ class Person:
         return git(self.folder, *args)
 
     def fetch(self) -> None:
-        """Have the newest branches in the clone, and main's files in its folder."""
+        """Fetch the branches into the clone and check out main; clone first if needed."""
         if not self.folder.exists():
             git(self.folder.parent, "clone", "--quiet", str(self.bare), str(self.folder))
             return
@@ -164,7 +164,7 @@ class Person:
         raise AssertionError("main never stood still")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Do the same in the clone and push it; fails when a generator was first."""
+        """Commit ``files`` in the clone and push; fails if a generator pushed first."""
         self.fetch()
         for path, text in files.items():
             target = self.folder / path
@@ -189,7 +189,7 @@ class Person:
         return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
 
     def policy(self, **changed: Any) -> None:
-        """Change every access domain."""
+        """Set these fields of every access domain."""
         data = yaml.safe_load(self.read(POLICY))
         for domain in data["domains"]:
             domain.update(changed)
@@ -222,7 +222,7 @@ class Person:
 
 @dataclass(frozen=True)
 class Commit:
-    """A commit as git itself tells it."""
+    """A commit, as ``git log`` shows it."""
 
     id: str
     parents: tuple[str, ...]
@@ -240,7 +240,7 @@ _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
 
 
 def commits(repo: Path, revisions: str = "main") -> list[Commit]:
-    """The commits behind the first one, oldest first."""
+    """Return the commits after the first one, oldest first."""
     text = git(repo, "log", "--reverse", f"--format={_FORMAT}", revisions)
     found = []
     for record in text.split("\x1d"):
@@ -253,7 +253,7 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
 
 
 def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
-    """Have a repository run a script; return its file."""
+    """Install a script as a repository's hook; return its file."""
     path = Path(os.fspath(repo), "hooks", name)
     path.parent.mkdir(exist_ok=True)
     path.write_text(f"#!/bin/sh\n{script}\n")
@@ -263,7 +263,7 @@ def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
 
 @contextmanager
 def away(repo: Path) -> Iterator[None]:
-    """Have a repository's folder somewhere else for the length of a block."""
+    """Move a repository's folder away for the length of a block."""
     elsewhere = repo.rename(repo.with_name("away.git"))
     try:
         yield
@@ -277,19 +277,19 @@ def tip(repo: Path | str) -> str:
 
 
 def read(repo: Path, path: str) -> str:
-    """Return a file of main, empty when it is not there."""
+    """Return the text of a file on main; empty if there is none."""
     return GitRepo(repo).files(path).get(path, "")
 
 
 def without_vehicle01(repo: Path) -> dict[str, str | None]:
-    """Return the inventory of nodes without one that demand 1 uses."""
+    """Return the inventory of nodes without vehicle01, which demand 1 uses."""
     path = "inventory/nodes.yaml"
     before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
     return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
 
 
 def operations(repo: Path) -> list[str]:
-    """The operation ids of all demands' commits, oldest first."""
+    """Return the operation ids of all demands' commits, oldest first."""
     return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
 
 
@@ -304,13 +304,13 @@ def books(repo: Path, revision: str = "main") -> dict[str, Any]:
 
 
 def claims(repo: Path, needle: str = "") -> list[str]:
-    """The paths of claim files whose text holds ``needle``."""
+    """Return the paths of claim files whose text contains ``needle``."""
     files = GitRepo(repo).files("ledger/")
     return [path for path, text in files.items() if "Claim\n" in text and needle in text]
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """What `demandops verify` finds fault with, in all of history or behind a commit."""
+    """Return the differing files of each commit that `demandops verify` rejects, by its summary."""
     with reader.opened(str(repo)) as opened:
         commits = opened.revisions(f"{since or root(repo)}..")
         verdicts = opened.verify(commits)
@@ -324,10 +324,10 @@ def root(repo: Path) -> str:
 
 
 def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
-    """Objects are whole, history is one line, no demand counts twice, every commit verifies.
+    """Check that objects are whole, history is one line, no demand counts twice, commits verify.
 
     Args:
-        verify_last: verify so many commits only, for verifying one takes a tenth of a second.
+        verify_last: how many commits to verify, because each takes a tenth of a second; 0: all.
     """
     fsck = subprocess.run(
         ["git", "-C", str(repo), "fsck", "--strict", "--no-dangling", "--no-progress"],

@@ -40,7 +40,7 @@ STATUS = {
 }
 
 _LAST = 100
-"""Above it the ports of a domain are among those that Linux gives to any socket."""
+"""The highest domain to use: Linux gives the ports of higher ones to any socket."""
 
 
 @contextmanager
@@ -132,7 +132,7 @@ class Servers:
         return self._started[-1]
 
     def kill(self) -> None:
-        """Kill those that still run."""
+        """Kill the processes that still run."""
         for served in self._started:
             if served.process.poll() is None:
                 served.process.kill()

@@ -1,6 +1,6 @@
 """Forced writes to disk: off in tests, unless a test is marked ``synced``.
 
-A killed process loses nothing without them; only a power cut does. The program has no switch for
+Without them only a power cut loses data; a killed process does not. The program has no switch for
 this, so the tests replace what it calls.
 """
 

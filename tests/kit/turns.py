@@ -14,7 +14,7 @@ from tests.kit.memory import NOW
 
 
 class Turns(Clock):
-    """Threads take turns when they wait; waiting takes no time, the clock goes forward instead."""
+    """Threads take turns when they wait; a wait takes no time, but moves the clock forward."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(NOW)
@@ -44,7 +44,7 @@ class Turns(Clock):
         return thread
 
     def wait(self, is_over: Callable[[], bool], timeout: float | None = None) -> None:
-        """Let others run until something is so, or some seconds have passed."""
+        """Let other threads run until ``is_over`` holds or the timeout has passed."""
         me = getcurrent()
         self._waiting[me] = (is_over, inf if timeout is None else self.monotonic() + timeout)
         self._turn = self._next()
@@ -54,7 +54,7 @@ class Turns(Clock):
                 self._turn = self._next()
 
     def stop(self, threads: Collection[greenlet]) -> None:
-        """Let no thread of these run again, as at the end of their process."""
+        """Never run these threads again, as if their process had ended."""
         for thread in threads:
             self._waiting.pop(thread, None)
         while getcurrent() in threads:
@@ -69,7 +69,7 @@ class Turns(Clock):
             thread.throw()
 
     def _next(self) -> greenlet:
-        """Return whose turn it is: by chance one that need not wait, else the first in time."""
+        """Return the next thread: a random one that can go on, else one whose wait ends first."""
         free = [one for one, (is_over, _) in self._waiting.items() if is_over()]
         if not free:
             end = min(end for _, end in self._waiting.values())
@@ -110,7 +110,7 @@ class _Event:
 
 
 class _Condition:
-    """Needs no lock, because a turn ends only with a wait."""
+    """A condition that needs no lock: a thread keeps its turn until it waits."""
 
     def __init__(self, turns: Turns) -> None:
         self._turns, self._changes = turns, 0

@@ -1,7 +1,8 @@
 """A pytest plugin for the tests of the core: they cannot import Git.
 
-Load it with ``-p tests.kit.without_git``. The scenarios use the clocks of `service`, which need no
-Git; so that they can be imported alone, the package's own imports are skipped.
+Load it with ``-p tests.kit.without_git``. The scenarios use the timers of `service`, which need no
+Git. The plugin skips the imports of the package itself, so that these modules can be imported
+alone.
 """
 
 from __future__ import annotations

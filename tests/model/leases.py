@@ -46,7 +46,7 @@ class Held:
     booked: int = 0
 
     def same(self, other: Held | None) -> bool:
-        """Tell whether both are the same but for the time."""
+        """Return whether both are the same but for the time."""
         if other is None:
             return False
         mine = (self.what, self.requesters, self.seconds, self.holders)

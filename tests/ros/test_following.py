@@ -66,7 +66,7 @@ def test_diagnostics_report_invalid_configuration_and_an_unreachable_remote(
     client.wait(lambda: bool(waiting.feedback))
     assert waiting.feedback[0].startswith(f"waiting: {url} cannot be fetched: ")
     client.wait(lambda: heard.is_at(STATE, DiagnosticStatus.ERROR))
-    assert int(heard.values(STATE)["demands in the outbox"]) >= 1
+    assert int(heard.values(STATE)["unpublished demands"]) >= 1
     client.wait(lambda: withdrawn.accepted is not None)
     assert client.cancel(withdrawn)
     client.wait(lambda: withdrawn.answered)

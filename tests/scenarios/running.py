@@ -319,7 +319,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
 
 
 def same_faults(wanted: Iterable[Told], found: Iterable[Fault]) -> bool:
-    """Tell whether each fault found is one that was expected, and the other way round."""
+    """Return whether each fault found is one that was expected, and the other way round."""
     wanted, found = list(wanted), list(found)
     return len(wanted) == len(found) and all(
         any(told.fits(fault) for fault in found) for told in wanted

@@ -76,22 +76,22 @@ def faults_of(error: DemandOpsError) -> list[Json]:
 
 
 def time_data(moment: datetime | None) -> str | None:
-    """Return a time in UTC."""
+    """Return a time as JSON text, in UTC."""
     return format_time(moment) if moment else None
 
 
 def time_text(time: str) -> str:
-    """Return a time of the JSON as text for people, without fractions of a second."""
+    """Return a time of the JSON output as text for people, without fractions of a second."""
     return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
 
 
 def subject_data(subject: Subject) -> Json:
-    """Return a subject."""
+    """Return a subject as JSON data."""
     return {"kind": subject.kind.value[:-1], "id": subject.id}
 
 
 def claim_data(claim: Claim) -> Json:
-    """Return a claim."""
+    """Return a claim as JSON data."""
     lease = claim.lease
     return {
         "subject": subject_data(claim.subject),
@@ -105,7 +105,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return the data of a release without its name and file."""
+    """Return what a release is and where it runs, as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -116,12 +116,12 @@ def place_data(release: Release) -> Json:
 
 
 def release_data(release: Release) -> Json:
-    """Return a release."""
+    """Return a release as JSON data."""
     return {"name": release.name, **place_data(release), "file": path_of(release)}
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    """Return an override with the given effects; by default all."""
+    """Return an override as JSON data, with the given effects; by default all."""
     names = override.effects() if effects is None else effects
     return {
         "name": override.name,
@@ -142,7 +142,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def commit_data(entry: LogEntry) -> Json:
-    """Return a commit with the data from its message and trailers."""
+    """Return a commit, its message and its trailers as JSON data."""
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),

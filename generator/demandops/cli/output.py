@@ -32,7 +32,7 @@ def console(stderr: bool = False) -> Console:
     from rich.console import Console  # noqa: PLC0415
 
     class QuotingConsole(Console):
-        """A console on which no text controls the terminal, in lines and in tables."""
+        """A console that escapes control characters, in lines and in tables."""
 
         def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
             return super().render_str(lines(text), **how)

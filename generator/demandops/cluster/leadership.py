@@ -22,9 +22,9 @@ from demandops.runtime import REAL, Runtime
 log = logging.getLogger("demandops")
 
 _LEASE_S = 15
-"""How long a Lease counts that nobody renews."""
+"""How long a Lease counts if nobody renews it."""
 _RENEW_S = 10
-"""How long a leader tries to renew its Lease before it ends."""
+"""How long a leader tries to renew its Lease; then its process ends."""
 _CALL_S = 2
 """How long a call may take. A renewal has two calls: ``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
 _PAUSE_S = 2.0
@@ -156,7 +156,7 @@ class Leadership:
         )
 
     def _tell(self, level: int, text: str) -> None:
-        """Log a text once, until another one follows."""
+        """Log a text, unless the last one was the same."""
         if text != self._told:
             log.log(level, "%s", text)
         self._told = text

@@ -76,7 +76,7 @@ class ObjectCache:
         return ""
 
     def unread(self, domain: ClusterDomain) -> Health | None:
-        """Return that a domain's objects are unknown now, and why; None if they are known."""
+        """Return the health of a domain whose objects are unknown now; None if they are known."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
@@ -210,7 +210,7 @@ def _request(selector: ObjectSelector) -> dict[str, str]:
 
 
 def _is_answer(error: Exception) -> bool:
-    """Report whether the cluster answered the request, with an error or a refusal."""
+    """Return whether the cluster answered the request, with an error or a refusal."""
     return bool(getattr(error, "status", None))
 
 

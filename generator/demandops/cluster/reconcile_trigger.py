@@ -146,7 +146,7 @@ def _domains(cluster: str, config: Config) -> list[AccessDomain]:
 
 
 def _concerns(path: str, cluster: str) -> bool:
-    """Report whether a changed path may affect a cluster.
+    """Return whether a changed path may affect a cluster.
 
     The ledger and the files of other clusters do not.
     """

@@ -48,7 +48,7 @@ class Parameter(CamelModel):
 
 
 class Scaling(CamelModel):
-    """The number of replicas: one for ``topics_per_replica`` inputs, from ``min`` to ``max``."""
+    """The number of replicas: one for every ``topics_per_replica`` inputs, ``min`` to ``max``."""
 
     min: Annotated[int, Field(ge=0, le=1000)] = 1
     max: Annotated[int, Field(ge=1, le=1000)] = 1

@@ -45,7 +45,7 @@ Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_lengt
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """Return a validator that rejects text with a problem."""
+    """Return a validator that rejects text in which ``problem_of`` finds a problem."""
 
     def check(value: str) -> str:
         problem = problem_of(value)
@@ -57,7 +57,7 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects text that ``parse`` cannot read, and keeps other text."""
+    """Return a validator that rejects text that ``parse`` cannot read; it changes no text."""
 
     def check(value: str) -> str:
         parse(value)
@@ -72,7 +72,7 @@ def _hidden(value: str) -> str:
 
 
 Visible = without(_hidden)
-"""Rejects the control characters that hide or reorder text; lines and tabs are valid."""
+"""Rejects the control characters that hide or reorder text; line breaks and tabs are valid."""
 
 Text = Annotated[str, Visible]
 """Any visible text."""

@@ -50,7 +50,7 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """The nodes by their part in names of topics, which several may share."""
+    """The nodes by what their id becomes in names of topics, which several may share."""
 
     def __post_init__(self) -> None:
         """Set what follows from the other fields."""

@@ -88,7 +88,7 @@ class ConfigReader:
         return self._positions[file][name]
 
     def is_missing(self, file: str, name: str) -> bool:
-        """Return whether a file lacks an item; False if an invalid item may be the one."""
+        """Return whether a file lacks an item; False if any of its items is invalid."""
         return file not in self._incomplete and name not in self._positions[file]
 
     def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:

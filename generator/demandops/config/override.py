@@ -48,7 +48,7 @@ _MOMENT = re.compile(
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("version", "replicas", "node", "keep")
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-"""The effects of overrides, in the order of messages."""
+"""The effects of overrides, in the order in which messages list them."""
 
 
 def parse_time(text: str) -> datetime:
@@ -109,7 +109,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Raise for a field without a value, which selects or changes less than it seems to."""
+    """Refuse a field without a value: it would select or change less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
@@ -205,14 +205,14 @@ class OverrideFile(FileModel):
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
-                "select: values are a client's settings if connections are selected, and Helm "
-                "values else; write two overrides"
+                "select: values are settings of clients if connections are selected, otherwise "
+                "Helm values; write two overrides"
             )
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
                 yield (
-                    f"select[{index}].connections: {wrong[0]} is for services, and connections "
+                    f"select[{index}].connections: {wrong[0]} changes services, and connections "
                     "have none; remove one of the two"
                 )
             if selector.services and "keep" in effects:
@@ -289,7 +289,7 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether a ``hold`` applies that no higher override changes, so the file stays."""
+        """Whether a ``hold`` keeps the file as it is: no higher override changes the release."""
         held = False
         for _, effects in self.by:
             held = "hold" in effects or (held and set(effects) <= {"keep"})
@@ -330,7 +330,7 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    """Return settings with the ``values`` of an override; fields of other types do not count.
+    """Return settings with an override's ``values``; others ignore the fields of MQTT clients.
 
     Raises:
         InvalidInput: if the result is not valid, naming the override's ``file``.

@@ -102,7 +102,8 @@ class LeasePolicy(CamelModel):
         if self.deployment_requests and self.default is None:
             raise ValueError("deploymentRequests needs a default lease; add default")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
-            raise ValueError(f"default {self.default} is above longest {self.longest}")
+            message = f"default {self.default} is above longest {self.longest}"
+            raise ValueError(f"{message}; lower default or raise longest")
         return self
 
 

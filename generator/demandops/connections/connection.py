@@ -43,7 +43,7 @@ class Connection:
 
     @property
     def nodes(self) -> tuple[str, str]:
-        """The nodes that a selector of an override matches."""
+        """The nodes that selectors of overrides are compared with."""
         return (self.source, self.target)
 
     @property
@@ -72,7 +72,7 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed`` can mean this one."""
+        """Return whether ``listed`` in a shutdown fits this connection; empty fields fit any."""
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -81,7 +81,7 @@ class Connection:
         )
 
     def told_apart_by(self) -> tuple[str, ...]:
-        """Return what a shutdown lists to mean this one, beside its id and topics."""
+        """Return what a shutdown must list, beside id and topics, to fit this connection."""
         return (self.source, self.target, self.known_type.word)
 
     def topic_keys(self) -> Iterator[TopicKey]:
@@ -90,7 +90,7 @@ class Connection:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each topic that ``listed`` names, in words, and the keys that it means here."""
+        """Yield each topic of ``listed`` as text, and the keys of the topics here that it fits."""
         assert isinstance(listed, Connection)  # noqa: S101 - see is_meant_by
         known = {*self.topic_keys()}
         for key in listed.topic_keys():

@@ -130,7 +130,7 @@ def message_type(route: Route, sender: str, config: Config) -> str:
 
 
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault: a type needs an entry that inventory or registry lack."""
+"""The code of a fault: inventory or registry lack an entry that the type needs."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 

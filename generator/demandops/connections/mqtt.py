@@ -1,7 +1,7 @@
 """MQTT connections: each end is an mqtt_client, and both meet at a broker.
 
-Parameters as ika-rwth-aachen/mqtt_client v2.5 reads them. The client cannot drop a bridge while it
-runs, so a change of topics restarts the pod.
+The parameters are those of ika-rwth-aachen/mqtt_client v2.5. The client cannot drop a bridge while
+it runs, so a change of topics restarts the pod.
 
 The parameters do not contain a broker's user name and password: the pod reads them from a Secret
 (``docs/decisions/0009-credentials-of-brokers.md``).
@@ -145,7 +145,7 @@ class MqttEnd(End):
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Return the settings' and the broker's entries."""
+        """Return the entries of the clients' settings and of the broker."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"

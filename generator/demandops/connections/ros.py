@@ -1,7 +1,8 @@
 """ROS connections: each end is an eProsima DDS-Router that links the node to the other end.
 
-Configuration as DDS-Router v3.5 reads it (version v5.0). A running router accepts a new allowlist
-from the mounted file, which it reads again at an interval. Any other change restarts the pod.
+The configuration has the format v5.0, as DDS-Router v3.5 reads it. A running router accepts a new
+allowlist from the mounted file, which it reads again at an interval. Any other change restarts the
+pod.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ def _shown(value: object) -> str:
 
 
 def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
-    """Return routes sorted by source topic, each once; a message type that one gives is kept."""
+    """Return routes sorted by source topic, each once; a message type fills in a missing one."""
     merged: dict[str, Route] = {}
     for route in routes:
         first = merged.get(route.source)

@@ -1,7 +1,7 @@
 """Zenoh connections: each node has one zenoh-bridge-ros2dds for all of them.
 
-Two bridges on one host and ROS domain do not work. Configuration as
-eclipse-zenoh/zenoh-plugin-ros2dds 1.10 reads it, at the start only.
+Two bridges on one host and ROS domain do not work. The configuration is that of
+eclipse-zenoh/zenoh-plugin-ros2dds 1.10, which reads it only at its start.
 """
 
 from __future__ import annotations

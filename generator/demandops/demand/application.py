@@ -61,7 +61,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The nodes that a selector of an override matches."""
+        """The nodes that selectors of overrides are compared with."""
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
@@ -103,7 +103,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(more, inputs=MappingProxyType(inputs), parameters=parameters)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed`` can mean this one."""
+        """Return whether ``listed`` in a shutdown fits this application; an empty node fits any."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -111,7 +111,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def told_apart_by(self) -> tuple[str, ...]:
-        """Return what a shutdown lists to mean this one, beside its id and topics."""
+        """Return what a shutdown must list, beside id and topics, to fit this application."""
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
@@ -122,7 +122,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each input that ``listed`` names, in words, and the keys that it means here."""
+        """Yield each input of ``listed`` as text, and the keys of the inputs here that it fits."""
         assert isinstance(listed, Application)  # noqa: S101 - see is_meant_by
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():

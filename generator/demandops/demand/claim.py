@@ -138,7 +138,7 @@ class Claim:
         return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
-        """Return it with the booking time of the ``current`` claim if at most the lease differs."""
+        """Return the claim, with the booking time of ``current`` if only their leases differ."""
         if current is None:
             return self
         kept = replace(self, booked=current.booked)

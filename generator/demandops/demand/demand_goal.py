@@ -176,14 +176,14 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the goal's field for a field of an item; the goal has one list of requesters."""
+    """Return the goal's field for the field ``path`` of an item; all items share the requesters."""
     if path.startswith("requesters"):
         return path
     return f"{item}.{'type' if path == 'appdef' else path}"
 
 
 def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield the fields that only a put may have."""
+    """Yield a fault for each field that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:
@@ -195,14 +195,14 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 
 def _not_supported(goal: DemandGoal) -> Iterator[Fault]:
-    """Yield the fields of the goal that this version cannot carry out."""
+    """Yield a fault for each field that this version cannot carry out."""
     for name in ("priority", "positions"):
         if getattr(goal, name):
-            yield fault(name, "is not supported, for this version places nothing; leave it out")
+            yield fault(name, "is not supported: this version chooses no nodes; leave it out")
     for index, app in enumerate(goal.applications):
         where = f"applications[{index}]"
         if app.place != GoalPlace():
-            message = "is not supported, for this version places nothing; name the node"
+            message = "is not supported: this version chooses no nodes; name the node"
             yield fault(f"{where}.place", message)
         if app.deliver:
             message = "is not supported by this version; list a connection that carries the output"

@@ -22,7 +22,7 @@ Place = Callable[[str], str]
 
 
 def place_in(field: str) -> Place:
-    """Return the place of an item whose fields have the same names in the goal's ``field``."""
+    """Return the place of an item at the goal's ``field``: its ``path`` is ``<field>.<path>``."""
     return lambda path: f"{field}.{path}"
 
 

@@ -88,7 +88,7 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the message's field for a field of an application; ``lists`` maps roles to lists."""
+    """Return the message's field for ``path`` of an application; ``lists`` maps roles to lists."""
     name, _, rest = path.partition(".")
     if name in ("id", "node"):
         return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
@@ -105,7 +105,7 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the message's field for a field of a connection, whose topics are two lists."""
+    """Return the message's field for ``path`` of a connection, whose topics are two lists there."""
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"
     if path in ("source", "target", "broker"):

@@ -13,7 +13,7 @@ from datetime import datetime, timedelta, timezone
 LONGEST_S = 366 * 24 * 3600
 
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
-"""The end of a lease that starts at the approval of its proposed claim."""
+"""The end of a lease that has not started, because its claim awaits approval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """A running lease: its term and its recorded end, in UTC."""
+    """The lease of a claim: its term and its recorded end, in UTC."""
 
     seconds: int
     slack: int

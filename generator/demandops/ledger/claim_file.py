@@ -32,7 +32,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements", f"{LEDGER_ROOT}/waiting")
-"""What a later version writes without a new schema: the nodes of services, waiting demands."""
+"""Folders that only a later version writes: for the nodes of services, and for waiting demands."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # what demandops.demand.claim.demand_id makes
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")

@@ -150,7 +150,7 @@ class Ledger:
         return None
 
     def has_usual_topic(self, role: str, source: str, *, but_of: str | None = None) -> bool:
-        """Return whether a topic of ``source`` in ``role`` is no further one.
+        """Return whether a claim has the usual topic of ``source`` in ``role``.
 
         The demand ``but_of`` does not count.
         """
@@ -158,7 +158,7 @@ class Ledger:
         return any(key.demand != but_of for key in keys)
 
     def usual_topics(self, role: str, source: str, *, but: str) -> Iterator[str]:
-        """Yield the topics of ``source`` in ``role`` that are no further ones, except ``but``."""
+        """Yield the usual topics of ``source`` in ``role`` that claims have, except ``but``."""
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("takes", source, but)) or ()):
             return  # all of them take that one
@@ -205,7 +205,7 @@ class Ledger:
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the applications that are called ``part`` in names of topics, sorted."""
+        """Return the applications whose id becomes ``part`` in names of topics, sorted."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:

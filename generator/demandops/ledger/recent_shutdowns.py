@@ -99,7 +99,10 @@ class RecentShutdowns:
     def forget(
         self, now: datetime, requesters: Iterable[str] = ()
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the shutdowns without those of the requesters and some old ones; their digests."""
+        """Return the shutdowns without the forgotten ones, and the digests of these.
+
+        Forgotten are those of ``requesters`` and some that are older than 15 minutes.
+        """
         first = _minute(now - REMEMBERED)
         ended = sorted(one for one in self.by_minute if one < first)
         old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))

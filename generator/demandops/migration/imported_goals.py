@@ -22,7 +22,7 @@ _MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # numbers in the messages
 def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
     """Return the joins that are still held, by resource, and warnings.
 
-    A detection has none of its own: an application holds it by the object list that it makes.
+    A detection has no joins of its own: the applications that use its object list hold it.
 
     Raises:
         InvalidInput: if the files do not say who holds a resource.
@@ -54,7 +54,7 @@ def _rewritten(name: str) -> Fault:
     message = (
         "has requests, but no bookkeeping. The requests alone do not tell who holds it, because "
         "the operator adds later requesters to the first one. Give mqtt_bookkeeping.yml too. If it "
-        f"is lost, write a file with who holds it, each as often as it joined: {name}: [vehicle00]"
+        f"is lost, write one that lists each requester as often as it joined: {name}: [vehicle00]"
     )
     return fault(name, message)
 
@@ -84,8 +84,8 @@ def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
 def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list[dict[str, Any]]:
     """Return goals, oldest first: one for each set of requesters, with all that they hold.
 
-    What the same requesters hold a second time gets a goal with another id, for the ledger counts a
-    repeated goal once.
+    What the same requesters hold a second time gets a goal with another id, because the ledger
+    counts a repeated goal once.
 
     Raises:
         InvalidInput: if the map, which is in ``file``, has no entry for a resource or a topic.

@@ -4,7 +4,7 @@ Each of its operators keeps two files. The bookkeeping maps a resource to the re
 it, each as often as it joined; for a fusion, it does so for each topic. The versioning file maps a
 resource to the requests that reached it, by the version of the resource.
 
-A file is known by its content, so that it may have any name.
+A file is recognized by its content, so it may have any name.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _BOOKS = {
     "object_detection_bookkeeping": DETECTION,
     "object_fusion_bookkeeping": FUSION,
 }
-"""The names of the bookkeeping files: an empty one says that nothing is left."""
+"""The bookkeeping files by name; an empty one says that nothing is held."""
 
 _NUMBER = re.compile(r"[0-9]{1,20}")
 _CLOUD = re.compile(r"\bpoint_cloud_topic:=(\S+)")
@@ -40,13 +40,13 @@ Hold: TypeAlias = "tuple[str, str]"
 
 
 class _Part(BaseModel):
-    """A part of a file, of which only some fields matter."""
+    """A part of a file; other fields than those listed are ignored."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
 
 class Request(_Part):
-    """What an operator reads of a request."""
+    """The fields of a request that an operator reads."""
 
     requester: list[str]
     shutdown: bool
@@ -68,7 +68,7 @@ class _RosTopic(_Part):
 
 
 class _Ros2Mqtt(_Part):
-    """The topics of the last request, and as further fields all that were ever listed."""
+    """The source's bridge: the topics of the last request, and a field for each one ever listed."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _MqttTopic] = Field(init=False)
@@ -76,7 +76,7 @@ class _Ros2Mqtt(_Part):
 
 
 class _Mqtt2Ros(_Part):
-    """The same for the other end, where the fields are topics of MQTT."""
+    """The target's bridge: the same, with the topics of MQTT."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _RosTopic] = Field(init=False)
@@ -87,7 +87,7 @@ _BRIDGE = ("configMQTT", "bridge")
 
 
 class MqttConnection(_Part):
-    """The spec of a connection. An end has nothing if the initial deployment carries its topics."""
+    """The spec of a connection; an end whose topics the initial deployment carries is empty."""
 
     operator: Request
     host: str = Field(validation_alias=AliasPath("configCommon", "broker", "host"))
@@ -127,7 +127,7 @@ class ObjectDetection(_Part):
 
     @property
     def topic(self) -> str:
-        """The topic of the point cloud, which only its command names."""
+        """The topic of the point cloud, which stands only in the command."""
         found = _CLOUD.search(" ".join(self.command))
         return found[1] if found else ""
 
@@ -165,13 +165,13 @@ class _FusionBook(_Part):
 
 @dataclass
 class ReferenceFiles:
-    """What all files together say: of each resource its spec, its books and its versions."""
+    """What all files together say: the spec, the bookkeeping and the requests of each resource."""
 
     specs: dict[str, Spec] = field(default_factory=dict)
     books: dict[str, Counter[Hold]] = field(default_factory=dict)
     versions: dict[str, dict[int, Request]] = field(default_factory=dict)
     booked: set[str] = field(default_factory=set)
-    """The prefixes of the resources whose bookkeeping is here, also if it is empty."""
+    """The prefixes of the resources whose bookkeeping was given, even if it is empty."""
 
     def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
         """Return the specs of one kind, by resource."""

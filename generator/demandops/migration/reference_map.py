@@ -68,7 +68,7 @@ class MappedConnection(CamelModel):
 
 
 class ReferenceMap(FileModel):
-    """What each resource is. ``request`` is the id of the demands, which nothing records."""
+    """What each resource is. ``request`` is the id of the demands, which the reference forgets."""
 
     kind: Literal["ReferenceMap"]
     request: _Filled

@@ -30,8 +30,9 @@ class Join:
 def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join]:
     """Return the joins whose holds add up to ``book``, oldest first.
 
-    The requests are undone from the newest to the one that created the resource. What is left then
-    is what that one asked for. From there they are done again, each as a join of its own.
+    The requests are undone, from the newest back to the one that created the resource. What is left
+    is what that first request asked for. Then the others are done again, and each join stays a join
+    of its own.
 
     Args:
         book: how often each hold is held.
@@ -67,7 +68,7 @@ def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
 
 
 def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
-    """Yield joins that hold nothing twice, for a demand of the ledger counts once."""
+    """Yield joins that hold nothing twice, because in the ledger a repeated demand counts once."""
     for count in range(1, max(holds.values(), default=0) + 1):
         topics: dict[str, list[str]] = {}
         for (topic, who), held in holds.items():
@@ -81,7 +82,7 @@ def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
 
 
 def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
-    """Return the bookkeeping that requests lead to; right only if none was rewritten."""
+    """Return the bookkeeping that results from requests; wrong if an operator rewrote one."""
     book = Counter[Hold]()
     for request in requests.values():
         if request.shutdown:

@@ -24,7 +24,7 @@ from demandops.plan.release import ServiceKey
 
 
 def _input_field(field: str, path: str) -> str:
-    """Return the input's field for a fault of its connection; requesters keep theirs."""
+    """Return the goal's field for a fault of an implied connection: the input or a requester."""
     return path if path.startswith("requesters") else field
 
 

@@ -150,7 +150,7 @@ def _application_inputs(
 def demanded_inputs(
     config: Config, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield role and topic of each input that an application gives a service, and its key."""
+    """Yield role, topic and key of each input that an application gives a service."""
     service, key = release.service, release.key
     if service.each is not None:
         for one in app.inputs_from(service.each, str(key.source), str(key.topic)):
@@ -227,7 +227,7 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             odd = next(value for value in given if value not in numbers)
             message = (
                 f"{odd!r} is not a number, but the application definition takes the "
-                f"{parameter.merge}"
+                f"{parameter.merge}; give a number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)

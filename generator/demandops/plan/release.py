@@ -62,7 +62,7 @@ class ServiceRelease:
         return f"{self.key.service} on {self.node.id} for {self.key.source or self.key.application}"
 
     def facts(self) -> list[str]:
-        """Return one line for each fact about it."""
+        """Return the service's properties as lines; commit messages show the changed ones."""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
@@ -70,7 +70,7 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what it decides) for entries of the configuration that shape it."""
+        """Yield (file, entry, what it decides) for each configuration entry that shapes it."""
         folder = f"appdefs/{self.appdef}"
         yield f"{folder}/appdef.yaml", f"services.{self.key.service}", "what it is"
         yield config.values_template(self.appdef, self.service), "", "its Helm values"

@@ -27,8 +27,8 @@ ReleaseKey = ServiceKey | ClientKey
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
 
-    If an application's definition is missing, yield none. If ``strict``, refuse instead: a deleted
-    file must not stop what runs.
+    If an application's definition is missing, yield none. With ``strict``, refuse it instead,
+    because a deleted file must not stop what runs.
     """
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)

@@ -43,7 +43,7 @@ _TEMPLATE_FAULTS = (
 )  # errors that a template can cause; its author has to fix them
 
 _MAX_LENGTH = 100_000
-"""The characters of a values template."""
+"""The most characters of a values template."""
 
 
 class _Verbatim(str):

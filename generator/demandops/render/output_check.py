@@ -85,7 +85,7 @@ def check_files(files: Mapping[str, str | None]) -> None:
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
-            faults.append(fault("", "is not the generator's to write").within(path))
+            faults.append(fault("", "is not in a folder that the generator writes").within(path))
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
@@ -95,9 +95,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield the documents of a file; one of a controller's own kinds without its ``spec``.
+    """Yield the documents of a file; those of Flux's and Argo CD's kinds without their ``spec``.
 
-    That is the program's own template around values that are checked already.
+    Such a ``spec`` is the program's own template around values that are checked already.
     """
     for part in text.split("\n---\n"):
         api = _API.search(part)

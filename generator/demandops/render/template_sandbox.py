@@ -33,11 +33,11 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
 MAX_STEPS = 1_000_000
-"""The steps of one rendering, at most a few seconds of work; 100 topics take some thousand."""
+"""The most steps of one rendering, a few seconds of work; 100 topics take some thousand."""
 MAX_LENGTH = 1_000_000
-"""The characters of a text. Kubernetes takes no object above 1.5 MB."""
+"""The most characters of a text. Kubernetes takes no object above 1.5 MB."""
 MAX_SIZE = 100_000
-"""The parts of a value: each item, key and 16 characters of text counts."""
+"""The most parts of a value. Each item, each key and every 16 characters of text are a part."""
 _MAX_BITS = 1024
 
 _DIGITS = re.compile(r"\d{1,9}")
@@ -52,7 +52,7 @@ _FILTERS = re.findall(
 _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
 """Filters that take a step whatever the size: they only look at a value or return a part of it."""
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
-"""Filters that look at each item: what they ask of it takes steps of its own."""
+"""Filters that call a filter or test for each item; these calls take the steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
 """Filters that take more steps for the same size."""
 _PADDING = frozenset(
@@ -91,7 +91,7 @@ _budget: ContextVar[_Budget] = ContextVar("budget")
 
 @contextmanager
 def budget() -> Iterator[None]:
-    """Give the templates that are compiled or rendered inside a full budget."""
+    """Give templates that are compiled or rendered in the block a full budget."""
     token = _budget.set(_Budget())
     try:
         yield
@@ -100,9 +100,9 @@ def budget() -> Iterator[None]:
 
 
 def _size(value: object, *, data: bool = True) -> int:
-    """Return the size of a value with all that it contains, also what it contains twice.
+    """Return the size of a value with all that it contains; what it contains twice counts twice.
 
-    With ``data`` anything but data is refused, because its text would hold an address in memory.
+    With ``data``, any other object is refused, because its text would hold an address in memory.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -133,11 +133,11 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Return a new value if it is not too large; what is lazy becomes a list."""
+    """Return a new value, and take steps for its size; an iterator or a view becomes a list."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
-        raise SecurityError("a text is too large")
+        raise SecurityError(f"a text is longer than {MAX_LENGTH} characters")
     _budget.get().take(_size(value, data=data))
     return value
 
@@ -157,7 +157,7 @@ def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
 
 
 def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
-    """Refuse a filter or a method of text whose result may be a product of what it is given."""
+    """Refuse a filter or a method of text whose result may be far larger than its arguments."""
     subject, *others = values or ("",)
     if name in _PADDING or name in ("ljust", "rjust", "zfill"):
         numbers = [abs(each) for each in others if isinstance(each, int)]

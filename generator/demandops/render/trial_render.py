@@ -55,7 +55,7 @@ def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Itera
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases of an appdef that an override may select, with its effects."""
+    """Yield the trial releases that an override may select, with the override's effects."""
     for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(

@@ -1,4 +1,4 @@
-"""A chart's ``values.schema.json``, compiled: it reads nothing else and ends soon on any values."""
+"""A chart's ``values.schema.json``, compiled so that it reads no other file and never runs long."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demandops.quoting import quoted
 _MAX_WORK = 100_000
 _MAX_VISITS = 1_000_000
 _MAX_DEPTH = 100
-"""The deepest values; strict YAML is not deeper."""
+"""The greatest depth of values; strict YAML is not deeper."""
 
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 _SAME_VALUE = ("allOf", "anyOf", "oneOf", "not", "if", "then", "else")
@@ -76,7 +76,7 @@ def _outside(schema: object, place: tuple[int | str, ...]) -> Iterator[tuple[Any
 
 
 class _Work:
-    """The schemas that are applied to one path into the values, at most."""
+    """Counts how many schemas are applied, at most, along one path into the values."""
 
     def __init__(self, document: object) -> None:
         self._document = document
@@ -86,7 +86,7 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return the work of a schema for values of a depth.
+        """Return how many schemas a schema applies, at most, to values of a depth.
 
         Raises:
             RecursionError: it refers to itself for the same value, or there is too much to count.

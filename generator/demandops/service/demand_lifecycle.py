@@ -376,7 +376,7 @@ class Demands:
         self._waiting.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
-        """Count a demand no more that got its answer or its proposal."""
+        """No longer count a demand, now answered or proposed, towards its requester's limit."""
         if ticket.proposal is None:
             self._of_requester -= Counter([requester_of(ticket.goal)])
 

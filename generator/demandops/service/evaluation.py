@@ -98,8 +98,9 @@ class Evaluator:
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         """Return the results of the demands that ``tip`` has, in the order of their commits.
 
-        They have no answer if the connection or the process ended after the remote accepted the
-        push, or if a sync failed. So what they rest on is written anew.
+        Such a demand was not answered because the connection or the process ended after the remote
+        accepted the push, or because a sync failed. So the commits since its base are written
+        again.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())

@@ -58,7 +58,7 @@ class FairQueue:
             self._barriers.append(place)
 
     def remove(self, tickets: Collection[Ticket]) -> None:
-        """Remove demands, whether they are in the queue or not."""
+        """Remove demands; those that are not in the queue do not matter."""
         for ticket in tickets:
             place = self._places.pop(ticket, None)
             if place is not None:

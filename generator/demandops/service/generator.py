@@ -30,7 +30,7 @@ log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
 _LAST_S = 5.0
-"""How long the worker may take to end once it must; git and ssh-keygen are ended before."""
+"""How long to wait for the worker's end after the timeout; it stops git and ssh-keygen sooner."""
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
@@ -57,8 +57,8 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many of them may be of one requester; None if there is one client,
-                whose demands keep their order.
+            requester_limit: how many of them may be of one requester. None is for a single client:
+                there is no such limit, and demands keep their order.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
             fetch_interval: seconds between two fetches while no demand comes; 0: never, except

@@ -33,7 +33,7 @@ _TIMEOUT_S = 10.0
 _AT_ONCE = 16
 _STOP_TIMEOUT_S = 1
 _MAX_BODY = 25 << 20
-"""The most that GitHub sends; the body is hashed, not stored."""
+"""The largest body that GitHub sends, in bytes; a body is hashed and not stored."""
 _WARN_EVERY_S = 60.0
 
 _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature")
@@ -48,7 +48,8 @@ class PushWebhook:
 
         Args:
             address: ``host:port``; port 0 picks a free port.
-            secret: the key that signs notifications; empty: those of this machine are accepted.
+            secret: the key that signs notifications. If empty, they need no signature, and the
+                address must be on the loopback.
             on_push: called for each notification; must return at once.
 
         Raises:
@@ -120,7 +121,7 @@ class PushWebhook:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection; the server refuses it if there are too many, and cuts it off in time."""
+    """A connection that is cut off after some seconds, or at once if too many are open."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -158,7 +159,7 @@ def _listening(address: str, *, local_only: bool) -> socket.socket:
     except OSError as error:
         listener.close()
         raise _invalid(
-            f"'{address}' cannot be listened on: {error.strerror}; choose another port"
+            f"cannot listen on '{address}': {error.strerror}; choose another port"
         ) from None
     return listener
 

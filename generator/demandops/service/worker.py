@@ -38,7 +38,7 @@ _TIDY_EVERY = 50
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
 _FIRST_REST_S, _LONGEST_REST_S = 1.0, 60.0
-"""How long to follow nothing after an unexpected error; demands are taken meanwhile."""
+"""How long not to follow the state repo after an unexpected error; demands are still taken."""
 _NAME = "writer"
 
 
@@ -126,7 +126,7 @@ class Worker:
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
-        """Answer a batch with an error; without a batch, follow nothing for a while.
+        """Answer a batch with an error; without a batch, do not follow the state repo for a while.
 
         Raises:
             Unsound: the process must end, and nobody is answered.
@@ -150,7 +150,7 @@ class Worker:
         return self._runtime.monotonic() < self._rests_until
 
     def _take_a_rest(self) -> None:
-        """Follow nothing for a while, because the state repo could not be followed."""
+        """Do not follow the state repo for a while, because that failed."""
         if self._rest == _FIRST_REST_S:
             self._renew_clone_if_damaged()
         self._rests_until = self._runtime.monotonic() + self._rest
@@ -352,9 +352,9 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's changes up to the fetched tip; return if there were any.
+        """Publish what follows from people's changes up to the fetched tip; return whether any did.
 
-        Does not fetch first.
+        It does not fetch first.
         """
         for _ in range(_TRIES):
             commits = self._new_commit_batch()

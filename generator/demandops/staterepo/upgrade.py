@@ -42,7 +42,7 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
 _FIRST_WITH_MARKS = 2
-"""The render version whose claims say which topics are further ones of their source."""
+"""The first render version whose claims mark the further topics of a source."""
 
 _FOLDER_DEPTH = 3
 """``clusters/<cluster>/<access domain>``: the commit's message counts files per such folder."""

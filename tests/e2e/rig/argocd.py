@@ -31,7 +31,7 @@ WEBHOOK_SECRET = secrets.token_hex(16)
 
 
 def settings() -> list[Manifest]:
-    """Return the lock-down of docs/argocd.md, which the parts read before they start."""
+    """Return the manifests that must exist before the parts start; docs/argocd.md requires them."""
     labels = {"app.kubernetes.io/part-of": "argocd"}
     return [
         {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}},

@@ -132,7 +132,7 @@ class Rig:
         return f"{self._git_url}/{repository.strip('/')}"
 
     def push_url(self, repository: str) -> str:
-        """Return the URL by which a test pushes to it, with credentials."""
+        """Return the URL by which a test pushes to a repository, with credentials."""
         return f"{self._push_url}/{repository.strip('/')}"
 
     def repository(self, repository: str) -> Path:

@@ -21,7 +21,7 @@ CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
 
 
 def settings() -> list[Manifest]:
-    """Return the manifests that must exist before they start."""
+    """Return the manifests that must exist before the controllers start."""
     return [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}]
 
 

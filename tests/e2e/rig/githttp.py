@@ -82,7 +82,7 @@ def _environment(root: Path) -> dict[str, str]:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers what git asks for, by `git http-backend`."""
+    """Answers git's requests with `git http-backend`."""
 
     protocol_version = "HTTP/1.1"  # with 1.0 a client that sends "Expect: 100-continue" would wait
     server: GitServer
@@ -129,7 +129,7 @@ class Handler(BaseHTTPRequestHandler):
             init_bare(repository, self.server.git)
 
     def run_backend(self, path: str, query: str) -> None:
-        """Have git answer."""
+        """Have `git http-backend` answer."""
         backend = subprocess.Popen(
             [self.server.git, "http-backend"],
             env=self.server.environment() | self._request_variables(path, query),

@@ -1,8 +1,8 @@
-"""Run the Go toolchain on one wrapper module, with progress: the only place that knows `go`.
+"""Run the Go toolchain on one wrapper module, with progress: the only module that runs `go`.
 
-Used by `tools` alone. Builds go by the committed `go.mod` and `go.sum`, whatever the caller's Go
-settings are, with the Go that is installed (no toolchain is fetched), and at the lowest priority:
-a cold build takes about twenty minutes of both cores.
+Only `tools` uses it. A build follows the committed `go.mod` and `go.sum`, whatever the caller's Go
+settings are. It uses the installed Go and fetches no toolchain. It runs at the lowest priority,
+because a cold build takes both cores for about twenty minutes.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Go:
 
     @staticmethod
     def find() -> Go:
-        """The Go on PATH; raises RigError with what to install where there is none."""
+        """Return the Go on PATH; raise RigError with the remedy if there is none."""
         program = shutil.which("go")
         if program is None:
             raise RigError("tests/e2e/tools: `go` is not on PATH: " + REMEDY.format(needed="1.26"))
@@ -56,7 +56,7 @@ class Go:
         return Go(program, version, f"{system}/{machine}")
 
     def check(self, wrapper: Path) -> None:
-        """Raise RigError where this Go is older than what the wrapper's `go.mod` needs."""
+        """Raise RigError if this Go is older than the wrapper's `go.mod` requires."""
         found = re.search(r"^go (\S+)$", (wrapper / "go.mod").read_text(), re.MULTILINE)
         needed = found.group(1) if found else "1.26"
         if _numbers(self.version) < _numbers(needed):
@@ -66,7 +66,7 @@ class Go:
 
 @dataclass(frozen=True)
 class Workspace:
-    """A folder for one wrapper's builds: its sources and what is compiled of them.
+    """A folder for one wrapper's builds, with its sources and compiled packages.
 
     The modules of all wrappers and their compiled packages would fill some 15 GB. So each wrapper
     keeps only the sources that it builds, in a vendor folder, and is removed after its last build.
@@ -85,7 +85,7 @@ class Workspace:
 
     @property
     def module(self) -> Path:
-        """A copy of the wrapper, with its vendor folder."""
+        """The folder of the wrapper's copy, with its vendor folder."""
         return self.folder / "wrapper"
 
     def vendor(self, go: Go, wrapper: Path, report: Report) -> None:
@@ -103,7 +103,7 @@ class Workspace:
         (self.module / "fetched").rename(self.module / "vendor")
 
     def drop_modules(self) -> None:
-        """Remove the modules; the vendor folder has what the build needs of them."""
+        """Remove the modules; the vendor folder has what the build needs."""
         shutil.rmtree(self.folder / "modules", ignore_errors=True)
 
     def remove(self) -> None:
@@ -131,13 +131,13 @@ def build(
 
 
 def module_folder(go: Go, workspace: Workspace, module: str) -> str:
-    """The folder of a module's unpacked sources, before the modules are dropped."""
+    """Return the folder of a module's unpacked sources; call it before the modules are dropped."""
     argv = [go.program, "list", "-mod=mod", "-m", "-f", "{{.Dir}}", module]
     return _watched(argv, workspace).strip()
 
 
 class _Counter:
-    """Counts lines of progress and reports them at most every few seconds."""
+    """Counts lines of progress and reports the count every few seconds."""
 
     def __init__(self, report: Report, text: str, expected: set[str] | None = None) -> None:
         self._report, self._text, self._expected = report, text, expected
@@ -145,7 +145,7 @@ class _Counter:
         self._last = self._start
 
     def line(self, line: str) -> bool:
-        """Whether the line was mere progress rather than something a person must read."""
+        """Return whether a line is only progress, which nobody must read."""
         progress = line.startswith("go: downloading")
         if self._expected is not None:
             progress = progress or line in self._expected
@@ -167,7 +167,7 @@ def _watched(
     line: Callable[[str], bool] = lambda line: False,
     tick: Callable[[], None] = lambda: None,
 ) -> str:
-    """Run a command, hand each line of its standard error on, and return its standard output."""
+    """Run a command, pass each line of its standard error to `line`, return its standard output."""
     folder = workspace.module
     process = subprocess.Popen(
         launch.command(argv[0], *argv[1:], niceness=19),
@@ -218,7 +218,7 @@ def _pump(stream: IO[str], lines: queue.Queue[str | None]) -> None:
 def _follow(
     lines: queue.Queue[str | None], line: Callable[[str], bool], tick: Callable[[], None]
 ) -> deque[str]:
-    """The last lines that were more than progress; linking is silent, hence the ticks."""
+    """Return the last lines that are not progress; call `tick` in silence, as while linking."""
     shown: deque[str] = deque(maxlen=_SHOWN_LINES)
     while True:
         try:

@@ -2,8 +2,8 @@
 
 Run as `python -I -S launch.py PARENT_PID NICENESS PROGRAM ARGUMENT…`: it asks the kernel for a
 SIGKILL on the parent's death and then becomes the program (same pid). Without it a test run ended
-by `kill -9` would leave a cluster behind. It imports little because it
-delays every start.
+by `kill -9` would leave a cluster behind. It imports little, because each import delays every
+start.
 
 `subprocess`'s `preexec_fn` would do the same, but runs Python between fork and exec, which a
 process with threads must not do.

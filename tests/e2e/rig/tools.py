@@ -1,10 +1,10 @@
 """Build the rig's programs from their pinned Go modules, once, into a cache outside the checkout.
 
-First stage of the rig: everything above takes the paths that `ensure` returns. A wrapper module
-under `tests/e2e/tools/` pins each program, so that `go.sum` covers all of it. A cache entry is
-named after the digest of all that decides its bytes; it appears by one rename, so an entry that
-exists is whole. `python -m tests.e2e.rig.tools` builds all and prints how long each took, with
-`--for flux` what a rig with that controller takes.
+This is the first stage of the rig: the others take the paths that `ensure` returns. A wrapper
+module under `tests/e2e/tools/` pins each program, so that `go.sum` covers all of it. A cache entry
+is named after a digest of all that decides its bytes. It appears by one rename, so an entry that
+exists is complete. `python -m tests.e2e.rig.tools` builds all programs and prints how long each
+took. With `--for flux` it builds those of a rig with Flux.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _CRD_FOLDERS = ("config/crd/bases", "manifests/crds")  # Flux's, Argo CD's
 
 @dataclass(frozen=True)
 class Tool:
-    """One program: which wrapper module pins it and which package is its main one."""
+    """A program: the wrapper module that pins it, and its main package."""
 
     name: str
     wrapper: str
@@ -74,9 +74,9 @@ TOOLS = {
 
 
 def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
-    """Paths of the named programs (all by default), built first where the cache lacks them.
+    """Return the paths of the named programs (all by default); build those that the cache lacks.
 
-    `report` takes progress lines, by default to standard error. Raises RigError where a name is
+    `report` gets lines of progress, by default to standard error. Raises RigError if a name is
     unknown, Go is missing or too old, or a build fails.
     """
     wanted = list(TOOLS) if names is None else list(names)
@@ -99,19 +99,19 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
 
 
 def needed_with(*gitops: str) -> list[str]:
-    """Names of the programs of a rig with these GitOps controllers."""
+    """Return the names of the programs of a rig with these GitOps controllers."""
     return [tool.name for tool in TOOLS.values() if tool.gitops in ("", *gitops)]
 
 
 def crd_files(binaries: dict[str, Path]) -> list[Path]:
-    """The CRD manifests that came with the given programs."""
+    """Return the CRD manifests that came with the given programs."""
     return sorted(
         path for binary in binaries.values() for path in binary.parent.glob("crds/*.yaml")
     )
 
 
 def cache_root() -> Path:
-    """Where built programs are kept."""
+    """Return the folder of the built programs."""
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         return Path(named).expanduser().resolve()
@@ -120,7 +120,7 @@ def cache_root() -> Path:
 
 
 def _digest(tool: Tool, go: gobuild.Go) -> str:
-    """What decides a program's bytes: its pins, the flags, the toolchain and the target."""
+    """Return a digest of what decides a program's bytes: pins, flags, toolchain and target."""
     folder = WRAPPERS / tool.wrapper
     parts = [
         (folder / "go.mod").read_bytes(),
@@ -132,7 +132,7 @@ def _digest(tool: Tool, go: gobuild.Go) -> str:
 
 
 def _flags(tool: Tool) -> list[str]:
-    """Build flags: small binaries whose bytes do not depend on where the checkout lies."""
+    """Return flags for small binaries whose bytes do not depend on the checkout's place."""
     linker = ["-s", "-w"]
     if tool.wrapper == "kubernetes":
         # Unstamped, the server calls itself v0.0.0-master and clients refuse to work with it.
@@ -156,7 +156,7 @@ def _pinned(go_mod: Path, module: str) -> str:
 
 @contextlib.contextmanager
 def _turn(root: Path, say: Report) -> Iterator[None]:
-    """One build at a time on a machine: two of Kubernetes at once would not fit into memory."""
+    """Wait for the turn to build: two builds of Kubernetes at once would not fit into memory."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / "build.lock").open("w") as lock:
         waited = False

@@ -63,7 +63,10 @@ APPENDED: dict[str, tuple[str, str]] = {
     "a way to a shell by an undefined name": ("x: {{ nope.__init__.__globals__ }}\n", "unsafe"),
     "a change of what it is given": ("{% set x = node.update({'id': 'other'}) %}\n", "unsafe"),
     "two documents": ("---\na: b\n", "another document starts here; only one is allowed"),
-    "a key twice": ("hostNetwork: true\n", "not valid YAML: the key 'hostNetwork' appears twice"),
+    "a key twice": (
+        "hostNetwork: true\n",
+        "not valid YAML: the key 'hostNetwork' appears twice; remove one",
+    ),
     "a loop without end": ("{% for i in range(1000000000) %}{% endfor %}\n", "Range too big"),
     "a division by nothing": ("x: {{ 1 / 0 }}\n", "zero"),
     "a value that YAML has no word for": (

@@ -104,8 +104,8 @@ def test_settings_and_patches_that_are_not_valid_are_named() -> None:
     ]
     both = [{"connections": ["*"]}, {"nodes": ["edge"]}]
     assert refusals({PATCH: override(*both, values={"env": {}})}) == [
-        "overrides/tested.yaml: select: values are a client's settings if connections are "
-        "selected, and Helm values else; write two overrides"
+        "overrides/tested.yaml: select: values are settings of clients if connections "
+        "are selected, otherwise Helm values; write two overrides"
     ]
     patch = override({"connections": ["*"]}, values={"resources": {"limits": {"memory": 1}}})
     assert refusals({PATCH: patch}) == [

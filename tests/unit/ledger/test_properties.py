@@ -97,7 +97,7 @@ def assert_changes(taken: Decision, expected: Result) -> None:
 
 
 def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
-    """Tell whether a subject is named for a requester, with this topic or with none."""
+    """Return whether a subject is named for a requester, with this topic or with none."""
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
     named = ": " not in text or f": {words} " in text
     return named and f"'{subject}'" in text and text.endswith(f" for {who}")

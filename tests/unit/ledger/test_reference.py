@@ -40,7 +40,7 @@ def resource(kind: str, *ids: str) -> str:
 
 
 def counted(ledger: Ledger) -> Books:
-    """Return who holds what, as often as they hold it, as :meth:`Operators.books` tells it."""
+    """Return who holds what, as often as they hold it, in the form of :attr:`Reference.books`."""
     books = defaultdict[str, list[str]](list)
     for claim in ledger:
         if not claim.is_on_application:

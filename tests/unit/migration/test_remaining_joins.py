@@ -137,7 +137,7 @@ def test_the_versioning_of_a_connection_is_not() -> None:
     assert str(refused.value) == (
         f"{CONNECTION}: has requests, but no bookkeeping. The requests alone do not tell who holds "
         "it, because the operator adds later requesters to the first one. Give "
-        "mqtt_bookkeeping.yml too. If it is lost, write a file with who holds it, each as often as "
+        "mqtt_bookkeeping.yml too. If it is lost, write one that lists each requester as often as "
         f"it joined: {CONNECTION}: [vehicle00]"
     )
 

@@ -76,10 +76,13 @@ X, Y = "clusters/c/d/n/x.yaml", "clusters/c/d/n/y.yaml"
     ("files", "told"),
     [
         *(
-            ({path: None}, [f"{path}: is not the generator's to write"])
+            ({path: None}, [f"{path}: is not in a folder that the generator writes"])
             for path in ("inventory/nodes.yaml", "demandops.yaml", "clusters/../x.yaml", "x")
         ),
-        ({"/clusters/x.yaml": None}, ["/clusters/x.yaml: is not the generator's to write"]),
+        (
+            {"/clusters/x.yaml": None},
+            ["/clusters/x.yaml: is not in a folder that the generator writes"],
+        ),
         ({X: CONFIG + "data: {a: 1}\nfoo: bar\n"}, [f"{X}: ", f"{X}: "]),
         (
             {X: CONFIG, Y: CONFIG},

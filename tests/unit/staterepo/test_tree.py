@@ -29,7 +29,7 @@ TEXTS = st.sampled_from(["", "x", "x\n", "ü{{ y }}\n"])
 
 
 def _without_conflict(paths: set[str], path: str) -> bool:
-    """Tell whether ``path`` can be a file beside ``paths``."""
+    """Return whether ``path`` can be a file beside ``paths``."""
     return not any(o.startswith(f"{path}/") or path.startswith(f"{o}/") for o in paths - {path})
 
 

@@ -1,1 +1,1 @@
-"""Commands that change the ledger: request, decommission, rollback."""
+"""Commands that change the ledger: request, import, decommission, rollback."""

@@ -31,8 +31,8 @@ from demandops.staterepo import reader
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="What the resources are as applications and connections. If the file does not exist, a "
-    "proposal is written to it, and nothing is booked.",
+    help="Which application or connection each resource is. If the file does not exist, a proposal "
+    "is written to it, and nothing is booked.",
 )
 @click.option("--dry-run", is_flag=True, help="Show the consequences and book nothing.")
 @click.option(
@@ -82,7 +82,8 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     for warning in warnings:
         errors.print(f"warning: {warning}")
     if not joins:
-        raise InvalidInput([fault("", "nothing is held in what was given")])
+        message = "nothing to import: nobody holds anything in the given files"
+        raise InvalidInput([fault("", message)])
     if not map_file.exists():
         _propose(joins, found, map_file, state_repo, output)
         return

@@ -21,8 +21,8 @@ _LOOK_UP_S = 0.5
 def await_answer(future: Future[Any]) -> None:
     """Return once a demand has an answer; Ctrl-C and SIGTERM interrupt it.
 
-    It looks up again and again: a wait without end may not see a signal that arrived just before
-    it, or whose handler another library set.
+    It polls: an endless wait may miss a signal that arrived just before it, or whose handler
+    another library set.
     """
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
@@ -67,12 +67,12 @@ def print_consequences(decision: Decision) -> None:
 
 
 def print_refusal(title: str, faults: Iterable[dict[str, Any]]) -> None:
-    """Print faults in the form of JSON as text, on stderr."""
+    """Print faults, given as data of the JSON output, as text on stderr."""
     errors.print(title)
     for each in faults:
         errors.print(f"  {Fault(**each)}")
 
 
 def claim_text(claim: dict[str, Any]) -> str:
-    """Return the subject of a claim in the form of JSON as text."""
+    """Return the subject of a claim, given as data of the JSON output, as text."""
     return f"{claim['subject']['kind']} '{claim['subject']['id']}'"

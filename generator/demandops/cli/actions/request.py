@@ -38,7 +38,7 @@ class Document:
 
     @property
     def request_id(self) -> str:
-        """Return the id by which a person knows it."""
+        """Return the goal's id, by which a person knows it."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""

@@ -102,7 +102,7 @@ def _consequences(decision: Decision | None) -> dict[str, Any]:
 def _roll_back(
     state_repo: str, goal: dict[str, Any], signing_key: Path | None, base: str
 ) -> dict[str, Any]:
-    """Roll back with a generator; return what differs from the dry run on ``base``."""
+    """Roll back with a generator; return the outcome, with its consequences if main has moved."""
     try:
         with started_generator(state_repo, signing_key) as generator:
             ticket = generator.submit(goal)

@@ -1,1 +1,1 @@
-"""Commands for a state repo as a whole: init, check, upgrade, verify, schema."""
+"""Commands for a state repo as a whole: init, check, journal, schema, upgrade, verify."""

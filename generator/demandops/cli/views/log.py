@@ -71,7 +71,7 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     "--max-count",
     type=click.IntRange(1),
     default=None,
-    help="The greatest number of commits to list.",
+    help="List at most this many commits.",
 )
 @output_option
 def log(

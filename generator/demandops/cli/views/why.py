@@ -68,7 +68,7 @@ class _Match:
     type=click.IntRange(0),
     default=10,
     show_default=True,
-    help="The greatest number of commits to list that changed it.",
+    help="List at most this many of the commits that changed it.",
 )
 @output_option
 def why(

@@ -203,7 +203,7 @@ def _requested_sync(operation: Object) -> Object:
 
 
 def _same(source: object, other: object) -> bool:
-    """Report whether two sources are equal; Argo CD may omit empty fields or write them."""
+    """Return whether two sources are equal; Argo CD may omit empty fields or write them."""
     return _without_empty(source) == _without_empty(other)
 
 

@@ -69,7 +69,7 @@ class Health:
     failing: bool = False
 
     def reaches(self, level: Level) -> bool:
-        """Report whether the state is at least ``level``."""
+        """Return whether the state is at least ``level``."""
         return _ORDER[self.state] >= _ORDER[level]
 
 
@@ -83,11 +83,11 @@ class History(Protocol):
     """Queries on the state repo's commits."""
 
     def includes(self, commit: str, other: str) -> bool:
-        """Report whether ``commit`` is ``other`` or comes after it."""
+        """Return whether ``commit`` is ``other`` or comes after it."""
         ...
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Report whether two commits have the same content under ``path``."""
+        """Return whether two commits have the same content under ``path``."""
         ...
 
 
@@ -122,7 +122,7 @@ class HealthReader(ABC):
         """Return how far a domain has applied a commit."""
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return how far a commit has started or removed a release: first applied, then started."""
+        """Return how far a release is at a commit: first applied, then started or removed."""
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain

@@ -2,7 +2,7 @@
 
 Decommissioning a node releases its applications, the inputs from it and the connections that end at
 it, whoever requested them. Decommissioning a requester releases all its claims, also those that it
-shares: the other requesters may never release them, because they were named by the one that left.
+shares: it named the other requesters, who might never release them.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from demandops.subject import TopicKey
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Take the holds that a shutdown names; nothing, if the same one came in the last 15 minutes.
+    """Take the holds that a shutdown names; none if it repeats one of the last 15 minutes.
 
     Raises:
         Refused: if the requesters hold none of them.
@@ -56,7 +56,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
 
 
 def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: str) -> list[Claim]:
-    """Return the claims to take a requester's holds from, in this order."""
+    """Return the claims to take a requester's holds from, in the order to try."""
     own = demand_id(request.id, one.requesters)
     claims = ledger.claims_held_by(requester, one.held.subject)
     return sorted(
@@ -68,9 +68,10 @@ def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: s
 def _holds(
     one: Demanded, requester: str, claims: list[Claim]
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield each listed topic in words, the claim to take it from, and what the claim calls it.
+    """Yield each listed topic as text, the claim to take holds from, and the topics' keys there.
 
-    If no topic is listed, all holds in the first claim are taken.
+    The claim is ``None`` if the requester holds no such topic. If no topic is listed, all holds in
+    the first claim are taken.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]

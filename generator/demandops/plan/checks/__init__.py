@@ -1,1 +1,1 @@
-"""Checks of a booking by its plan: quotas and denials."""
+"""Checks of a booking by its plan: denials, quotas and topic clashes."""

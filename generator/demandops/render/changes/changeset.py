@@ -78,8 +78,7 @@ def build_changeset(
     Args:
         before, after: the world before and after; the configuration is the same.
         changes: what differs in the ledger.
-        keys: the releases that may differ (:func:`demandops.plan.release_keys.affected`).
-
+        keys: the releases that may differ (:func:`demandops.plan.release_keys.affected_keys`).
         engine: the engine of the configuration.
         read: reads the state repo before the change.
         plans: releases of ``before`` that are planned already.

@@ -158,7 +158,7 @@ def _pairs(
 
 
 def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield the differences between two manifests, if no fact of the plan describes them."""
+    """Yield the differences between two manifests as text, then how many more there are."""
     try:
         differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:

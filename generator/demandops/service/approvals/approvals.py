@@ -110,7 +110,7 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Remove the proposals that demands of the batch release, before these are evaluated.
+        """Remove the proposals that demands of a batch release; call it before it is evaluated.
 
         Nobody can merge a proposal without its branch. If it was merged earlier, the demands are
         evaluated on a tip that has the merge.
@@ -129,7 +129,7 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw the earlier demands of a batch that a demand releases before they are proposed.
+        """Withdraw those earlier demands of a batch that the demand ``by`` releases.
 
         Args:
             earlier: their results; results of withdrawn demands are replaced.
@@ -299,10 +299,10 @@ class Approvals:
     def _leave_out(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
-        """Update the branch for the demands that still need approval; the others leave it.
+        """Update the branch so that it holds only the demands that still need approval.
 
         Returns:
-            False if the proposal must be checked again; then it still has all of them.
+            False if the proposal must be checked again; then it keeps all its demands.
         """
         before, is_updated = proposal.tickets, False
         proposal.wait_for(verdict.waiting)

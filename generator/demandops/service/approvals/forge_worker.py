@@ -24,7 +24,7 @@ POLL_S = 30.0
 
 _TOO_MANY_REQUESTS = 429
 _REST_S = 60.0
-"""How long to ask a forge nothing after it said that it was asked too often."""
+"""The pause after a forge answers that it got too many requests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class ForgeWorker:
             self._enqueue(task)
 
     def has_answered(self, branch: str) -> bool:
-        """Return whether the forge was queried for a branch, successfully or not."""
+        """Return whether a first query about a branch has ended, successfully or not."""
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:

@@ -137,7 +137,7 @@ class Proposal:
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request by one of their requesters releases all of some pending ones."""
+    """Return whether a request by one of the requesters of ``pending`` releases all of them."""
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False

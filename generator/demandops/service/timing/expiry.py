@@ -29,7 +29,7 @@ _SHORTEST_S = 1.0
 LONGEST_WAIT_S = 60.0
 """The longest time between two checks of the leases, because the clock may be set meanwhile."""
 _RETRY = timedelta(seconds=LONGEST_WAIT_S)
-"""When to try again what could not be released or ended, such as files that do not render."""
+"""The pause before a failed release of claims, or a failed end of an override, is tried again."""
 
 
 class LeaseExpiry:
@@ -44,8 +44,7 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, unless one was just answered.
 
-        They are for this ledger and this moment: another may show that a lease was renewed or that
-        the clock was set.
+        Use the tickets at once: later a lease may have been renewed, or the clock set.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)

@@ -1,4 +1,4 @@
-"""The address of a state repo: a folder or a URL that Git can clone, and opening it."""
+"""How a state repo is opened by its address: a folder, or a URL that Git can clone."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import (
 )
 
 _STALE_LOCK_S = 5.0
-"""Git holds the lock of a branch for milliseconds; for so long only if its process was killed."""
+"""Git holds a branch's lock for milliseconds. One this old was left by a killed process."""
 
 log = logging.getLogger("demandops")
 

@@ -26,12 +26,12 @@ from pygit2.enums import ObjectType
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 _LAST = 0
-"""The priority of the memory. It is asked last, because most objects that are read are not new."""
+"""The lowest priority among the places of objects: most objects that are read are not new."""
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-"""What file systems answer that have no hard links, or no more of them."""
+"""The errors of file systems that have no hard links, or allow no more to a file."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -55,7 +55,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository, as long as its owner holds it."""
+        """The repository; whoever writes to it keeps it alive."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - whoever writes to it holds it
         return repo
@@ -97,9 +97,10 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
-        """Build a pack and place it before its index: git removes an index without a pack.
+        """Build a pack, then move it and its index into place, in this order.
 
-        Its .keep begins like the index, so :meth:`clean` knows it.
+        Git removes an index without a pack. The pack's .keep begins like the index, by which
+        :meth:`clean` recognizes it.
         """
         packs = self._packs
         with (
@@ -197,7 +198,7 @@ class NewObjects(pygit2.OdbBackend):
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return type, content and id of a new object; only full ids are looked up."""
+        """Return type, content and id of a new object; a shortened id finds none."""
         kind, data = self._known[oid]
         return kind, data, oid
 

@@ -38,7 +38,7 @@ _REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
 _TEMPORARY = re.compile(r"lock|failed to update ref|incorrect old value")
 _POLL_S = 0.02
 _CLONE_TIMEOUT_S = 3600
-"""A first clone may take long; a connection that carries nothing is cut off before."""
+"""The limit of a first clone; git ends a connection that carries nothing much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
@@ -50,7 +50,7 @@ HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
 HAS_TOKEN = re.compile(
     r"^https?://(gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-zA-Z]*\d)[a-zA-Z0-9]{32,}@)", re.I
 )
-"""A user name that is a token. A name alone is none: some forges have it in their addresses."""
+"""Matches a URL whose user name is a token. Other user names are normal: some forges need one."""
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")

@@ -61,10 +61,10 @@ _TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objec
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
-    """Return what it means that a state repo on this disk could not be written; None: nothing.
+    """Return the error to raise if a state repo on this disk could not be written, or None.
 
-    libgit2 tells the number of an error only by its text. After an I/O error nobody knows what is
-    on the disk.
+    libgit2 gives the number of an error only as text. After an I/O error nobody knows what is on
+    the disk.
     """
     number = getattr(error, "errno", None)
     if number is None:
@@ -85,9 +85,9 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
 
 
 def access_error(error: Exception, address: str) -> Exception:
-    """Return what it means that a folder or state repo could not be read or written.
+    """Return the error to raise if a folder or state repo could not be read or written.
 
-    An error of the system or of libgit2 is no fault of the program.
+    An error of the system or of libgit2 is no fault of the program; any other is returned as it is.
     """
     if not isinstance(error, OSError | pygit2.GitError):
         return error
@@ -135,7 +135,7 @@ class StateRepository(ABC):
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote's answer was its promise
-        """Make durable what was published after the commit ``since``, whatever became of it before.
+        """Write again what was published after the commit ``since``, so that it is durable.
 
         Raises Unavailable or Unsound if that fails.
         """
@@ -189,7 +189,7 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git join the packs, beside what else happens, unless it still does."""
+        """Have git join the packs in the background, unless it is still doing so."""
         if self._tidying is not None and self._tidying.poll() is None:
             return
         self._tidying = subprocess.Popen(

@@ -17,7 +17,7 @@ pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectTyp
 
 
 MAX_DEPTH = 64
-"""The folders above a file; deeper ones are not read."""
+"""How many folders a file may be inside; deeper folders are not read."""
 
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
@@ -66,10 +66,10 @@ def text_of(blob: Object) -> str:
 
 
 def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
-    """Yield (path, object) of all that is no folder at or below the paths ``roots``.
+    """Yield (path, object) of each file, link or submodule at or below the paths ``roots``.
 
-    In Git's order. A folder that is deeper than :data:`MAX_DEPTH` counts as one entry. A name that
-    is not UTF-8 has ``\\xff`` for such a byte.
+    The order is Git's. A folder that is deeper than :data:`MAX_DEPTH` is yielded like a file. In a
+    name that is not UTF-8, ``\\xff`` stands for such a byte.
     """
     for root in roots:
         found = entry(tree, root)
@@ -200,7 +200,7 @@ def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | Non
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
-    """Return the name of the entry that is written as ``name``, or of a new one."""
+    """Return the raw name of the entry that reads as ``name``; else ``name``, encoded."""
     raw = name.encode()
     if raw in entries or b"\\" not in raw:
         return raw

@@ -32,7 +32,7 @@ class Check(NamedTuple):
 
 
 _good: dict[str, Check] = {}
-"""Commit → its check, if it is good: a commit, its signature and its parent never change."""
+"""The good checks so far, by commit: a commit, its signature and its parent never change."""
 
 
 def are_listed(repo: Repository, commit: Oid) -> bool:

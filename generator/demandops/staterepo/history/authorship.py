@@ -44,7 +44,10 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return what finds commit and author of people's last change to a path, else to any."""
+    """Return a function that finds the commit and author of people's last change to a path.
+
+    If they did not change the path, it finds their last change to any path.
+    """
 
     @cache  # read late: most reports exist already and need no commits
     def commits() -> list[Commit]:

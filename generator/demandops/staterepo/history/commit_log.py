@@ -45,10 +45,10 @@ class LogEntry:
     trailers: dict[str, list[str]]
     why: str = ""
     by_generator: bool = False
-    """Whether the generator is the committer, so that the files should match the ledger.
+    """Whether the generator is the committer; then the files should match the ledger.
 
-    Its message alone says nothing, because anybody may quote trailers. A proposal does not count: a
-    person merges it, maybe onto other changes, so it is read again. :func:`is_by_generator` also
+    The message alone proves nothing, because anybody may quote trailers. A proposal does not count:
+    a person merges it, maybe onto other changes, so it is read again. :func:`is_by_generator` also
     asks for a signature.
     """
 
@@ -118,7 +118,7 @@ def person_commits(
 def _told_apart(
     repo: Repository, tip: str | Oid, until: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return the commits; ``by_generator`` of an entry also says that the signature is good."""
+    """Return the commits; ``by_generator`` of an entry also means that its signature is good."""
     found = list(commits(repo, tip, until))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
     return [
@@ -203,7 +203,7 @@ class PathHistory:
 def changes_to(
     repo: Repository, tip: str | Oid, path: str, until: str | None = None
 ) -> Iterator[PathChange]:
-    """Yield the commits after ``until`` that changed a file or folder, newest first, like Git."""
+    """Yield the commits after ``until`` that changed a path, newest first, as ``git log`` does."""
     for revision in _git_log(repo, tip, until, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)

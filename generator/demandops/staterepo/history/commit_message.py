@@ -72,7 +72,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 def of_decision(
     decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``settled`` are trailers of demands before it."""
+    """Return the message of a demand's commit; ``settled`` are trailers for earlier demands."""
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     title, why = _title_and_why(decision, received)

@@ -60,7 +60,7 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a commit that this program made with a known state."""
+        """Return the snapshot at a new commit of this program, with the ``state`` after it."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
@@ -166,10 +166,10 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether what differs since ``before`` does not tell which generated files must change.
+    """Return whether every release must be rendered to find the generated files that must change.
 
-    They fit the newest commit of a generator. After it, people may have edited them, or undone what
-    another generator did since ``before``.
+    Generated files fit the newest commit of a generator. After it, people may have edited them, or
+    undone what another generator did since ``before``.
     """
     people = list(commit_log.person_commits(repo, to, before))
     if not people or people[0].id != to:
@@ -224,7 +224,7 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Keeps the advance beyond the published snapshot until a commit is published on it.
+    """Keeps what was read beyond the published snapshot, until a commit is published on it.
 
     So each attempt reads only new commits. If it read all of them again, faster writers could
     always publish first.

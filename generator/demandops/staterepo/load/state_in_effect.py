@@ -6,8 +6,8 @@ names a file that is in effect in another version, as path and blob. Each ``Held
 of the ledger that is not in effect. A restart and ``demandops verify`` start from these trailers.
 They then apply people's later changes with the same code as a running generator.
 
-People's changes that cannot be planned are not applied (quarantine). A claim that cannot be
-planned, for example because it names an unknown node, or that policy refuses stays in its file, and
+People's changes that cannot be planned are not applied (quarantine). If a claim cannot be planned,
+for example because it names an unknown node, or if policy refuses it, its file stays as it is and
 its last valid version is in effect. If the new configuration is the reason, the old configuration
 stays in effect.
 """
@@ -129,7 +129,10 @@ def snapshot_at(
 
 
 def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
-    """Return the generator's newest commit up to a commit, else that commit without trailers."""
+    """Return the generator's newest commit at or before a revision.
+
+    If there is none, return the revision's own commit, without trailers.
+    """
     commit = trees.commit_of(repo, revision)
     made = commit_log.last_generator_commit(repo, commit.id)
     if made is None:
@@ -178,7 +181,8 @@ class Judgement:
 
     If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
     be planned with the new one only, the new configuration is at fault. If policy refuses a claim
-    that a person wrote, that claim is at fault (``refused``: with the new configuration).
+    that a person wrote, that claim is at fault. ``refused`` has these faults, with the new
+    configuration.
     """
 
     repo: Repository
@@ -246,7 +250,7 @@ def judge(
     """Return the subjects that people changed since ``before`` and that cannot be accepted.
 
     Args:
-        held_back: the claim files that were refused then, if a record says so; else policy decides.
+        held_back: the claim files that were refused, as a record says; without one, policy decides.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)
@@ -288,7 +292,7 @@ def _together(one: Faults, other: Faults) -> Faults:
 
 
 def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
-    """Return the subjects with claims that a record names, without the reasons."""
+    """Return a placeholder fault for each subject that has a claim file in ``held_back``."""
     ledger = advance.snapshot.state.ledger
     return {
         subject: (_TO_CHECK,)

@@ -133,7 +133,7 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects of an override for an edit, and the parts of the edit it leaves out."""
+    """Return the effects of an override that replaces an edit, and the parts that it leaves out."""
     if after is None:
         return {"deny": True}, []
     try:
@@ -176,7 +176,7 @@ def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
 def _service_effects(
     old: list[Any], new: list[Any], release: ServiceRelease, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects of an edit of a HelmRelease or an Application, and what they leave out."""
+    """Return :func:`_effects` of an edit of a HelmRelease or an Application."""
     effects, not_covered = dict[str, Any](), list[str]()
     place_of_values = _VALUES.get(old[0].get("kind"), ())
     before, after = _at(old[0], place_of_values), _at(new[0] if new else None, place_of_values)
@@ -247,7 +247,7 @@ def _move_images(
 def _client_effects(
     old: list[Any], new: list[Any], config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects of an edit of plain manifests; an override changes only their image."""
+    """Return :func:`_effects` of an edit of plain manifests; overrides change only their images."""
     images, not_covered = dict[str, dict[str, str]](), list[str]()
     by_reference = {image.reference(): (name, image) for name, image in config.images.items()}
     for path, left, right in leaf_differences(old, new):

@@ -105,7 +105,7 @@ class CommitBatch:
         return str(made)
 
     def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
-        """Name a demand that changed nothing in the next commit, if any.
+        """Have the next commit, if any, name a demand that changed nothing.
 
         If the process dies before it answers, a restart must not evaluate that demand again after
         a later release.

@@ -96,7 +96,7 @@ class Journal:
         """Raise if nobody knows what is in the file.
 
         Raises:
-            Unsound: as every write from then on.
+            Unsound: the same as every write raises from then on.
         """
         if self._unsound is not None:
             raise self._unsound

@@ -45,7 +45,7 @@ class Slot:
                 self.folder, self._lock = folder, lock
                 break
         else:
-            raise OSError(f"{_MAX_SLOTS} processes already use {root}")
+            raise OSError(f"{_MAX_SLOTS} processes already use {root}; stop some of them")
         try:
             self.journal = Journal(self.folder / _JOURNAL)
             self._adopt_orphans(root)
