@@ -304,3 +304,17 @@ def test_what_people_push_beside_a_damaged_clone_is_followed(
     with rig.running(url) as generator:
         rig.book(generator, goal(2))
         assert str(generator.snapshot.commit) == tip(bare)
+
+
+@pytest.mark.parametrize("damage", [_truncate_packs, _drop_indexes])
+def test_a_damaged_repo_of_this_disk_is_told_with_the_remedy(
+    bare: Path, tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    rig.git(bare, "repack", "-adq")
+    damage(bare)
+    with (
+        pytest.raises(StateRepoError, match="restore it from a backup or a clone$") as error,
+        rig.running(str(bare), data=tmp_path / "data"),
+    ):
+        pass
+    assert str(error.value).startswith(f"{bare} cannot be read: ")

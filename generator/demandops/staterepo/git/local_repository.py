@@ -62,7 +62,7 @@ class LocalRepository(StateRepository):
             f"`git -C {self.address} fsck` finds it broken, restore it from a backup or a clone"
         )
 
-    def renew_if_unreadable(self) -> bool:
+    def renew_if_damaged(self) -> bool:
         """Raise StateRepoError if git finds it damaged: nobody can make it anew."""
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],

@@ -177,13 +177,14 @@ class StateRepository(ABC):
         except StateRepoError:
             return None
 
+    @abstractmethod
     def renew_if_damaged(self) -> bool:
         """Make the files here anew if they are damaged and can be; return whether that was done.
 
         Raises:
             Unavailable: they are damaged and cannot be made anew now.
+            StateRepoError: they are damaged, and nobody can make them anew.
         """
-        return False
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any."""
