@@ -74,7 +74,9 @@ class LocalRepository(StateRepository):
             check=False,
         )
         if checked.returncode:
-            raise self._unreadable((checked.stderr + checked.stdout).strip().partition("\n")[0])
+            found = (checked.stderr + checked.stdout).strip().splitlines()
+            missing = (line for line in found if line.startswith("missing "))
+            raise self._unreadable(next(missing, found[0]))
         return False
 
     def _require_branch(self, path: Path) -> None:
