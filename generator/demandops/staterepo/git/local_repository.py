@@ -74,7 +74,7 @@ class LocalRepository(StateRepository):
             check=False,
         )
         if checked.returncode:
-            found = (checked.stderr + checked.stdout).strip().splitlines()
+            found = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
             missing = (line for line in found if line.startswith("missing "))
             raise self._unreadable(next(missing, found[0]))
         return False
