@@ -1,7 +1,7 @@
 """The Helm values of a service: its appdef's template, rendered and checked against the chart.
 
 The variables that the template gets are the interface of application definitions
-(docs/applications.md). Requesters are not among them.
+(docs/appdef.md). Requesters are not among them.
 """
 
 from __future__ import annotations
