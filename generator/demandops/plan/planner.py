@@ -150,8 +150,13 @@ def _inputs(
     config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
 ) -> tuple[InputTopic, ...]:
     """Return what an instance reads in a role, sorted; a known type replaces a missing one."""
-    origins = ((part, _origin(config, key, role, part)) for part in parts)
-    found = {one.topic for part, origin in origins for one in made(config, part, origin)}
+    found: set[InputTopic] = set()
+    for part in parts:
+        origin = _origin(config, key, role, part)
+        if "." in origin:
+            found.update(one.topic for one in made(config, part, origin))
+        else:
+            found.update(part.inputs.get(origin, ()))
     return tuple({one[:2]: one for one in sorted(found)}.values())
 
 
