@@ -30,6 +30,7 @@ from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
 from demandops.plan import implied_connections, output_topics
 from demandops.plan.checks import denial, quota, topic_clash
+from demandops.plan.flows import flows
 from demandops.plan.overrides.claim_overrides import (
     with_kept_claims,
     without_kept_claims,
@@ -322,12 +323,11 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
     for one in request.demanded if request.adds_claims else ():
         held = one.held
         if isinstance(held, Application):
-            for foreign in implied_connections.foreign_inputs(held, world.config):
-                topic = foreign.topic
-                if not ledger.is_carried_to(held.node, topic.topic):
+            for flow in flows(world.config, held):
+                if not ledger.is_carried_to(flow.receiver, flow.topic.topic):
                     yield (
-                        f"application '{held.id}': no connection carries {foreign.name} "
-                        f"{topic.topic} of '{topic.source}' to '{held.node}'"
+                        f"application '{held.id}': no connection carries {flow.name} "
+                        f"{flow.topic.topic} of '{flow.sender}' to '{flow.receiver}'"
                     )
             continue
         if one.note:

@@ -76,7 +76,7 @@ def test_it_is_demanded_with_yaml_alone(demandops: Run, state: GitRepo, tmp_path
             "node": "vehicle00",
             "source": "vehicle00",
             "source_topic": CLOUD[0],
-            "inputs": {"point_cloud": {CLOUD[0]: ["vehicle00"]}},
+            "inputs": {"cloud": {CLOUD[0]: ["vehicle00"]}},
             "requesters": ["vehicle00"],
         },
         next(name for name in found if name.startswith("rec-")): {
@@ -152,19 +152,13 @@ def test_two_applications_of_different_kinds_share_a_driver(books: MemoryRepo) -
     assert drivers == {
         "drv-vehicle00-vehicle00": {
             "version": "0.1.0",
-            "parameters": {
-                "format": "mcap",
-                "labels": [],
-                "quality": None,
-                "rate": 1,
-                "title": "untitled",
-            },
+            "parameters": {"rate": 1},
             "applications": ["cloud/monitor", "edge/record"],
             "service": "driver",
             "node": "vehicle00",
             "source": "vehicle00",
             "source_topic": CLOUD[0],
-            "inputs": {"point_cloud": {CLOUD[0]: ["operator", "vehicle00"]}},
+            "inputs": {"cloud": {CLOUD[0]: ["operator", "vehicle00"]}},
             "requesters": ["operator", "vehicle00"],
         }
     }

@@ -129,5 +129,5 @@ def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
 
 def test_schemas_are_written_to_a_folder(tmp_path: Path) -> None:
     ran = CliRunner().invoke(cli, ["schema", "--write", str(tmp_path / "schemas")])
-    assert ran.output == f"14 schemas in {tmp_path / 'schemas'}\n"
-    assert len(list((tmp_path / "schemas").glob("*.json"))) == 14
+    assert ran.output == f"15 schemas in {tmp_path / 'schemas'}\n"
+    assert len(list((tmp_path / "schemas").glob("*.json"))) == 15

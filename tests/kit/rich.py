@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import yaml
-from demandops.config.appdef import ApplicationDefinition
+from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
@@ -19,6 +19,7 @@ from tests.kit.config import configuration, override
 from tests.kit.goals import CLOUD, EGO, Goal, application, connection, goal
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+SERVICE = "appdefs/lidar-driver/service.yaml"
 CONFIG_MODELS: dict[str, type[BaseModel]] = {
     "demandops.yaml": RepoSettings,
     "inventory/brokers.yaml": BrokersFile,
@@ -29,6 +30,7 @@ CONFIG_MODELS: dict[str, type[BaseModel]] = {
     "registry/images.yaml": ImagesFile,
     "registry/clients.yaml": ClientsFile,
     APPDEF: ApplicationDefinition,
+    SERVICE: ServiceDefinition,
     "overrides/values.yaml": OverrideFile,
 }
 GOAL_MODELS: tuple[type[BaseModel], ...] = (WireGoal, DemandGoal)
@@ -169,6 +171,8 @@ parameters:
 deploymentRequest:
   type: 1
   inputs: {ego_data_topics: ego_data, pointcloud_topics: point_cloud}
+uses:
+  lidar-driver: {cloud: point_cloud}
 services:
   object-detection:
     prefix: od
@@ -190,6 +194,25 @@ services:
     chart: object-fusion
     images: [object-fusion, k8s-configmap-watcher]
     values: values/object-fusion.yaml.j2
+"""
+_SERVICE = """
+apiVersion: demandops/v1
+kind: ServiceDefinition
+name: lidar-driver
+description: Publishes points
+scope: topic
+prefix: drv
+inputs:
+  cloud: {description: Lidar points, type: sensor_msgs/msg/PointCloud2}
+each: cloud
+placement: source
+outputs: {points: "/{instance}_points"}
+parameters:
+  rate: {description: Highest rate in Hz, default: 10, merge: max}
+scaling: {min: 1, max: 4, topicsPerReplica: 2}
+chart: by-oci
+images: [object-detection]
+values: values/lidar-driver.yaml.j2
 """
 _OVERRIDES = {
     "values": override(
@@ -224,6 +247,8 @@ def rich() -> dict[str, str]:
             "registry/images.yaml": _IMAGES,
             "registry/clients.yaml": _CLIENTS,
             APPDEF: _APPDEF,
+            SERVICE: _SERVICE,
+            "appdefs/lidar-driver/values/lidar-driver.yaml.j2": "replicas: {{ replicas }}\n",
         }
         | {f"overrides/{name}.yaml": text for name, text in _OVERRIDES.items()}
     )

@@ -74,7 +74,8 @@ def _recorder(bare: Path) -> dict[str, str | None]:
     charts, images = "registry/charts.yaml", "registry/images.yaml"
     files: dict[str, str | None] = {
         f"appdefs/{path.relative_to(APPDEFS).as_posix()}": path.read_text()
-        for path in sorted((APPDEFS / "recorder").rglob("*"))
+        for folder in ("recorder", "driver")
+        for path in sorted((APPDEFS / folder).rglob("*"))
         if path.is_file()
     }
     chart = "  recorder:\n    folder: appdefs/recorder/charts/recorder\n    version: 0.1.0\n"

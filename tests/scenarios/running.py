@@ -141,7 +141,7 @@ def configuration(
     """Return the files of a state repo that people own."""
     files = skeleton_config()
     overlays: list[tuple[str, Any]] = []
-    for name in appdefs:
+    for name in (*appdefs, "driver") if appdefs else ():
         for path in sorted((_APPDEFS / name).rglob("*")):
             if path.is_file():
                 files[f"appdefs/{path.relative_to(_APPDEFS).as_posix()}"] = path.read_text()

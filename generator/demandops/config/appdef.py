@@ -1,13 +1,15 @@
 """Application definitions (appdefs): a YAML file and a folder define a type of application.
 
-An appdef lists inputs, parameters and services. A service runs once for each application, or once
-for each topic of an input. In the second case, all applications that demand the same topic on the
-same node share it (paper, section on object detection).
+An appdef lists inputs, parameters and services, which read inputs of the demand and outputs of each
+other. Its own services run for its applications only. A service that several types of applications
+share has a file of its own (paper, section on object detection), and each of them uses it by name.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
 
@@ -61,18 +63,19 @@ class Scaling(CamelModel):
         return self
 
 
-class Service(CamelModel):
-    """One deployable part of an application, with one Helm release for each instance.
+Scope = Literal["application", "topic", "node"]
+"""What one instance of a service is for."""
 
-    ``each`` names an input; every topic of it gets its own instance, which applications share.
-    Without ``each``, every application gets one instance. Its ``inputs`` name roles of the appdef
-    or ``<service>.<output>``.
+
+class Deployed(CamelModel):
+    """How a service runs: its releases' names, chart and values, and what it publishes.
+
+    ``each`` names an input; the service then runs once for every topic of it.
     """
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
     description: Text = ""
     each: Word | None = None
-    inputs: dict[Word, str] = Field(default_factory=dict)
     outputs: dict[Word, TopicPattern] = Field(default_factory=dict)
     placement: Literal["application", "source"] = "application"
     scaling: Scaling = Scaling()
@@ -80,13 +83,73 @@ class Service(CamelModel):
     images: Items[DnsLabel] = ()
     values: Annotated[str, StringConstraints(pattern=r"^values/[A-Za-z0-9_.-]+$")]
 
+
+class OwnService(Deployed):
+    """A service of one appdef. Its ``inputs`` name roles of the appdef or ``<service>.<output>``.
+
+    ``each`` names one of these inputs, or a role that is then an input too.
+    """
+
+    inputs: dict[Word, str] = Field(default_factory=dict)
+
     @model_validator(mode="after")
-    def _consistent(self) -> Service:
-        if self.each and self.inputs:
-            raise ValueError("'each' already names the service's input; remove 'inputs'")
+    def _consistent(self) -> OwnService:
         if self.placement == "source" and not self.each:
             raise ValueError("placement 'source' needs 'each': an application has no single source")
         return self
+
+
+class ServiceDefinition(Deployed, FileModel):
+    """A service that several appdefs may use: ``appdefs/<name>/service.yaml``."""
+
+    kind: Literal["ServiceDefinition"]
+    name: DnsLabel
+    scope: Scope
+    inputs: dict[Word, Input] = Field(default_factory=dict)
+    parameters: dict[Word, Parameter] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ServiceDefinition:
+        if (self.each is None) is (self.scope == "topic"):
+            raise ValueError("scope 'topic' needs 'each', and no other scope may have it")
+        if self.each and self.each not in self.inputs:
+            known = suggestion(self.each, self.inputs)
+            raise ValueError(f"each: '{self.each}' is not an input{known}")
+        if self.placement == "source" and self.scope == "application":
+            raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
+        return self
+
+
+class Service(Deployed):
+    """A service as the applications of one appdef have it.
+
+    ``folder`` is that of its definition in ``appdefs/``. ``inputs`` maps all its inputs to roles of
+    the appdef or ``<service>.<output>``. ``root`` is the role whose topics a service with ``each``
+    runs for; ``roots`` are the roles of which it reads the topics of one source only.
+    """
+
+    name: str
+    folder: str
+    shared: bool
+    scope: Scope
+    inputs: dict[str, str]
+    parameters: dict[str, Parameter]
+    root: str | None = None
+    roots: tuple[str, ...] = ()
+
+    @property
+    def at_source(self) -> bool:
+        """Whether it runs at the sources of its inputs."""
+        return self.placement == "source"
+
+    @property
+    def file(self) -> str:
+        """The file that defines it."""
+        return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"
+
+
+Services: TypeAlias = "Mapping[str, Service]"
+"""The services of an appdef, its own and those that it uses, by name."""
 
 
 class WireNames(CamelModel):
@@ -101,7 +164,10 @@ class WireNames(CamelModel):
 
 
 class ApplicationDefinition(FileModel):
-    """One type of application: ``appdefs/<name>/appdef.yaml``."""
+    """One type of application: ``appdefs/<name>/appdef.yaml``.
+
+    ``uses`` maps each shared service to where its inputs come from.
+    """
 
     kind: Literal["ApplicationDefinition"]
     name: DnsLabel
@@ -109,41 +175,151 @@ class ApplicationDefinition(FileModel):
     inputs: dict[Word, Input]
     parameters: dict[Word, Parameter] = Field(default_factory=dict)
     deployment_request: WireNames | None = None
-    services: dict[DnsLabel, Service] = Field(min_length=1)
+    uses: dict[DnsLabel, dict[Word, str]] = Field(default_factory=dict)
+    services: dict[DnsLabel, OwnService] = Field(default_factory=dict)
     approval: Approval = "none"
 
     @model_validator(mode="after")
-    def _references(self) -> ApplicationDefinition:
-        problems = []
-        for name, service in self.services.items():
-            if service.each and service.each not in self.inputs:
-                problems.append(
-                    f"services.{name}.each: '{service.each}' is not an input"
-                    + suggestion(service.each, self.inputs)
-                )
-            sources = self.sources()
-            problems += [
-                f"services.{name}.inputs.{role}: '{source}' is neither an input nor an output of "
-                "a service that runs for each topic" + suggestion(source, sources)
-                for role, source in service.inputs.items()
-                if source not in sources
-            ]
-        for role in (self.deployment_request.inputs if self.deployment_request else {}).values():
-            if role not in self.inputs:
-                problems.append(
-                    f"deploymentRequest.inputs: '{role}' is not an input"
-                    + suggestion(role, self.inputs)
-                )
+    def _consistent(self) -> ApplicationDefinition:
+        problems = [
+            f"deploymentRequest.inputs: '{role}' is not an input{suggestion(role, self.inputs)}"
+            for role in (self.deployment_request.inputs if self.deployment_request else {}).values()
+            if role not in self.inputs
+        ]
+        problems += [
+            f"uses.{name}: 'services' has a service of this name; rename that one"
+            for name in self.uses
+            if name in self.services
+        ]
+        if not self.services and not self.uses:
+            problems.append("services: is empty; list at least one, or use one")
         if problems:
             raise ValueError("; ".join(problems))
         return self
 
-    def sources(self) -> list[str]:
-        """Return the sources that a service may name: roles, and outputs of per-topic services."""
-        outputs = [
-            f"{name}.{output}"
-            for name, service in self.services.items()
-            if service.each
-            for output in service.outputs
-        ]
-        return [*self.inputs, *outputs]
+
+Problem: TypeAlias = "tuple[str, str]"
+"""A field of an appdef and what is wrong there."""
+
+
+def resolved_services(
+    appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
+) -> tuple[Services, list[Problem]]:
+    """Return the services of an appdef, its own and those that it uses, or what is wrong."""
+    services = {
+        name: Service.model_construct(
+            **{**dict(own), "inputs": _with_each(own)},
+            name=name,
+            folder=appdef.name,
+            shared=False,
+            scope="topic" if own.each else "application",
+            parameters=appdef.parameters,
+        )
+        for name, own in appdef.services.items()
+    }
+    for name, bound in appdef.uses.items():
+        if name in definitions:
+            used = {**dict(definitions[name]), "inputs": bound}
+            services[name] = Service.model_construct(**used, folder=name, shared=True)
+    problems = [*_unbound(appdef, definitions), *_unknown(appdef, services)]
+    if problems:
+        return {}, problems
+    graph = {
+        name: [origin.partition(".")[0] for origin in one.inputs.values() if "." in origin]
+        for name, one in services.items()
+    }
+    try:
+        order = list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        circle = " reads ".join(f"'{name}'" for name in reversed(error.args[1]))
+        return {}, [("services", f"are in a circle: {circle}; take one of these inputs away")]
+    for name in order:
+        problems += _set_roots(name, services)
+    return ({}, problems) if problems else (services, [])
+
+
+def _with_each(service: OwnService) -> dict[str, str]:
+    return ({service.each: service.each} if service.each else {}) | service.inputs
+
+
+def _unbound(
+    appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
+) -> Iterator[Problem]:
+    for name, bound in appdef.uses.items():
+        if name not in definitions:
+            known = suggestion(name, definitions)
+            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{known}"
+            continue
+        inputs = definitions[name].inputs
+        for role in inputs.keys() - bound.keys():
+            yield f"uses.{name}.{role}", "is missing; name an input, or an output of a service"
+        for role in bound.keys() - inputs.keys():
+            known = suggestion(role, inputs)
+            yield f"uses.{name}.{role}", f"'{name}' has no such input; leave it out{known}"
+
+
+def _unknown(appdef: ApplicationDefinition, services: Services) -> Iterator[Problem]:
+    for service in services.values():
+        for role, origin in service.inputs.items():
+            name, _, output = origin.partition(".")
+            known = services[name].outputs if name in services else services
+            if not output and origin not in appdef.inputs:
+                problem = f"'{origin}' is not an input{suggestion(origin, appdef.inputs)}"
+            elif output and name not in services:
+                problem = f"'{name}' is not a service{suggestion(name, services)}"
+            elif output and output not in known:
+                problem = f"'{name}' has no output '{output}'{suggestion(output, known)}"
+            else:
+                continue
+            yield _place(service, role), problem
+
+
+def _place(service: Service, role: str) -> str:
+    if service.shared:
+        return f"uses.{service.name}.{role}"
+    of_each = role == service.each == service.inputs[role]
+    return f"services.{service.name}.{'each' if of_each else f'inputs.{role}'}"
+
+
+def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
+    """Set the roots of a service from those of the services that it reads."""
+    service, root = services[name], None
+    made_from: dict[str, tuple[str, ...]] = {}
+    for role, origin in service.inputs.items():
+        producer = services.get(origin.partition(".")[0]) if "." in origin else None
+        made_from[role] = producer.roots if producer else (origin,)
+        if service.at_source and producer and producer.root and not producer.at_source:
+            yield (
+                _place(service, role),
+                f"'{origin}' is made at the node of each application, so several nodes may make it "
+                f"under one name; run '{producer.name}' at the source, or this one at the "
+                "application's node",
+            )
+        if role == service.each:
+            root = producer.root if producer else origin
+            if root is None:
+                yield (
+                    _place(service, role),
+                    f"'{origin}' is not made for each topic of an input; 'each' needs an input "
+                    "that is",
+                )
+                return
+    roots: tuple[str, ...] = ()
+    if service.scope == "topic":
+        roots = (str(root),)
+        for role, others in made_from.items():
+            if others and root not in others:
+                yield (
+                    _place(service, role),
+                    f"'{service.inputs[role]}' is of other topics than '{root}', which the service "
+                    "runs for; read it in a service that runs for the application or the node",
+                )
+    elif service.at_source:
+        roots = tuple(sorted({one for of in made_from.values() for one in of}))
+        if not roots:
+            yield (
+                f"uses.{name}",
+                "runs at the sources of its inputs, but none of them has a source; bind one to an "
+                "input of the application",
+            )
+    services[name] = service.model_copy(update={"root": root, "roots": roots})

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from demandops import naming
-from demandops.config.appdef import ApplicationDefinition, Service
+from demandops.config.appdef import ApplicationDefinition, Service, ServiceDefinition, Services
 from demandops.config.inventory import Broker, Cluster, Node
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
@@ -31,6 +31,7 @@ CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", 
 class Config:
     """What can run, where, and from which charts and images.
 
+    ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
     ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
     override; :class:`demandops.ledger.world.World` knows which of them have ended.
     """
@@ -43,6 +44,8 @@ class Config:
     charts: Mapping[str, Chart]
     images: Mapping[str, Image]
     appdefs: Mapping[str, ApplicationDefinition]
+    definitions: Mapping[str, ServiceDefinition]
+    services: Mapping[str, Services]
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
@@ -51,6 +54,8 @@ class Config:
         init=False, compare=False, repr=False
     )
     """The nodes by what their id becomes in names of topics, which several may share."""
+    roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    """The roles of which a service of any appdef runs once for each topic, sorted."""
 
     def __post_init__(self) -> None:
         """Set what follows from the other fields."""
@@ -59,6 +64,9 @@ class Config:
             part = naming.topic_part(id)
             found[part] = (*found.get(part, ()), id)
         object.__setattr__(self, "nodes_by_topic_part", found)
+        services = (one for services in self.services.values() for one in services.values())
+        roles = tuple(sorted({one.root for one in services if one.root}))
+        object.__setattr__(self, "roles_with_services", roles)
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.
@@ -86,9 +94,17 @@ class Config:
 
     def versions_of(self, appdef: str) -> list[str]:
         """Return the channels and versions that a demand for this appdef may request."""
-        charts = {service.chart for service in self.appdefs[appdef].services.values()}
+        charts = {service.chart for service in self.services[appdef].values()}
         return sorted({known for chart in charts for known in self.charts[chart].versions()})
 
-    def values_template(self, appdef: str, service: Service) -> str:
+    def parameters_of(self, appdef: str) -> set[str]:
+        """Return the parameters that a demand for this appdef may set."""
+        services = self.services[appdef].values()
+        return {
+            *self.appdefs[appdef].parameters,
+            *(name for s in services for name in s.parameters),
+        }
+
+    def values_template(self, service: Service) -> str:
         """Return the path of the template of a service's Helm values."""
-        return f"appdefs/{appdef}/{service.values}"
+        return f"appdefs/{service.folder}/{service.values}"

@@ -5,8 +5,10 @@ They run when all files are parsed. Every check runs, and the reader collects al
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from demandops import strict_yaml
-from demandops.config.appdef import Service
+from demandops.config.appdef import Deployed, ServiceDefinition
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -31,6 +33,7 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
         _check_namespaces,
         _check_charts,
         _check_services,
+        _check_uses,
         _check_wire_types,
         _check_connection_types,
         _check_overrides,
@@ -107,39 +110,62 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
 
 
 def _check_services(config: Config, reader: ConfigReader) -> None:
-    prefixes: dict[str, tuple[str, str, Service]] = {}
+    prefixes: dict[str, tuple[str, str]] = {}
+    files: dict[str, str] = {}
     words = {known.word for known in connection_types.CONNECTION_TYPES}
-    for appdef in config.appdefs.values():
-        file = f"appdefs/{appdef.name}/appdef.yaml"
-        for name, service in appdef.services.items():
-            where = f"services.{name}"
-            reader.check_reference(file, f"{where}.chart", service.chart, CHARTS_FILE)
-            for image in service.images:
-                reader.check_reference(file, f"{where}.images", image, IMAGES_FILE)
-            if config.values_template(appdef.name, service) not in config.files:
-                message = f"'{service.values}' does not exist; add it beside appdef.yaml"
-                reader.add_fault(file, f"{where}.values", message)
-            if service.prefix in words:
-                message = f"'{service.prefix}' is the prefix of connections; choose another"
-                reader.add_fault(file, f"{where}.prefix", message)
-                continue
-            other = prefixes.setdefault(service.prefix, (appdef.name, name, service))
-            if other[2] is not service and not _same(config, other, (appdef.name, name, service)):
+    for file, where, name, service in _defined_services(config):
+        folder, _, own = file.rpartition("/")
+        reader.check_reference(file, f"{where}chart", service.chart, CHARTS_FILE)
+        for image in service.images:
+            reader.check_reference(file, f"{where}images", image, IMAGES_FILE)
+        if f"{folder}/{service.values}" not in config.files:
+            message = f"'{service.values}' does not exist; add it beside {own}"
+            reader.add_fault(file, f"{where}values", message)
+        if service.prefix in words:
+            message = f"'{service.prefix}' is the prefix of connections; choose another"
+            reader.add_fault(file, f"{where}prefix", message)
+            continue
+        if service.each or isinstance(service, ServiceDefinition):
+            other = files.setdefault(name, file)
+            if other != file:
                 reader.add_fault(
                     file,
-                    f"{where}.prefix",
-                    f"'{service.prefix}' is used by '{other[1]}' already; choose another (only "
-                    "identical services with 'each' may share a prefix)",
+                    where.rstrip("."),
+                    f"'{name}' is defined in {other} too; choose another name, or define it once "
+                    f"in appdefs/{name}/service.yaml and use it in both",
                 )
+                continue
+        known = prefixes.setdefault(service.prefix, (file, name))
+        if known != (file, name):
+            message = f"'{service.prefix}' is used by '{known[1]}' already; choose another"
+            reader.add_fault(file, f"{where}prefix", message)
 
 
-def _same(config: Config, one: tuple[str, str, Service], other: tuple[str, str, Service]) -> bool:
-    """Return whether two appdefs define the same shared service."""
-    texts = [
-        config.files.get(config.values_template(appdef, service))
-        for appdef, _, service in (one, other)
-    ]
-    return bool(one[2].each) and one[1:] == other[1:] and texts[0] == texts[1]
+def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
+    """Yield file, place, name and definition of each service that is defined."""
+    for appdef in config.appdefs.values():
+        for name, service in appdef.services.items():
+            yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
+    for name, definition in config.definitions.items():
+        yield f"appdefs/{name}/service.yaml", "", name, definition
+
+
+def _check_uses(config: Config, reader: ConfigReader) -> None:
+    """Add a fault if appdefs have a shared service run for topics of different origins."""
+    origins: dict[str, tuple[str, str]] = {}
+    for appdef, services in config.services.items():
+        for name, service in services.items():
+            if not service.shared or service.each is None:
+                continue
+            origin = service.inputs[service.each]
+            first, other = origins.setdefault(name, (appdef, origin))
+            if origin != other:
+                reader.add_fault(
+                    f"appdefs/{appdef}/appdef.yaml",
+                    f"uses.{name}.{service.each}",
+                    f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; one service "
+                    "runs for both, so name them alike",
+                )
 
 
 def _check_connection_types(config: Config, reader: ConfigReader) -> None:
@@ -195,10 +221,10 @@ def _versions_for(override: Override, config: Config) -> set[str]:
     """Return the versions and channels of every chart that an override selects."""
     charts = {
         service.chart
-        for appdef in config.appdefs.values()
-        for name, service in appdef.services.items()
+        for appdef, services in config.services.items()
+        for name, service in services.items()
         for selector in override.select
-        if selector.takes(name, appdef.name)
+        if selector.takes(name, appdef)
     }
     return {
         known for chart in charts & {*config.charts} for known in config.charts[chart].versions()

@@ -8,8 +8,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TypeVar
 
-from demandops.config.appdef import ApplicationDefinition
+from demandops.config.appdef import (
+    ApplicationDefinition,
+    ServiceDefinition,
+    Services,
+    resolved_services,
+)
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -36,6 +42,8 @@ from demandops.config.registry import (
 from demandops.config.repo_settings import ROOT_FILE, Flux, RepoSettings
 from demandops.errors import InvalidInput
 from demandops.settings import API_VERSION, RENDER_VERSION
+
+Definition = TypeVar("Definition", ApplicationDefinition, ServiceDefinition)
 
 _NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
 _ANY = RepoSettings(
@@ -74,6 +82,9 @@ def load(files: Mapping[str, str]) -> Config:
         )
     nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
     domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
+    appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
+    definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
+    services = {name: _resolve(appdef, definitions, reader) for name, appdef in appdefs.items()}
     config = Config(
         repo_settings=repository or _ANY,
         clusters=reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
@@ -83,7 +94,9 @@ def load(files: Mapping[str, str]) -> Config:
         charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
         images=_read_images(reader),
         clients=_read_clients(reader),
-        appdefs=_read_appdefs(reader),
+        appdefs=appdefs,
+        definitions=definitions,
+        services=MappingProxyType(services),
         domain_of=_domains_of_nodes(reader, nodes, domains),
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reader),
@@ -107,22 +120,40 @@ def _read_clients(reader: ConfigReader) -> ClientsFile:
     return found or DEFAULT_SETTINGS
 
 
-def _read_appdefs(reader: ConfigReader) -> Mapping[str, ApplicationDefinition]:
-    appdefs = {}
+def _read_definitions(
+    reader: ConfigReader, file: str, model: type[Definition]
+) -> Mapping[str, Definition]:
+    """Return the definitions in the files of this name, one in each folder of ``appdefs/``."""
+    found = {}
     for path in sorted(reader.files):
         parts = path.split("/")
-        if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != "appdef.yaml":
+        if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != file:
             continue
-        appdef = reader.read_file(path, ApplicationDefinition)
-        if appdef is None:
+        one = reader.read_file(path, model)
+        if one is None:
             continue
-        if appdef.name != parts[1]:
+        if one.name != parts[1]:
             reader.add_fault(
-                path, "name", f"is '{appdef.name}', but the folder is '{parts[1]}'; make them equal"
+                path, "name", f"is '{one.name}', but the folder is '{parts[1]}'; make them equal"
             )
-            appdef = appdef.model_copy(update={"name": parts[1]})
-        appdefs[appdef.name] = appdef
-    return MappingProxyType(appdefs)
+            one = one.model_copy(update={"name": parts[1]})
+        found[one.name] = one
+    return MappingProxyType(found)
+
+
+def _resolve(
+    appdef: ApplicationDefinition,
+    definitions: Mapping[str, ServiceDefinition],
+    reader: ConfigReader,
+) -> Services:
+    """Return the services of an appdef; none if it, or a definition that it uses, is not valid."""
+    files = {f"appdefs/{name}/service.yaml" for name in appdef.uses.keys() - definitions.keys()}
+    if files & reader.files.keys():
+        return {}
+    services, problems = resolved_services(appdef, definitions)
+    for where, problem in problems:
+        reader.add_fault(f"appdefs/{appdef.name}/appdef.yaml", where, problem)
+    return services
 
 
 def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:

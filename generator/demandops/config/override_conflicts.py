@@ -12,7 +12,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import combinations
 
-from demandops.config.appdef import ApplicationDefinition
+from demandops.config.appdef import Services
 from demandops.config.config import Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.override import Override, Selector, by_rank
@@ -97,18 +97,18 @@ def _selects_services(selector: Selector) -> bool:
 def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
     """Yield the fields for which a release that both may match has a single value."""
     yield from ("services", "nodes")
-    if not any(_shared(one, other, appdef) for appdef in config.appdefs.values()):
+    if not any(_shared(one, other, services) for services in config.services.values()):
         yield from ("applications", "appdefs")
     if not any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES):
         yield "connections"
 
 
-def _shared(one: Selector, other: Selector, appdef: ApplicationDefinition) -> bool:
-    """Return whether both may match a shared service of an appdef."""
+def _shared(one: Selector, other: Selector, services: Services) -> bool:
+    """Return whether both may match one of these services that applications share."""
     return any(
-        service.each is not None
+        service.scope != "application"
         and all(not s.services or matches(name, s.services) for s in (one, other))
-        for name, service in appdef.services.items()
+        for name, service in services.items()
     )
 
 

@@ -125,9 +125,10 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
         if role not in appdef.inputs and topics:
             message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
             yield fault(f"inputs.{role}", message)
+    parameters = config.parameters_of(appdef.name) if app.parameters else set()
     for name in app.parameters:
-        if name not in appdef.parameters:
-            known = suggestion(name, appdef.parameters)
+        if name not in parameters:
+            known = suggestion(name, parameters)
             yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{known}")
     versions = config.versions_of(appdef.name)
     if app.version and app.version not in versions:

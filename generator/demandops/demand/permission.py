@@ -55,10 +55,9 @@ def needed_access(
 
 def _service_nodes(app: Application, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run: its node, and sources."""
-    appdef = config.appdefs.get(app.appdef)
-    services = appdef.services.values() if appdef else ()
-    roles = [service.each for service in services if service.placement == "source"]
-    return app.node, *(topic.source for role in roles for topic in app.inputs.get(str(role), ()))
+    services = config.services.get(app.appdef, {}).values()
+    roles = {role for one in services if one.at_source for role in one.roots}
+    return app.node, *(one.source for role in sorted(roles) for one in app.inputs.get(role, ()))
 
 
 def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:

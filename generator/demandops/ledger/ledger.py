@@ -200,6 +200,10 @@ class Ledger:
         """Return how many claims a requester has."""
         return len(self.index.get(("requester", requester)) or ())
 
+    def claims_at(self, node: str) -> tuple[Claim, ...]:
+        """Return the claims on applications that run on a node or have an input from it, sorted."""
+        return self._claims("node", node)
+
     def applications_at(self, node: str) -> tuple[str, ...]:
         """Return the applications that run on a node or have an input from it, sorted."""
         return self._ids("node", node)

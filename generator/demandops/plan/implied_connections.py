@@ -1,4 +1,4 @@
-"""Connections that a demand needs for inputs from other nodes, but does not list.
+"""Connections that a demand needs for its services' inputs from other nodes, but does not list.
 
 The demand claims such a connection as if it had listed it. So the connection is shared with other
 demands, changes when the application moves, and is released with the demand.
@@ -7,7 +7,7 @@ demands, changes when the application moves, and is released with the demand.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
 
@@ -15,12 +15,11 @@ from demandops.config.config import Config
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named
 from demandops.connections.route import Route
-from demandops.demand.application import Application, InputTopic
+from demandops.demand.application import Application
 from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Ledger
-from demandops.plan.output_topics import outputs
-from demandops.plan.release import ServiceKey
+from demandops.plan.flows import Flow, flows
 
 
 def _input_field(field: str, path: str) -> str:
@@ -29,10 +28,10 @@ def _input_field(field: str, path: str) -> str:
 
 
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request with a connection for each input that no listed connection brings.
+    """Return the request with a connection for each flow that no listed connection carries.
 
-    A connection that already brings the topic is joined. Otherwise the two nodes get a connection
-    of their own. A faulty input adds none; admission reports it.
+    A connection that already carries it is joined. Otherwise the two nodes get a connection of
+    their own. A faulty input adds none; admission reports it.
     """
     first: dict[_Ends, Demanded] = {}
     routes: dict[_Ends, dict[Route, None]] = {}
@@ -46,14 +45,11 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         app = one.held
         if not isinstance(app, Application) or one.connect == "none":
             continue
-        if app.appdef not in config.appdefs:
-            continue
-        for foreign in foreign_inputs(app, config):
-            topic = foreign.topic
-            if (app.node, topic.topic) in brought or not _is_valid(app, topic, config):
+        for flow in flows(config, app):
+            if (flow.receiver, flow.topic.topic) in brought or not _is_valid(flow, config):
                 continue
-            needed = _connection(app, one.connect, topic, ledger)
-            place = partial(_input_field, one.place(foreign.field))
+            needed = _connection(flow, one.connect, ledger)
+            place = partial(_input_field, one.place(_field(app, flow)))
             ends = (needed.id, *needed.nodes)
             first.setdefault(ends, replace(one, held=needed, place=place, connect="none"))
             routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
@@ -76,60 +72,32 @@ def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
     return replace(one, held=replace(one.held, topics=tuple(dict.fromkeys(topics))))
 
 
-def _is_valid(app: Application, topic: InputTopic, config: Config) -> bool:
-    return {app.node, topic.source} <= config.domain_of.keys() and not topic_problem(topic.topic)
+def _is_valid(flow: Flow, config: Config) -> bool:
+    return {flow.sender, flow.receiver} <= config.domain_of.keys() and not topic_problem(
+        flow.topic.topic
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class ForeignInput:
-    """A topic of another node that an application needs at its own.
-
-    ``name`` is the role, or ``<service>.<output>`` if a service at the other node makes the topic.
-    ``field`` is the application's field that lists the original topic.
-    """
-
-    name: str
-    topic: InputTopic
-    field: str
+def _field(app: Application, flow: Flow) -> str:
+    """Return the field of an application that needs a flow."""
+    if not flow.root:
+        return "node"
+    role, topic, source = flow.root
+    listed = [one[:2] for one in app.inputs[role]]
+    return f"inputs.{role}[{listed.index((topic, source))}]"
 
 
-def foreign_inputs(app: Application, config: Config) -> list[ForeignInput]:
-    """Return the topics that must be carried to the application's node."""
-    appdef = config.appdefs[app.appdef]
-    needed = set()
-    for service in appdef.services.values():
-        if service.each is not None and service.placement == "application":
-            needed.add(service.each)
-        needed |= set(service.inputs.values())
-    found = []
-    for name in sorted(needed):
-        producer_name, _, output = name.partition(".")
-        producer = appdef.services[producer_name] if output else None
-        if producer is not None and producer.placement != "source":
-            continue
-        role = str(producer.each) if producer else name
-        for index, topic in enumerate(app.inputs.get(role, ())):
-            if topic.source == app.node:
-                continue
-            carried = topic
-            if producer is not None:
-                key = ServiceKey(
-                    producer_name, topic.source, source=topic.source, topic=topic.topic
-                )
-                names = outputs(config, producer, key, further=topic.further)
-                carried = InputTopic(names[output], topic.source)
-            found.append(ForeignInput(name, carried, f"inputs.{role}[{index}]"))
-    return found
-
-
-def _connection(app: Application, type: str, topic: InputTopic, ledger: Ledger) -> Connection:
-    """Return the connection that brings a topic to an application, with only this topic."""
-    ends, name = (topic.source, app.node), topic.topic
-    for id in ledger.connections_bringing(app.node, name):
+def _connection(flow: Flow, type: str, ledger: Ledger) -> Connection:
+    """Return the connection that carries a flow, with only its topic."""
+    name, ends = flow.topic.topic, (flow.sender, flow.receiver)
+    for id in ledger.connections_bringing(flow.receiver, name):
         for claim in ledger.connection_claims(id):
             known, route = claim.connection, claim.connection.route(name)
-            if known.nodes == ends and route is not None and not route.reverse:
-                return Connection(id, known.type, *ends, "", (route,))
+            if route is None or route.source != route.target:
+                continue
+            if route.sender_and_receiver(*known.nodes) == ends:
+                return Connection(id, known.type, *known.nodes, "", (route,))
     kind = None if type == "auto" else type_named(type)
-    id = f"derived/{topic.source}/{app.node}"
-    return Connection(id, kind, *ends, "", (Route(name, name),))
+    return Connection(
+        f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (Route(name, name),)
+    )

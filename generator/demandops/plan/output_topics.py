@@ -1,9 +1,10 @@
 """The topics that services publish, named as the reference names them.
 
-``{instance}`` in a pattern of an appdef is the application, or the source of a service with
-``each``. A source has one usual topic for an input: the one in its inventory entry, else the first
-that a demand booked. Only names for its further topics contain the topic as well. The claims record
-which topics are further ones, so a name stays the same while anybody demands the topic.
+``{instance}`` in a pattern is the application or the node that a service runs for, or the source of
+a service with ``each``. A source has one usual topic for an input: the one in its inventory entry,
+else the first that a demand booked. Only names for its further topics contain the topic as well.
+The claims record which topics are further ones, so a name stays the same while anybody demands the
+topic.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ def outputs(
 
     ``further`` is that of the instance's input in the claims.
     """
-    if key.application is not None:
-        instance = naming.topic_part(key.application)
+    if service.root is None:
+        instance = naming.topic_part(key.application or key.node)
     else:
         input = InputTopic(str(key.topic), str(key.source), further=further)
-        instance = instance_of(config, str(service.each), input)
+        instance = instance_of(config, service.root, input)
     return {name: named(pattern, instance) for name, pattern in sorted(service.outputs.items())}
 
 
@@ -102,10 +103,8 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
 
 
 def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
-    """Yield the inputs of which a service runs once for each topic, with their roles."""
-    appdef = config.appdefs.get(app.appdef)
-    services = appdef.services.values() if appdef else ()
-    for role in sorted({service.each for service in services if service.each}):
+    """Yield the inputs of which any service runs once for each topic, with their roles."""
+    for role in config.roles_with_services:
         for topic in app.inputs.get(role, ()):
             yield role, topic
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from demandops import naming
-from demandops.config.appdef import ApplicationDefinition, Parameter, Scaling, Service
+from demandops.config.appdef import Parameter, Scaling, Service
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.config.registry import ChartSource
@@ -24,11 +24,12 @@ from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, requesters_of
 from demandops.errors import Refused
 from demandops.ledger.world import World
-from demandops.plan.output_topics import instance_of, named, outputs, usual_topic
+from demandops.plan.flows import made, roots_of
+from demandops.plan.output_topics import outputs, usual_topic
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey, appdef_of, claims_needing
+from demandops.plan.release_keys import ReleaseKey, claims_needing, services_of
 from demandops.subject import TopicKey
 
 
@@ -63,46 +64,42 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     if not claims:
         return None
     apps = [claim.application for claim in claims]
-    first = world.ledger.application(apps[0].id) or apps[0]
-    appdef = appdef_of(config, first.appdef)
-    service = appdef.services[key.service]
+    service = services_of(config, _first(world, apps[0]).appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
-    inputs: dict[str, tuple[InputTopic, ...]]
-    if service.each is not None:
-        inputs = {service.each: (_shared_input(apps, service.each, key),)}
-    else:
-        inputs = _application_inputs(config, appdef, service, apps)
-    further = any(one.further for topics in inputs.values() for one in topics)
-    definitions: dict[str, Parameter] = {}
-    for name in sorted({app.appdef for app in apps}, reverse=True):
-        definitions |= appdef_of(config, name).parameters
+    parts = list(_parts(world, service, key, apps))
+    inputs = {role: _inputs(config, key, role, parts) for role in sorted(service.inputs)}
+    further = service.root is not None and parts[0].inputs[service.root][0].further
     return ServiceRelease(
         key=key,
         name=service_name(config, service, key),
         node=node,
         domain=domain,
-        appdef=min(
-            name
-            for name, known in config.appdefs.items()
-            if known.services.get(key.service) == service
-        ),
         service=service,
         chart=_chart(config, service, apps),
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
-        parameters=MappingProxyType(_merged_parameters(definitions, claims)),
+        parameters=MappingProxyType(_merged_parameters(service.parameters, claims)),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
         applications=tuple(dict.fromkeys(app.id for app in apps)),
         requesters=_requesters(claims, service, key),
     )
 
 
+def _first(world: World, app: Application) -> Application:
+    """Return an application as its first claim has it, which decides what and where it is."""
+    return world.ledger.application(app.id) or app
+
+
 def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
-    """Return who requests a service; for one topic, who still holds it."""
-    if service.each is None:
+    """Return who requests a service; if topics need it, who still holds one of them."""
+    if not service.roots:
         return requesters_of(claims)
-    topic = (service.each, str(key.topic), str(key.source))
-    return tuple(sorted({who for claim in claims for who in claim.holders(topic)}))
+    holders = (
+        claim.holders(topic)
+        for claim in claims
+        for topic in roots_of(claim.application, service, key)
+    )
+    return tuple(sorted({who for names in holders for who in names}))
 
 
 def _chart(config: Config, service: Service, apps: Iterable[Application]) -> ChartSource:
@@ -120,6 +117,28 @@ def _chart(config: Config, service: Service, apps: Iterable[Application]) -> Cha
     return next(iter(charts.values()))
 
 
+def _parts(
+    world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
+) -> Iterator[Application]:
+    """Yield of each application what an instance sees of it."""
+    by_id: dict[str, list[Application]] = {}
+    for app in apps:
+        by_id.setdefault(app.id, []).append(app)
+    shared = service.root and {service.root: (_shared_input(apps, service.root, key),)}
+    for same in by_id.values():
+        first = _first(world, same[0])
+        if shared:
+            yield first.with_inputs(shared)
+            if len(service.inputs) == 1:
+                return  # whatever application: it reads nothing else
+            continue
+        roles = service.roots or {role for app in same for role in app.inputs}
+        united = {role: {one for app in same for one in app.inputs.get(role, ())} for role in roles}
+        if service.roots:
+            united = {r: {one for one in of if one.source == key.node} for r, of in united.items()}
+        yield first.with_inputs({role: tuple(of) for role, of in united.items()})
+
+
 def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> InputTopic:
     source, topic = str(key.source), str(key.topic)
     found = [one for app in apps for one in app.inputs_from(role, source, topic)]
@@ -127,61 +146,54 @@ def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> In
     return InputTopic(topic, source, type, all(one.further for one in found))
 
 
-def _application_inputs(
-    config: Config, appdef: ApplicationDefinition, service: Service, apps: Iterable[Application]
-) -> dict[str, tuple[InputTopic, ...]]:
-    inputs: dict[str, tuple[InputTopic, ...]] = {}
-    for role, origin in sorted(service.inputs.items()):
-        producer_name, _, output = origin.partition(".")
-        if not output:
-            united = {one[:2]: one for one in sorted(_topics(apps, origin))}
-            inputs[role] = tuple(united.values())
-            continue
-        producer = appdef.services[producer_name]
-        pattern, each = producer.outputs[output], str(producer.each)
-        made = {
-            InputTopic(named(pattern, instance_of(config, each, one)), one.source)
-            for one in _topics(apps, each)
-        }
-        inputs[role] = tuple(sorted(made))
-    return inputs
+def _inputs(
+    config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
+) -> tuple[InputTopic, ...]:
+    """Return what an instance reads in a role, sorted; a known type replaces a missing one."""
+    found: set[InputTopic] = set()
+    for part in parts:
+        origin = _origin(config, key, role, part)
+        if "." in origin:
+            found.update(one.topic for one in made(config, part, origin))
+        else:
+            found.update(part.inputs.get(origin, ()))
+    return tuple({one[:2]: one for one in sorted(found)}.values())
+
+
+def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str:
+    return services_of(config, app.appdef)[key.service].inputs[role]
 
 
 def demanded_inputs(
     config: Config, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield role, topic and key of each input that an application gives a service."""
+    """Yield role and topic of each input that an application gives a service, and its root.
+
+    The root is the demanded topic that the input is or is made from; it may be empty.
+    """
     service, key = release.service, release.key
-    if service.each is not None:
-        for one in app.inputs_from(service.each, str(key.source), str(key.topic)):
-            yield service.each, one.topic, (service.each, one.topic, one.source)
-        return
-    services = appdef_of(config, app.appdef).services
-    for role, origin in service.inputs.items():
-        producer, _, output = origin.partition(".")
-        each = str(services[producer].each) if output else origin
-        for one in app.inputs.get(each, ()):
-            topic = one.topic
-            if output:
-                pattern = services[producer].outputs[output]
-                topic = named(pattern, instance_of(config, each, one))
-            yield role, topic, (each, one.topic, one.source)
-
-
-def _topics(apps: Iterable[Application], role: str) -> set[InputTopic]:
-    return {one for app in apps for one in app.inputs.get(role, ())}
+    if service.roots:
+        kept = {*roots_of(app, service, key)}
+        left = {
+            role: tuple(one for one in of if (role, one.topic, one.source) in kept)
+            for role, of in app.inputs.items()
+        }
+        app = app.with_inputs(left)
+    for role in service.inputs:
+        for one in made(config, app, _origin(config, key, role, app)):
+            yield role, one.topic.topic, one.root
 
 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     """Return the release name of a service instance.
 
-    The name leaves out a source's usual topic (``topics`` of its inventory entry):
+    For a topic, the name leaves out a source's usual topic (``topics`` of its inventory entry):
     ``od-edge-vehicle00``. For other topics it has a slug of the topic.
     """
-    if key.application is not None:
-        return naming.object_name(service.prefix, key.application)
+    if service.root is None:
+        return naming.object_name(service.prefix, key.application or key.node)
     source, topic = str(key.source), str(key.topic)
-    if topic == usual_topic(config, source, str(service.each)):
+    if topic == usual_topic(config, source, service.root):
         return naming.object_name(service.prefix, key.node, source)
     return naming.object_name(service.prefix, key.node, source, topic)
 

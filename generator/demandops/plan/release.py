@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from demandops.config.appdef import Service
+from demandops.config.appdef import Scope, Service
 from demandops.config.config import CHARTS_FILE, Config
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
@@ -22,7 +22,8 @@ class ServiceKey:
     """One instance of a service.
 
     ``application`` is set if the service runs once for each application. ``source`` and ``topic``
-    are set if it runs once for each topic; all applications that use the topic share it.
+    are set if it runs once for each topic. All applications that use the topic, or without either
+    the node, share it.
     """
 
     service: str
@@ -30,6 +31,13 @@ class ServiceKey:
     application: str | None = None
     source: str | None = None
     topic: str | None = None
+
+    @property
+    def scope(self) -> Scope:
+        """What it is one instance for."""
+        if self.application is not None:
+            return "application"
+        return "node" if self.source is None else "topic"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +48,6 @@ class ServiceRelease:
     name: str
     node: Node
     domain: AccessDomain
-    appdef: str
     service: Service
     chart: ChartSource
     inputs: Mapping[str, tuple[InputTopic, ...]]
@@ -59,7 +66,8 @@ class ServiceRelease:
     @property
     def description(self) -> str:
         """Its description in commit messages."""
-        return f"{self.key.service} on {self.node.id} for {self.key.source or self.key.application}"
+        for_whom = self.key.source or self.key.application
+        return f"{self.key.service} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
 
     def facts(self) -> list[str]:
         """Return the service's properties as lines; commit messages show the changed ones."""
@@ -71,9 +79,10 @@ class ServiceRelease:
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
         """Yield (file, entry, what it decides) for each configuration entry that shapes it."""
-        folder = f"appdefs/{self.appdef}"
-        yield f"{folder}/appdef.yaml", f"services.{self.key.service}", "what it is"
-        yield config.values_template(self.appdef, self.service), "", "its Helm values"
+        folder = f"appdefs/{self.service.folder}"
+        entry = "" if self.service.shared else f"services.{self.key.service}"
+        yield self.service.file, entry, "what it is"
+        yield config.values_template(self.service), "", "its Helm values"
         chart, name = self.chart, self.service.chart
         where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
         yield CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from demandops.config.appdef import ApplicationDefinition
+from demandops.config.appdef import Service, Services
 from demandops.config.config import Config
 from demandops.connections.connection_type import ClientKey
 from demandops.demand.application import Application
@@ -17,6 +17,7 @@ from demandops.demand.claim import Claim
 from demandops.errors import Refused
 from demandops.ledger.ledger import ClaimChange, Ledger
 from demandops.ledger.world import World
+from demandops.plan.flows import instances, node_of, roots_of
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import ServiceKey
 from demandops.subject import Subject, SubjectKind
@@ -58,56 +59,57 @@ def _client_keys(world: World, claim: Claim) -> Iterable[ClientKey]:
 def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceKey]:
     app = claim.application
     first = world.ledger.application(app.id) or app
-    known = strict or first.appdef in world.config.appdefs
-    appdef = appdef_of(world.config, first.appdef) if known else None
-    for name, service in (appdef.services if appdef else {}).items():
-        if service.each is None:
-            yield ServiceKey(name, first.node, application=app.id)
-            continue
-        for topic in app.inputs.get(service.each, ()):
-            node = topic.source if service.placement == "source" else first.node
-            yield ServiceKey(name, node, source=topic.source, topic=topic.topic)
+    known = strict or first.appdef in world.config.services
+    app = app if app.node == first.node else replace(app, node=first.node)
+    for service in services_of(world.config, first.appdef).values() if known else ():
+        yield from instances(app, service)
 
 
 def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
     """Return the claims that need a service instance, by application and demand."""
+    ledger = world.ledger
     if key.application is not None:
-        needed = _role(world, key.application, key) is not None
-        return world.ledger.application_claims(key.application) if needed else ()
-    source, topic = str(key.source), str(key.topic)
-    claims = world.ledger.claims_taking(source, topic)
-    roles = {name: _role(world, name, key) for name in {one.subject.id for one in claims}}
+        needed = _service(world, key.application, key) is not None
+        return ledger.application_claims(key.application) if needed else ()
+    topic = (str(key.source), str(key.topic))
+    claims = ledger.claims_at(key.node) if key.scope == "node" else ledger.claims_taking(*topic)
+    services = {id: _service(world, id, key) for id in {one.subject.id for one in claims}}
     return tuple(
         one
         for one in claims
-        if one.application.inputs_from(roles[one.subject.id] or "", source, topic)
+        if (service := services[one.subject.id]) and takes(one.application, service, key)
     )
 
 
 def is_needed(world: World, key: ServiceKey) -> bool:
     """Return whether a claim needs a service instance."""
     if key.application is not None:
-        return _role(world, key.application, key) is not None
-    source, topic = str(key.source), str(key.topic)
+        return _service(world, key.application, key) is not None
+    if key.scope == "node":
+        return bool(claims_needing(world, key))
     return any(
-        one.application.inputs_from(_role(world, one.subject.id, key) or "", source, topic)
-        for one in world.ledger.each_taking(source, topic)
+        service is not None and takes(one.application, service, key)
+        for one in world.ledger.each_taking(str(key.source), str(key.topic))
+        for service in (_service(world, one.subject.id, key),)
     )
 
 
-def _role(world: World, application: str, key: ServiceKey) -> str | None:
-    """Return the role that gives a service one instance for each of its inputs.
+def takes(app: Application, service: Service, key: ServiceKey) -> bool:
+    """Return whether an application with this service needs this instance of it."""
+    return not service.roots or bool(roots_of(app, service, key))
 
-    The role is empty if the application has one instance. ``None`` means that ``key`` is
-    not a service of the application, for example because it moved or changed its definition.
+
+def _service(world: World, application: str, key: ServiceKey) -> Service | None:
+    """Return the service of an application that may have ``key`` as an instance.
+
+    ``None``, for example, if it moved or changed its definition.
     """
     first = world.ledger.application(application)
-    appdef = world.config.appdefs.get(first.appdef) if first else None
-    service = appdef.services.get(key.service) if appdef else None
-    if first is None or service is None or (service.each is None) is (key.application is None):
+    services = world.config.services.get(first.appdef, {}) if first else {}
+    service = services.get(key.service)
+    if first is None or service is None or service.scope != key.scope:
         return None
-    node = key.source if service.placement == "source" else first.node
-    return service.each or "" if node == key.node else None
+    return service if node_of(first, service, key.source or key.node) == key.node else None
 
 
 def affected_keys(
@@ -175,15 +177,15 @@ def all_keys(world: World) -> tuple[ReleaseKey, ...]:
     return tuple(dict.fromkeys(keys))
 
 
-def appdef_of(config: Config, name: str) -> ApplicationDefinition:
-    """Return an application definition by name.
+def services_of(config: Config, name: str) -> Services:
+    """Return the services of an application definition.
 
     Raises:
         Refused: if the state repo has none.
     """
-    appdef = config.appdefs.get(name)
-    if appdef is None:
+    services = config.services.get(name)
+    if services is None:
         message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"
         file = f"appdefs/{name}/appdef.yaml"
         raise Refused.at("appdef", message, code="unknown-application", file=file)
-    return appdef
+    return services

@@ -1,7 +1,7 @@
 """The Helm values of a service: its appdef's template, rendered and checked against the chart.
 
 The variables that the template gets are the interface of application definitions
-(docs/applications.md). Requesters are not among them.
+(docs/appdef.md). Requesters are not among them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
         InvalidInput: if the template fails, or the values do not match the chart's schema; it
             names the template or the override.
     """
-    template = config.values_template(release.appdef, release.service)
+    template = config.values_template(release.service)
     try:
         values = engine.data(template, **_context(release, config))
         check_values(values, release.chart, config, template)
@@ -69,7 +69,9 @@ def _context(release: ServiceRelease, config: Config) -> dict[str, object]:
     }
     if release.key.application is not None:
         return context | {"application": release.key.application}
-    return context | {"source": release.key.source, "source_topic": release.key.topic}
+    if release.key.source is not None:
+        context |= {"source": release.key.source, "source_topic": release.key.topic}
+    return context
 
 
 def _node(node: Node) -> dict[str, object]:

@@ -56,14 +56,45 @@ def second_definition(*edits: tuple[str, str]) -> dict[str, str]:
 
 
 URL = "https://git.example/state.git"
-TEMPLATE = "appdefs/copy/values/object-detection.yaml.j2"
-SHARED = second_definition(
+TWICE = second_definition(
     ("name: object-detection-fusion", "name: copy"),
     ("type: 1\n", "type: 2\n"),
     ("prefix: of", "prefix: cp"),
     ("object-fusion:\n", "copy-fusion:\n"),
 )
-"""A second application that shares its detections with the first."""
+"""A second application that defines the detection of the first again."""
+SERVICE = "appdefs/driver/service.yaml"
+
+
+def shared(
+    *edits: tuple[str, str],
+    uses: str = "{cloud: point_cloud}",
+    more: Mapping[str, str] | None = None,
+) -> dict[str, str]:
+    """Return a shared service that the application uses, with texts of its definition replaced."""
+    definition = """
+apiVersion: demandops/v1
+kind: ServiceDefinition
+name: driver
+scope: topic
+prefix: drv
+inputs: {cloud: {}}
+each: cloud
+placement: source
+outputs: {points: "/{instance}/points"}
+chart: object-detection
+values: values/driver.yaml.j2
+"""
+    for old, new in edits:
+        assert old in definition
+        definition = definition.replace(old, new)
+    return {
+        **edited(APPDEF, "services:\n", f"uses:\n  driver: {uses}\nservices:\n"),
+        SERVICE: definition,
+        "appdefs/driver/values/driver.yaml.j2": "{}\n",
+        **(more or {}),
+    }
+
 
 _EDITS: dict[str, tuple[str, str, str]] = {
     # what any file can get wrong
@@ -138,8 +169,26 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "an MQTT client that is missing": (IMAGES, "  mqtt-client:", "  mqtt-clint:"),
     # appdefs/*/appdef.yaml
     "an input that does not exist": (APPDEF, "each: point_cloud", "each: point_clod"),
-    "both each and inputs": (
+    "an input of other topics than each": (
         APPDEF, "each: point_cloud\n", "each: point_cloud\n    inputs: {ego_data: ego_data}\n",
+    ),
+    "each of what is made once": (
+        APPDEF,
+        "services:\n",
+        "services:\n  planner:\n    prefix: pl\n    each: lists\n"
+        "    inputs: {lists: object-fusion.fused_objects}\n"
+        "    chart: object-fusion\n    values: values/object-fusion.yaml.j2\n",
+    ),
+    "services in a circle": (
+        APPDEF,
+        "each: point_cloud\n",
+        "each: point_cloud\n    inputs: {all: object-fusion.raw_objects}\n",
+    ),
+    "an input from a service that does not exist": (
+        APPDEF, "object-detection.object_list", "object-detektion.object_list",
+    ),
+    "a shared service that does not exist": (
+        APPDEF, "services:\n", "uses:\n  lidar-driver: {cloud: point_cloud}\nservices:\n",
     ),
     "a source for an application": (APPDEF, "prefix: of\n", "prefix: of\n    placement: source\n"),
     "an output that does not exist": (
@@ -226,7 +275,48 @@ MISTAKES: dict[str, Mapping[str, str | None]] = {
     "two definitions for one type": second_definition(
         ("name: object-detection-fusion", "name: copy")
     ),
-    "a shared service with two templates": SHARED | {TEMPLATE: SHARED[TEMPLATE] + "replicas: 5\n"},
+    "a service in two definitions": TWICE,
+    "an application without services": {
+        "appdefs/copy/appdef.yaml": "apiVersion: demandops/v1\nkind: ApplicationDefinition\n"
+        "name: copy\ninputs: {cloud: {}}\n"
+    },
+    "a shared service that the application defines too": shared(
+        more=edited(APPDEF, "services:\n", "uses:\n  object-fusion: {}\nservices:\n")
+    ),
+    "an input of a shared service that nobody names": shared(uses="{}"),
+    "an input that the shared service does not have": shared(
+        uses="{cloud: point_cloud, ego: ego_data}"
+    ),
+    "a shared service for each topic of nothing": shared(("each: cloud\n", "")),
+    "a shared service for each topic of an unknown input": shared(("each: cloud", "each: clouds")),
+    "a shared service at the source of an application": shared(
+        ("each: cloud\n", ""), ("scope: topic", "scope: application")
+    ),
+    "a shared service for a cluster": shared(("scope: topic", "scope: cluster")),
+    "a shared service at the sources of nothing": shared(
+        ("each: cloud\n", ""),
+        ("scope: topic", "scope: node"),
+        uses="{cloud: object-fusion.raw_objects}",
+    ),
+    "a service at the source that reads what several nodes make": shared(
+        ("inputs: {cloud: {}}", "inputs: {cloud: {}, lists: {}}"),
+        uses="{cloud: point_cloud, lists: object-detection.object_list}",
+    ),
+    "a shared service with the prefix of another": shared(("prefix: drv", "prefix: od")),
+    "a shared service without its template": shared(("values/driver", "values/drive")),
+    "a shared service that is not named like its folder": shared(("name: driver", "name: drive")),
+    "a shared service for topics of two inputs": shared(
+        more={
+            "appdefs/copy/appdef.yaml": """
+apiVersion: demandops/v1
+kind: ApplicationDefinition
+name: copy
+inputs: {cloud: {}}
+uses:
+  driver: {cloud: cloud}
+"""
+        }
+    ),
 }
 """What a configuration is refused for, as the files that are other than the skeleton's."""
 
@@ -263,7 +353,8 @@ def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
         {"README.md": "x", "appdefs/notes.txt": "x", "inventory/README.md": "x"},
         argocd(url=URL),
         {ROOT: f"{skeleton()[ROOT]}argocd:\n  url: {URL}\n"},
-        SHARED,
+        shared(),
+        shared(("each: cloud\n", ""), ("scope: topic", "scope: node")),
     ],
 )
 def test_what_is_odd_but_works(changed: dict[str, str]) -> None:

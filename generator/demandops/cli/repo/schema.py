@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from demandops.cli.output import console
 from demandops.cluster.access import AccessFile
-from demandops.config.appdef import ApplicationDefinition
+from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
@@ -35,6 +35,7 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "nodes": (NodesFile, "inventory/nodes.yaml"),
     "override": (OverrideFile, "overrides/<name>.yaml"),
     "reference-map": (ReferenceMap, "the file of `demandops import --map`"),
+    "service": (ServiceDefinition, "appdefs/<name>/service.yaml"),
     "state-repo": (RepoSettings, "demandops.yaml"),
 }
 

@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Iterator
 from itertools import islice
 
+from demandops import naming
 from demandops.config.appdef import Service
 from demandops.config.config import NODES_FILE
 from demandops.demand.application import Application
@@ -52,12 +53,12 @@ def faults(
 def _service(world: World, key: ServiceKey) -> Iterator[Service]:
     """Yield the service of a key, if it must run."""
     for claim in claims_needing(world, key)[:1]:
-        yield world.config.appdefs[claim.application.appdef].services[key.service]
+        yield world.config.services[claim.application.appdef][key.service]
 
 
 def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
-    input = (str(service.each), str(key.source), str(key.topic))
-    booked = world.ledger.booked_input(*input) if service.each else None
+    input = (str(service.root), str(key.source), str(key.topic))
+    booked = world.ledger.booked_input(*input) if service.root else None
     return outputs(world.config, service, key, further=bool(booked and booked.further))
 
 
@@ -66,8 +67,8 @@ def _others(world: World, key: ServiceKey, topic: str) -> Iterator[ServiceKey]:
 
     An appdef's pattern says which instance of its service would, and the ledger whether it runs.
     """
-    for appdef in world.config.appdefs.values():
-        for name, service in appdef.services.items():
+    for services in world.config.services.values():
+        for name, service in services.items():
             for pattern in service.outputs.values():
                 first, *others = map(re.escape, pattern.split("{instance}"))
                 expression = first + "(.+)" + r"\1".join(others) if others else first
@@ -84,7 +85,11 @@ def _named(
     world: World, key: ServiceKey, name: str, service: Service, instance: str
 ) -> Iterator[ServiceKey]:
     """Yield the instances of a service on the node of ``key`` that are called ``instance``."""
-    ledger, config, role = world.ledger, world.config, service.each
+    ledger, config, role = world.ledger, world.config, service.root
+    if service.scope == "node":
+        if naming.topic_part(key.node) == instance:
+            yield ServiceKey(name, key.node)
+        return
     if role is None:
         for id in ledger.applications_in_topics(instance):
             yield ServiceKey(name, key.node, application=id)
@@ -107,15 +112,19 @@ def _all(world: World, key: ServiceKey) -> Iterator[ServiceKey]:
 def _words(key: ServiceKey) -> str:
     if key.application is not None:
         return f"application '{key.application}'"
+    if key.scope == "node":
+        return key.service
     return f"{key.service} for {key.topic} of '{key.source}'"
 
 
 def _remedy(key: ServiceKey, other: ServiceKey, service: Service) -> str:
     if key.application is not None:
         return "use another application id"
+    if "node" in (key.scope, other.scope):
+        return f"change this output in {service.file}"
     if key.source == other.source:
         return (
-            f"name the usual one of the two as topics.{service.each} of '{key.source}' in "
+            f"name the usual one of the two as topics.{service.root} of '{key.source}' in "
             f"{NODES_FILE}"
         )
     return f"give '{key.source}' another id in {NODES_FILE}"
@@ -128,7 +137,7 @@ def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
             continue
         if one.held.id == key.application:
             return one.place("id")
-        for index, topic in enumerate(one.held.inputs.get(str(service.each), ())):
+        for index, topic in enumerate(one.held.inputs.get(str(service.root), ())):
             if (topic.source, topic.topic) == (key.source, key.topic):
-                return one.place(f"inputs.{service.each}[{index}].topic")
+                return one.place(f"inputs.{service.root}[{index}].topic")
     return ""

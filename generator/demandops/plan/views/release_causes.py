@@ -12,7 +12,7 @@ from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release, ServiceRelease, claims_of
-from demandops.plan.release_keys import all_keys, keys_of
+from demandops.plan.release_keys import all_keys, keys_of, takes
 from demandops.subject import Subject
 
 
@@ -40,10 +40,9 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
 
 def _takes(claim: Claim, release: Release) -> bool:
     """Return whether a claim on an application needs this service of it."""
-    if not isinstance(release, ServiceRelease) or release.service.each is None:
+    if not isinstance(release, ServiceRelease):
         return True
-    topics = claim.application.inputs.get(release.service.each, ())
-    return any((t.source, t.topic) == (release.key.source, release.key.topic) for t in topics)
+    return takes(claim.application, release.service, release.key)
 
 
 def how_to_release(claim: Claim) -> str:

@@ -1,0 +1,128 @@
+"""The flow of topics through an application: what its services read, and where that is made.
+
+An instance of a service depends on one demanded topic, on those of one source, or on its
+application alone. So the flows of a demand follow from the demand itself, whatever others hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from demandops import naming
+from demandops.config.appdef import Service
+from demandops.config.config import Config
+from demandops.demand.application import Application, InputTopic
+from demandops.plan.output_topics import instance_of, named
+from demandops.plan.release import ServiceKey
+from demandops.subject import TopicKey
+
+
+class Made(NamedTuple):
+    """A topic that a service reads and the node where it is made.
+
+    ``root`` is the demanded topic that it is, or is made from; empty if the application has one.
+    """
+
+    topic: InputTopic
+    node: str
+    root: TopicKey = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """A topic that is made on one node and needed on another.
+
+    ``name`` is the role, or ``<service>.<output>``. ``root`` is the demanded topic that needs it.
+    """
+
+    name: str
+    topic: InputTopic
+    sender: str
+    receiver: str
+    root: TopicKey
+
+
+def node_of(app: Application, service: Service, source: str) -> str:
+    """Return the node of the instance that an application has of a service, for a source."""
+    return source if service.at_source else app.node
+
+
+def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
+    """Yield the instances of a service that an application needs."""
+    if service.scope == "application":
+        yield ServiceKey(service.name, app.node, application=app.id)
+    elif service.root is not None:
+        for topic in app.inputs.get(service.root, ()):
+            node = node_of(app, service, topic.source)
+            yield ServiceKey(service.name, node, source=topic.source, topic=topic.topic)
+    else:
+        for node, _ in _parts(app, service):
+            yield ServiceKey(service.name, node)
+
+
+def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
+    """Return the demanded topics of an application that need an instance of a service."""
+    if service.root is not None:
+        found = app.inputs_from(service.root, str(key.source), str(key.topic))
+        return [(service.root, one.topic, one.source) for one in found]
+    topics = ((role, one) for role in service.roots for one in app.inputs.get(role, ()))
+    return [(role, one.topic, one.source) for role, one in topics if one.source == key.node]
+
+
+def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
+    """Yield the topics of a role or of ``<service>.<output>`` that an application has."""
+    name, _, output = origin.partition(".")
+    if not output:
+        for one in app.inputs.get(origin, ()):
+            yield Made(one, one.source, (origin, one.topic, one.source))
+        return
+    producer = config.services[app.appdef][name]
+    pattern = producer.outputs[output]
+    if producer.root is not None:
+        role = producer.root
+        for one in app.inputs.get(role, ()):
+            topic = InputTopic(named(pattern, instance_of(config, role, one)), one.source)
+            yield Made(topic, node_of(app, producer, one.source), (role, one.topic, one.source))
+        return
+    if not producer.roots:
+        instance = app.id if producer.scope == "application" else app.node
+        topic = InputTopic(named(pattern, naming.topic_part(instance)), app.node)
+        yield Made(topic, node_of(app, producer, ""))
+        return
+    for role in producer.roots:
+        for one in app.inputs.get(role, ()):
+            topic = InputTopic(named(pattern, naming.topic_part(one.source)), one.source)
+            yield Made(topic, one.source, (role, one.topic, one.source))
+
+
+def flows(config: Config, app: Application) -> list[Flow]:
+    """Return what must be carried between nodes for an application, sorted by name."""
+    found: dict[tuple[str, str, str], Flow] = {}
+    for service in config.services.get(app.appdef, {}).values():
+        for node, part in _parts(app, service):
+            for origin in service.inputs.values():
+                for one in made(config, part, origin):
+                    if one.node != node:
+                        root = one.root or (next(part.topic_keys()) if service.roots else ())
+                        flow = Flow(origin, one.topic, one.node, node, root)
+                        found.setdefault((one.topic.topic, one.node, node), flow)
+    return sorted(found.values(), key=lambda flow: flow.name)
+
+
+def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
+    """Yield the node of each instance of a service, and the part of the application it sees."""
+    if service.root is not None:
+        for one in app.inputs.get(service.root, ()):
+            yield node_of(app, service, one.source), app.with_inputs({service.root: (one,)})
+    elif service.at_source:
+        by_source: dict[str, dict[str, tuple[InputTopic, ...]]] = {}
+        for role in service.roots:
+            for one in app.inputs.get(role, ()):
+                of = by_source.setdefault(one.source, {})
+                of[role] = (*of.get(role, ()), one)
+        for source, inputs in sorted(by_source.items()):
+            yield node_of(app, service, source), app.with_inputs(inputs)
+    else:
+        yield app.node, app

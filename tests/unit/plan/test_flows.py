@@ -1,0 +1,250 @@
+"""Whatever the services of applications read of each other: every topic comes in exactly one way.
+
+The configurations are made by chance: some services shared, some not, at any depth.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from random import Random
+from typing import Any, NamedTuple
+
+import yaml
+from demandops.decision import rendered_files
+from demandops.plan.planner import plan
+from demandops.plan.release import ServiceKey, ServiceRelease
+from demandops.plan.release_keys import all_keys
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.kit.chance import chances, examples
+from tests.kit.config import brokers, skeleton
+from tests.kit.memory import MemoryRepo, outcome
+
+ROLES = ("a", "b")
+TYPES = ("one", "two")
+SOURCES = ("vehicle00", "vehicle01", "edge")
+NODES = ("edge", "cloud", "vehicle01")
+
+
+class Origin(NamedTuple):
+    """A role, or an output of a service: the roles that it is made from, and where and how often.
+
+    ``kind`` is ``source`` if it is made where a topic comes from, ``topic`` if it is made for each
+    topic at the applications' nodes, ``once`` if an application or a node has one.
+    """
+
+    name: str
+    roots: frozenset[str]
+    kind: str
+
+
+class Graphs:
+    """Two types of applications of services that read each other, made by chance."""
+
+    def __init__(self, random: Random) -> None:
+        self.random = random
+        self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
+        self.files: dict[str, str | None] = {**brokers("edge")}
+        roles = [Origin(role, frozenset({role}), "source") for role in ROLES]
+        self._origins = {type: list(roles) for type in TYPES}
+        self._common = list(roles)
+        self._appdefs: dict[str, dict[str, Any]] = {
+            type: {"uses": {}, "services": {}} for type in TYPES
+        }
+        for number in range(random.randint(1, 5)):
+            if random.random() < 0.5:
+                self._share(f"s{number}")
+            else:
+                for type in TYPES:
+                    self._own(f"{type[0]}{number}", type)
+        for type, parts in self._appdefs.items():
+            if not parts["uses"] and not parts["services"]:
+                self._own(f"{type}-last", type)
+            head = {"apiVersion": "demandops/v1", "kind": "ApplicationDefinition", "name": type}
+            appdef = head | {"inputs": {role: {} for role in ROLES}} | parts
+            self.files[f"appdefs/{type}/appdef.yaml"] = yaml.safe_dump(appdef)
+        charts = yaml.safe_load(skeleton()["registry/charts.yaml"])
+        charts["charts"]["any"] = {"http": "https://charts.example", "version": "1.0.0"}
+        self.files["registry/charts.yaml"] = yaml.safe_dump(charts)
+
+    def _service(self, name: str, folder: str) -> dict[str, Any]:
+        self.files[f"appdefs/{folder}/values/any.j2"] = "inputs: {{ inputs }}\n"
+        outputs = {"out": f"/{{instance}}/{name.replace('-', '_')}"}
+        return {
+            "prefix": name.replace("-", ""), "outputs": outputs, "chart": "any",
+            "values": "values/any.j2",
+        }  # fmt: skip
+
+    def _readable(
+        self, origins: list[Origin], scope: str, at_source: bool, root: str
+    ) -> list[Origin]:
+        """Return what a service may read beside what it runs for."""
+        found = [one for one in origins if not (at_source and one.kind == "topic")]
+        if scope == "topic":
+            return [one for one in found if not one.roots or root in one.roots]
+        return found
+
+    def _chosen(self, origins: list[Origin], least: int = 0) -> list[Origin]:
+        count = min(len(origins), self.random.randint(least, 2))
+        return self.random.sample(origins, count)
+
+    def _output(self, name: str, scope: str, at_source: bool, roots: set[str]) -> Origin:
+        kind = "source" if at_source else "topic" if scope == "topic" else "once"
+        return Origin(f"{name}.out", frozenset(roots if kind != "once" else ()), kind)
+
+    def _add(self, type: str, name: str, scope: str, at_source: bool, read: list[Origin]) -> Origin:
+        """Note a service of a type; the first that it reads is what it runs for."""
+        if scope == "topic":
+            roots = {self._root(type, read[0])}
+        else:
+            roots = {root for one in read for root in one.roots} if at_source else set()
+        self.services[type][name] = {"scope": scope, "at_source": at_source, "roots": roots}
+        made = self._output(name, scope, at_source, roots)
+        self._origins[type].append(made)
+        return made
+
+    def _root(self, type: str, origin: Origin) -> str:
+        name = origin.name.partition(".")[0]
+        return next(iter(self.services[type][name]["roots"])) if "." in origin.name else origin.name
+
+    def _each(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
+        """Return something that a service may run for each of."""
+
+        def is_for_each(one: Origin) -> bool:
+            service = self.services[type].get(one.name.partition(".")[0])
+            return service is None or service["scope"] == "topic"
+
+        known = [one for one in origins if is_for_each(one)]
+        return self.random.choice([one for one in known if not at_source or one.kind == "source"])
+
+    def _own(self, name: str, type: str) -> None:
+        origins, service = self._origins[type], self._service(name, type)
+        if self.random.random() < 0.5:
+            read = self._chosen(origins, least=1)
+            service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
+            self._add(type, name, "application", False, read)
+        else:
+            at_source = self.random.random() < 0.5
+            each = self._each(origins, type, at_source)
+            more = self._readable(origins, "topic", at_source, self._root(type, each))
+            read = [each, *self._chosen(more)]
+            service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
+            service |= {"each": "in0", "placement": "source" if at_source else "application"}
+            self._add(type, name, "topic", at_source, read)
+        self._appdefs[type]["services"][name] = service
+
+    def _share(self, name: str) -> None:
+        scope = self.random.choice(["topic", "topic", "node", "application"])
+        at_source = scope != "application" and self.random.random() < 0.5
+        definition = self._service(name, name) | {"scope": scope, "name": name}
+        definition |= {"placement": "source" if at_source else "application"}
+        first = self._each(self._common, TYPES[0], at_source)
+        count = self.random.randint(0, 1)
+        made = []
+        for type in TYPES:
+            root = self._root(type, first)
+            more = self._readable(self._origins[type], scope, at_source, root)
+            read = [first, *(self.random.choice(more) for _ in range(count))]
+            self._appdefs[type]["uses"][name] = {f"in{n}": one.name for n, one in enumerate(read)}
+            made.append(self._add(type, name, scope, at_source, read))
+        if made[0] == made[1]:
+            self._common.append(made[0])
+        definition["inputs"] = {f"in{n}": {} for n in range(count + 1)}
+        if scope == "topic":
+            definition["each"] = "in0"
+        head = {"apiVersion": "demandops/v1", "kind": "ServiceDefinition"}
+        self.files[f"appdefs/{name}/service.yaml"] = yaml.safe_dump(head | definition)
+
+
+class Demands:
+    """Demands for applications of both types, made by chance."""
+
+    def __init__(self, random: Random) -> None:
+        self.random = random
+        self.held: dict[str, list[dict[str, Any]]] = {}
+        self.where = {id: random.choice(NODES) for id in ("x", "y", "z")}
+        self.types = {"x": "one", "y": "one", "z": "two"}
+
+    def next(self) -> dict[str, Any]:
+        demand = self.random.choice(["d", "e", "f"])
+        head = {"kind": "Demand", "demand": demand, "requesters": [f"of {demand}"]}
+        if demand in self.held and self.random.random() < 0.4:
+            del self.held[demand]
+            return head | {"operation": "release"}
+        ids = self.random.sample(sorted(self.where), self.random.randint(1, 2))
+        self.held[demand] = [self._application(id) for id in ids]
+        return head | {"applications": self.held[demand]}
+
+    def _application(self, id: str) -> dict[str, Any]:
+        inputs = defaultdict(list)
+        for _ in range(self.random.randint(1, 4)):
+            role, source = self.random.choice(ROLES), self.random.choice(SOURCES)
+            topic = f"/{source}/{role}/t{self.random.randint(0, 1)}"
+            inputs[role].append({"topic": topic, "source": source})
+        return {"id": id, "type": self.types[id], "node": self.where[id], "inputs": dict(inputs)}
+
+
+def instances(graphs: Graphs, demands: Demands) -> Iterator[ServiceKey]:
+    """Yield the services that must run, by what is demanded."""
+    for app in (app for apps in demands.held.values() for app in apps):
+        for name, service in graphs.services[app["type"]].items():
+            if service["scope"] == "application":
+                yield ServiceKey(name, app["node"], application=app["id"])
+            elif service["scope"] == "node" and not service["at_source"]:
+                yield ServiceKey(name, app["node"])
+            for one in (one for role in service["roots"] for one in app["inputs"].get(role, ())):
+                topic, source = one["topic"], one["source"]
+                node = source if service["at_source"] else app["node"]
+                if service["scope"] == "topic":
+                    yield ServiceKey(name, node, source=source, topic=topic)
+                else:
+                    yield ServiceKey(name, node)
+
+
+def assert_every_topic_comes_in_one_way(repo: MemoryRepo) -> None:
+    """Compare what services read and publish with what connections carry."""
+    releases = [plan(repo.state, key) for key in all_keys(repo.state)]
+    services = [one for one in releases if isinstance(one, ServiceRelease)]
+    made = {(one.node.id, topic) for one in services for topic in one.outputs.values()}
+    for claim in repo.state.ledger:
+        if claim.is_on_application:
+            made |= {(one.source, one.topic) for _, one in claim.application.all_inputs()}
+    brought = [
+        (connection["source"], topic, connection["target"])
+        for connection in repo.books()["connections"].values()
+        for topic in connection["topics"]
+    ]
+    for source, topic, _ in brought:
+        assert (source, topic) in made, f"carries {topic} of {source}, where nothing makes it"
+    read = {
+        (topic.topic, one.node.id)
+        for one in services
+        for topics in one.inputs.values()
+        for topic in topics
+    }
+    for topic, node in read:
+        ways = [source for source, name, target in brought if (name, target) == (topic, node)]
+        ways += [node] if (node, topic) in made else []
+        assert len(ways) == 1, f"{topic} comes to {node} from {ways}"
+    assert {(topic, target) for _, topic, target in brought} <= read, "carries what nobody reads"
+
+
+def in_clusters(files: Mapping[str, str]) -> dict[str, str]:
+    return {path: text for path, text in files.items() if path.startswith("clusters/")}
+
+
+@examples(60)
+@given(chances, st.integers(1, 8))
+def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carried(
+    random: Random, length: int
+) -> None:
+    graphs, demands = Graphs(random), Demands(random)
+    repo = MemoryRepo(graphs.files)
+    for _ in range(length):
+        assert outcome(taken := repo.take(demands.next())) != "refused", taken
+        running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
+        assert running == {*instances(graphs, demands)}
+        assert_every_topic_comes_in_one_way(repo)
+        assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))
