@@ -5,9 +5,11 @@ A :class:`Ledger` never changes. A new one costs what a request touches, not wha
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from operator import attrgetter
 from typing import TypeAlias
 
 from rpds import HashTrieMap, HashTrieSet
@@ -20,28 +22,6 @@ from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
 from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
 from demandops.subject import Subject, SubjectKind
-
-
-@dataclass(frozen=True, slots=True)
-class SubjectClaims:
-    """The claims on one subject by demand id.
-
-    ``first`` has the lowest demand id. Claims on one subject agree on where and what it is. If a
-    person writes one that does not, the first one decides.
-    """
-
-    by_demand: HashTrieMap[str, Claim]
-    first: Claim
-
-    def replace(self, demand: str, claim: Claim | None) -> SubjectClaims | None:
-        """Return these claims with ``claim`` at ``demand``, or ``None`` if none is left."""
-        if claim is not None:
-            lowest = claim if demand <= self.first.demand else self.first
-            return SubjectClaims(self.by_demand.insert(demand, claim), lowest)
-        left = self.by_demand.remove(demand)
-        if not left:
-            return None
-        return SubjectClaims(left, left[min(left)] if demand == self.first.demand else self.first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +58,7 @@ class Changes:
 
 
 _ENDS = "ends"
+_DEMAND = attrgetter("demand")
 
 Entry: TypeAlias = "tuple[str, ...]"
 Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
@@ -87,13 +68,16 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 class Ledger:
     """All claims, and an index of them.
 
+    ``claims`` has those on each subject, sorted by demand id, because the planner asks for all of
+    them. They agree on where and what it is. If a person writes one that does not, the first one
+    decides.
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
     ``shutdowns`` are those of the last 15 minutes.
     """
 
-    claims: HashTrieMap[Subject, SubjectClaims] = field(default_factory=HashTrieMap)
+    claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
     index: Index = field(default_factory=HashTrieMap)
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
     ended: Mapping[str, str] = field(default_factory=dict)
@@ -101,13 +85,12 @@ class Ledger:
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
-        held = self.claims.get(subject)
-        return tuple(claim for _, claim in sorted(held.by_demand.items())) if held else ()
+        return self.claims.get(subject) or ()
 
     def first_claim(self, subject: Subject) -> Claim | None:
         """Return the claim on ``subject`` with the lowest demand id, or ``None``."""
         held = self.claims.get(subject)
-        return held.first if held else None
+        return held[0] if held else None
 
     def application_claims(self, application: str) -> tuple[Claim, ...]:
         """Return the claims on an application."""
@@ -185,8 +168,7 @@ class Ledger:
 
     def is_only_kept(self, subject: Subject) -> bool:
         """Return whether no demand holds ``subject``: at most overrides keep it."""
-        held = self.claims.get(subject)
-        return held is None or len(held.by_demand) == len(self.kept_claims(subject))
+        return len(self.claims.get(subject) or ()) == len(self.kept_claims(subject))
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
         """Return the claims of a requester, sorted by subject and demand."""
@@ -263,18 +245,18 @@ class Ledger:
 
     def get(self, key: ClaimKey) -> Claim | None:
         """Return one claim."""
-        held = self.claims.get(key.subject)
-        return held.by_demand.get(key.demand) if held else None
+        held = self.claims.get(key.subject) or ()
+        place = bisect_left(held, key.demand, key=_DEMAND)
+        found = held[place : place + 1]
+        return found[0] if found and found[0].demand == key.demand else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
         """Return the ledger with ``claim`` at ``key``, or with no claim there if it is ``None``."""
-        held, old = self.claims.get(key.subject), self.get(key)
+        held, old = self.claims.get(key.subject) or (), self.get(key)
         if old == claim:
             return self
-        if held is not None:
-            held = held.replace(key.demand, claim)
-        elif claim is not None:
-            held = SubjectClaims(HashTrieMap({key.demand: claim}), claim)
+        place = bisect_left(held, key.demand, key=_DEMAND)
+        held = held[:place] + ((claim,) if claim else ()) + held[place + (old is not None) :]
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
         before, after = index_entries(old), index_entries(claim)
         index, minutes = self.index, self.minutes
@@ -306,11 +288,11 @@ class Ledger:
     def __iter__(self) -> Iterator[Claim]:
         """Yield every claim, in no order."""
         for claims in self.claims.values():
-            yield from claims.by_demand.values()
+            yield from claims
 
     def __len__(self) -> int:
         """Return how many claims there are."""
-        return sum(len(claims.by_demand) for claims in self.claims.values())
+        return sum(len(claims) for claims in self.claims.values())
 
 
 def index_entries(claim: Claim | None) -> set[Entry]:

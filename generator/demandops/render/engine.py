@@ -96,16 +96,17 @@ def _finalize(value: object) -> object:
 
 
 def _plain(value: object) -> object:
+    if isinstance(value, list | tuple):
+        return [item if isinstance(item, str) else _plain(item) for item in value]
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
     return value
 
 
 def _block(value: Mapping[str, Any], indent: int) -> _Verbatim:
     text = strict_yaml.dump(value) if value else "{}\n"
-    return _Verbatim(re.sub(r"(?m)^(?=.)", " " * indent, text.rstrip("\n")))
+    pad = " " * indent
+    return _Verbatim("\n".join(line and pad + line for line in text.rstrip("\n").split("\n")))
 
 
 def _literal(value: str, indent: int) -> _Verbatim:

@@ -7,26 +7,28 @@ from demandops.config.repo_settings import RepoSettings
 from demandops.decision import Decision, State
 from demandops.errors import Refused
 from demandops.ledger.world import World
+from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
+from demandops.plan.release_keys import affected_keys, all_keys, keys_of_claims
 from demandops.render.gitops.argocd import project_of
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
-    """Return the releases that a demand needs, and those that it removes."""
+    """Return the releases that a demand needs, and those that it changes or removes.
+
+    What other demands on the same subjects need beside it does not count.
+    """
     after, request = decision.state, decision.request
-    subjects = [claim.subject for claim in after.ledger.claims_of_demand(request.demand)]
-    if request.adds_claims:
-        subjects += request.subjects()
-    subjects += decision.changes.subjects()
-    keys: dict[ReleaseKey, None] = {}
-    for subject in dict.fromkeys(subjects):
-        keys |= dict.fromkeys(keys_of(after, subject))
-    keys |= dict.fromkeys(affected_keys(before, after, decision.changes.claims))
+    active = without_suspended(after)
+    claims = [*active.ledger.claims_of_demand(request.demand)]
+    for one in request.demanded if request.adds_claims else ():
+        for who in one.requesters:
+            claims += active.ledger.claims_held_by(who, one.held.subject)
+    changed = affected_keys(before, after, decision.changes.claims)
     targets = []
-    for key in keys:
-        new = plan(after, key)
+    for key in dict.fromkeys((*keys_of_claims(active, claims), *changed)):
+        new = after.plans.get(key) or plan(after, key)
         try:
             release = new or plan(before, key)
         except Refused:

@@ -8,8 +8,9 @@ from demandops.cluster.health.release_health import ObjectName
 from demandops.decision import decide
 from demandops.service import rollout_targets
 
+from tests.kit import goals
 from tests.kit.golden import requests_of, start
-from tests.kit.memory import NOW
+from tests.kit.memory import NOW, MemoryRepo
 
 
 @pytest.mark.parametrize(
@@ -25,3 +26,21 @@ def test_a_place_knows_by_which_controller_it_is_kept(
     assert {target.name for release, target in found} == {release.name for release, _ in found}
     assert {target.domain.application for _, target in found} == {application}
     assert {target.by_helm for _, target in found} == {True, False}
+
+
+def test_a_demand_waits_for_no_release_that_only_others_need() -> None:
+    def join(cloud: goals.Topic) -> goals.Goal:
+        return goals.goal([goals.application(who=[cloud[1]], clouds=[cloud])], id=cloud[1])
+
+    def followed(goal: goals.Goal) -> dict[str, bool]:
+        before = repo.state
+        targets = rollout_targets.targets_of_decision(before, repo.send(goal))
+        return {target.name: target.wanted for target in targets}
+
+    repo, fusion = MemoryRepo(), "of-edge-object-detection-fusion-cf7e0180a8bb"
+    vehicle, station = join(goals.CLOUD), join(goals.STATION_CLOUD)
+    repo.send(vehicle)
+    own = {fusion: True, "od-edge-station00": True}
+    assert followed(station) == own
+    assert followed(station) == own, "it repeats"
+    assert followed(vehicle | {"shutdown": True}) == {fusion: True, "od-edge-vehicle00": False}

@@ -103,11 +103,16 @@ def lay(repo: pygit2.Repository, files: Files) -> pygit2.Tree:
 def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.DataObject) -> None:
     files = data.draw(file_trees(), "files")
     change = data.draw(changes(files), "change")
+    wanted = changed(files, change)
+    more = data.draw(changes(wanted), "more")
     with scratch() as repo:
-        made = write_tree(repo, lay(repo, files) if files else None, change)
-        wanted = changed(files, change)
+        new = NewObjects(repo)
+        made = trees.write(new, lay(repo, files) if files else None, change)
         assert read(repo, made) == wanted
         assert made == lay(repo, wanted).id, "same files, other tree: an empty folder or a mode"
+        for further in (more, {}):  # the folders of their start are in memory only once
+            again = trees.write(new, repo[made].peel(pygit2.Tree), further)
+            assert again == lay(repo, changed(wanted, further)).id
 
 
 @given(before=file_trees(), after=file_trees())

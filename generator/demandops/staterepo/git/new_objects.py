@@ -21,7 +21,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pygit2
-from pygit2 import Oid, PackBuilder, Repository
+from pygit2 import Oid, PackBuilder, Repository, Tree
 from pygit2.enums import ObjectType
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
@@ -35,12 +35,18 @@ _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
-_ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0(.{20}))", re.DOTALL)
+_ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)
 """An entry of a tree object: the mode, the name and the raw id."""
+_ID = re.compile(rb"[0-7]+ [^\0]+\0(.{20})", re.DOTALL)
 _FOLDER = b"40000"
 
 Entries = dict[bytes, bytes]
 """The entries of a folder by name; a folder's name ends in a slash, as Git sorts it."""
+_REMEMBERED = 32
+"""How many of the folders that were written last stay parsed; the next demand changes some again.
+
+What an id stands for never changes.
+"""
 
 
 class NewObjects(pygit2.OdbBackend):
@@ -51,6 +57,7 @@ class NewObjects(pygit2.OdbBackend):
         # the repo holds this object where Python does not see it, so holding it too would leak both
         self._repo = weakref.ref(repo)
         self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
+        self._folders: dict[Oid, Entries] = {}
         repo.odb.add_backend(self, _LAST)
 
     @property
@@ -65,6 +72,19 @@ class NewObjects(pygit2.OdbBackend):
         header = b"%s %d\0" % (_TYPES[kind], len(data))
         oid = Oid(raw=_sha1(header + data))
         self._known[oid] = (kind, data)
+        return oid
+
+    def folder(self, oid: Oid) -> Entries:
+        """Return the entries of a folder, which may be changed and added again."""
+        known = self._folders.pop(oid, None)
+        return _entries_of(self.repo[oid].peel(Tree).read_raw()) if known is None else known
+
+    def add_folder(self, entries: Entries) -> Oid:
+        """Keep a folder, to which ``entries`` belong from now on, and return its id."""
+        oid = self.add(ObjectType.TREE, b"".join(map(entries.__getitem__, sorted(entries))))
+        self._folders[oid] = entries
+        if len(self._folders) > _REMEMBERED:
+            del self._folders[next(iter(self._folders))]
         return oid
 
     def forget(self) -> None:
@@ -175,7 +195,7 @@ class NewObjects(pygit2.OdbBackend):
                 found = self.repo[oid].peel(pygit2.Commit)
                 queue += [found.tree_id, *found.parent_ids]
             elif kind is ObjectType.TREE:
-                queue += [known[raw] for *_, raw in _ENTRY.findall(data) if raw in known]
+                queue += [known[raw] for raw in _ID.findall(data) if raw in known]
         return list(needed)
 
     # ---- what libgit2 calls ----
@@ -210,11 +230,10 @@ def _sha1(data: bytes | bytearray) -> bytes:
     return hashlib.sha1(data).digest()  # noqa: S324 - Git's object ids
 
 
-def entries_of(data: bytes) -> Entries:
-    """Return the entries of a tree object."""
+def _entries_of(data: bytes) -> Entries:
     return {
         name + b"/" if mode == _FOLDER else name: entry
-        for entry, mode, name, _ in _ENTRY.findall(data)
+        for entry, mode, name in _ENTRY.findall(data)
     }
 
 

@@ -9,7 +9,7 @@ from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
 from pygit2.enums import FileMode, ObjectType
 
 from demandops.errors import StateRepoError
-from demandops.staterepo.git.new_objects import Entries, NewObjects, entries_of
+from demandops.staterepo.git.new_objects import Entries, NewObjects
 
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)  # a reported commit is on the disk
 # By default libgit2 does not cache trees over 4 KiB and parses them at every look-up.
@@ -161,12 +161,12 @@ def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
     """
-    return _write(objects, base, files) or objects.add(ObjectType.TREE, b"")
+    return _write(objects, base.id if base is not None else None, files) or objects.add_folder({})
 
 
-def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid | None:
+def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None]) -> Oid | None:
     """Add a folder and return its id; ``None`` if it is empty."""
-    entries = entries_of(base.read_raw()) if base is not None else {}
+    entries = objects.folder(base) if base is not None else {}
     below: dict[bytes, dict[str, str | None]] = {}
     here: dict[bytes, str | None] = {}
     for path, text in files.items():
@@ -178,7 +178,7 @@ def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | Non
     for name, inner in below.items():
         folder = name + b"/"
         kept = folder in entries and here.get(name, "") is not None
-        old = objects.repo[Oid(raw=entries[folder][-20:])].peel(Tree) if kept else None
+        old = Oid(raw=entries[folder][-20:]) if kept else None
         subtree = _write(objects, old, inner)
         if subtree is not None:
             entries.pop(name, None)
@@ -193,10 +193,7 @@ def _write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | Non
         elif not any(inner is not None for inner in below.get(name, {}).values()):
             entries.pop(name, None)
             entries.pop(name + b"/", None)
-    if not entries:
-        return None
-    content = b"".join(entries[name] for name in sorted(entries))
-    return objects.add(ObjectType.TREE, content)
+    return objects.add_folder(entries) if entries else None
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
