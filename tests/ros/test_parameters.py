@@ -121,6 +121,16 @@ def test_the_parameters_of_an_older_file(ros: None, tmp_path: Path) -> None:
     ]
 
 
+def test_the_parameter_file_of_the_package_leaves_options_alone() -> None:
+    file = Path(reference_parameters.__file__).parents[1] / "ros_package" / "config" / "params.yaml"
+    rclpy.init(args=["--ros-args", "--params-file", str(file)])
+    try:
+        read = parameters.read({"state_repo": "fleet.git", "fetch_interval": "5s"})
+    finally:
+        rclpy.try_shutdown()
+    assert read == parameters.DEFAULTS | {"state_repo": "fleet.git", "fetch_interval": "5s"}
+
+
 def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: int) -> None:
     file = tmp_path / "params.yml"
     file.write_text(FILE.replace("NAMESPACE", "perception").replace("PORT", "1993"))
