@@ -69,7 +69,8 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     if registry and not all(image.repository.startswith(f"{registry}/") for image in images):
         yield (
             "parameter k3d_image_registry of the reference is not used: set registry: "
-            f"{registry} in {IMAGES_FILE}"
+            f"{registry} in {IMAGES_FILE}, with the names that its images have there "
+            "(docs/migration.md)"
         )
     yield from _brokers(values, config)
     topics = values.get("connections.init_comm_topics") or ()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import glob
 import re
-import shlex
 from pathlib import Path
 
 import pytest
@@ -248,37 +246,3 @@ def test_resources_are_read_from_a_cluster(migration: Migration, tmp_path: Path)
     away = migration.run(*where, "c-its", files="bookkeeping")
     assert away.code == 1
     assert away.err.startswith("error: cluster c-its: cannot be read: ")
-
-
-PAGE = (Path(__file__).parents[2] / "docs" / "migration.md").read_text()
-
-
-def test_the_commands_of_the_documentation_run(
-    tmp_path: Path, demandops: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    migration = Migration(tmp_path / "elsewhere", demandops, 6)
-    commands = re.findall(r"^    (?:kubectl|demandops) .*", PAGE, re.MULTILINE)
-    ran = []
-    for command in commands:
-        words = shlex.split(command.strip())
-        if words[0] == "kubectl" and ">" in words:  # copies what the cluster has
-            copy = tmp_path / words[-1]
-            copy.parent.mkdir(exist_ok=True)
-            copy.write_text(migration.files[copy.stem].read_text())
-        elif words[0] == "demandops" and words[1] != "serve":
-            files = [str(one) for word in words[2:] for one in expanded(word)]
-            done = demandops(words[1], *files)
-            assert done.code == 0, done.err
-            ran.append(words[1])
-    assert ran == ["init", "import", "import", "import", "bookkeeping"]
-    held = books(tmp_path / "fleet.git")
-    assert held["connections"]["station00/edge"]["requesters"] == [
-        "station00",
-        "vehicle02",
-        "vehicle03",
-    ]
-
-
-def expanded(word: str) -> list[str]:
-    return sorted(glob.glob(word)) if "*" in word else [word]  # noqa: PTH207 - as a shell does

@@ -131,7 +131,7 @@ OTHER_EDITS: list[tuple[str, list[tuple[str, str]], dict[str, Any], list[str]]] 
         {
             "values": {
                 "image": {"digest": None},
-                "ros": {"rmwImplementation": None, "other": "rmw_cyclonedds_cpp"},
+                "ros": {"rmwImplementation": None, "other": ""},
             }
         },
         [],

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import rclpy
 from demandops.config.load import load
-from demandops.staterepo import skeleton
 from demandops_ros import parameters, reference_parameters
 from rcl_interfaces.srv import DescribeParameters
 
@@ -42,6 +42,7 @@ application_manager:
       communication_broker: {host: broker, port: 1883}
 """
 UNUSED = "of the reference is not used:"
+PAGE = Path(__file__).parents[2] / "docs" / "migration.md"
 
 
 @pytest.fixture
@@ -65,7 +66,7 @@ REPLACED = [
     f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; --clusters "
     "gives access for answers at reconciled or healthy",
     f"parameter k3d_image_registry {UNUSED} set registry: k3d-registry.localhost:41671 in "
-    "registry/images.yaml",
+    "registry/images.yaml, with the names that its images have there (docs/migration.md)",
 ]
 
 
@@ -74,11 +75,23 @@ def test_a_file_whose_brokers_are_in_the_inventory(ros: None, tmp_path: Path) ->
     assert told(tmp_path, text) == REPLACED
 
 
-def test_a_registry_that_is_set_needs_no_warning(ros: None, tmp_path: Path) -> None:
+def test_the_page_names_the_images_as_the_registry_has_them(ros: None, tmp_path: Path) -> None:
     text = FILE.replace("NAMESPACE", "perception").replace("PORT", "1993")
-    images = skeleton.files()["registry/images.yaml"]
-    images = images.replace("images:\n", "registry: k3d-registry.localhost:41671\nimages:\n", 1)
-    assert told(tmp_path, text, **{"registry/images.yaml": images}) == REPLACED[:1]
+    (images,) = re.findall(
+        r"```yaml\n(# registry/images.yaml\n.*?)```", PAGE.read_text(), re.DOTALL
+    )
+    files = {"registry/images.yaml": images}
+    assert told(tmp_path, text, **files) == REPLACED[:1]
+    # as object_detection_fusion_app.py and mqtt_connection.py of application_manager name them
+    assert {image.reference() for image in load(configuration(files)).images.values()} == {
+        f"k3d-registry.localhost:41671/{name}:latest"
+        for name in (
+            "mqtt_client",
+            "point_cloud_object_detection",
+            "object_fusion",
+            "k8s_configmap_watcher",
+        )
+    }
 
 
 def test_what_the_state_repo_lacks_is_named(ros: None, tmp_path: Path) -> None:
@@ -106,6 +119,16 @@ def test_the_parameters_of_an_older_file(ros: None, tmp_path: Path) -> None:
         f"parameter connections.init_comm_topics {UNUSED} add /vehicles/vehicle00/pose to bridged "
         "of the source's node in inventory/nodes.yaml",
     ]
+
+
+def test_the_parameter_file_of_the_package_leaves_options_alone() -> None:
+    file = Path(reference_parameters.__file__).parents[1] / "ros_package" / "config" / "params.yaml"
+    rclpy.init(args=["--ros-args", "--params-file", str(file)])
+    try:
+        read = parameters.read({"state_repo": "fleet.git", "fetch_interval": "5s"})
+    finally:
+        rclpy.try_shutdown()
+    assert read == parameters.DEFAULTS | {"state_repo": "fleet.git", "fetch_interval": "5s"}
 
 
 def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: int) -> None:

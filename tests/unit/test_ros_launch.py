@@ -34,7 +34,7 @@ def test_the_parameter_file_has_the_defaults() -> None:
     data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / "params.yaml").read_text())
     named = data["/**"]["ros__parameters"]
     assert named == {name: parameters.DEFAULTS[name] for name in named}
-    assert set(parameters.DEFAULTS) - set(named) == {"state_repo", "log_level"}
+    assert set(parameters.DEFAULTS) - set(named) == {"state_repo", "fetch_interval", "log_level"}
 
 
 def test_the_package_has_the_version_and_the_needs_of_the_code() -> None:

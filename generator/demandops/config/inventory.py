@@ -128,7 +128,8 @@ class Toleration(CamelModel):
         return self
 
 
-Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp"]
+Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp", "image"]
+"""A middleware of ROS; ``image`` for the one that each image has."""
 
 
 class Ros(CamelModel):

@@ -184,12 +184,12 @@ class ClientSettings(CamelModel):
 class MqttClientSettings(ClientSettings):
     """The settings of MQTT clients, which are ROS nodes.
 
-    ``rmw`` is that of the node if not given; ``image`` leaves it to the image. ``messages`` are the
-    packages whose messages the image can carry; if empty, that is not known.
+    ``rmw`` is that of the node if not given. ``messages`` are the packages whose messages the image
+    can carry; if empty, that is not known.
     """
 
     launch_file: _LaunchFile = "standalone.launch.xml"
-    rmw: Rmw | Literal["image"] | None = None
+    rmw: Rmw | None = None
     messages: Items[_Package] = ()
 
 

@@ -75,11 +75,12 @@ def _context(release: ServiceRelease, config: Config) -> dict[str, object]:
 
 
 def _node(node: Node) -> dict[str, object]:
+    rmw = "" if node.ros.rmw == "image" else node.ros.rmw
     return {
         "id": node.id,
         "selector": node.labels(),
         "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
         "image_pull_secrets": list(node.image_pull_secrets),
         "host_network": node.host_network,
-        "ros": {"domain_id": node.ros.domain_id, "rmw": node.ros.rmw},
+        "ros": {"domain_id": node.ros.domain_id, "rmw": rmw},
     }

@@ -252,7 +252,7 @@ class Rig:
             [
                 plane.controller_manager(path),
                 plane.scheduler(path),
-                kwok.component(self._binaries["kwok"], path),
+                kwok.component(self._binaries["kwok"], path, certificates),
                 *(
                     component
                     for part in parts

@@ -72,6 +72,7 @@ class ControlPlane:
             f"--service-cluster-ip-range={_SERVICES}",
             "--authorization-mode=RBAC",
             "--allow-privileged=true",
+            "--kubelet-preferred-address-types=InternalIP",  # for `kubectl exec`
             # A Service's endpoint must not be on loopback: the API server would refuse its own.
             "--endpoint-reconciler-type=none",
         ]

@@ -14,6 +14,7 @@ from typing import Any
 
 from .errors import RigError
 from .net import LOOPBACK, answers, free_port
+from .pki import Pki
 from .processes import Component
 
 NODE_ID_LABEL = "node_id"
@@ -24,7 +25,7 @@ _LABEL_VALUE = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
 _CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"}
 
 
-def component(binary: Path, kubeconfig: Path) -> Component:
+def component(binary: Path, kubeconfig: Path, certificates: Pki) -> Component:
     """Return the kwok process for all nodes that `manifest` returns."""
     port = free_port()
     argv = [
@@ -36,6 +37,9 @@ def component(binary: Path, kubeconfig: Path) -> Component:
         f"--node-ip={LOOPBACK}",
         "--cidr=10.244.0.0/16",
         f"--server-address={LOOPBACK}:{port}",
+        f"--node-port={port}",
+        f"--tls-cert-file={certificates.server_certificate}",
+        f"--tls-private-key-file={certificates.server_key}",
         f"--config={_STAGES}",
     ]
     return Component("kwok", tuple(argv), answers(port, "/healthz"))

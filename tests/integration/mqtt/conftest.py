@@ -137,12 +137,14 @@ class Pod:
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
-        """Return the client's parameters as the real rcl reads them from its arguments."""
+        """Return the client's parameters as the real rcl reads them, started by its launch file."""
         (container,) = self._spec["containers"]
         arguments = container["args"]
-        assert arguments[:4] == ["ros2", "run", "mqtt_client", "mqtt_client"]
+        assert arguments[:4] == ["ros2", "launch", "mqtt_client", "standalone.launch.ros2.xml"]
+        given = dict(argument.split(":=") for argument in arguments[4:])
         script = str(Path(__file__).with_name("read_parameters.py"))
-        read = json.loads(self._run(container, [sys.executable, script, *arguments[4:]]))
+        ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params_file"]]
+        read = json.loads(self._run(container, [sys.executable, script, "--ros-args", *ros_args]))
         assert read["node"] == self.deployment["metadata"]["name"].replace("-", "_")
         found: dict[str, Any] = read["parameters"]
         found["broker.tls.ca_certificate"] = self.path(

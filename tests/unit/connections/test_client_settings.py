@@ -10,12 +10,13 @@ from demandops.config.load import load
 from demandops.errors import InvalidInput
 
 from tests.kit.config import configuration, override, skeleton
-from tests.kit.goals import connection, goal
+from tests.kit.goals import application, connection, goal
 from tests.kit.memory import MemoryRepo
 
 CLIENTS, BROKERS, IMAGES = "registry/clients.yaml", "inventory/brokers.yaml", "registry/images.yaml"
 NODES = "inventory/nodes.yaml"
 PATCH = "overrides/tested.yaml"
+SKELETONS = "    ros: {rmw: image}\n"
 PROBE = {"exec": {"command": ["ros2", "node", "list"]}, "periodSeconds": 30}
 
 
@@ -44,10 +45,6 @@ def test_without_the_file_a_client_runs_as_the_inventory_says() -> None:
     spec = pod({CLIENTS: None})
     (container,) = spec["containers"]
     assert container["args"][3] == "standalone.launch.xml"
-    assert container["env"] == [
-        {"name": "ROS_DOMAIN_ID", "value": "0"},
-        {"name": "RMW_IMPLEMENTATION", "value": "rmw_cyclonedds_cpp"},
-    ]
     assert container["resources"] == {
         "requests": {"cpu": "50m", "memory": "64Mi"},
         "limits": {"memory": "256Mi"},
@@ -56,11 +53,34 @@ def test_without_the_file_a_client_runs_as_the_inventory_says() -> None:
     assert not [name for name in container if name.endswith("Probe")]
 
 
-def test_the_skeletons_image_launch_file_and_middleware_belong_together() -> None:
+def test_the_skeletons_image_and_launch_file_belong_together() -> None:
     (container,) = pod({})["containers"]
     assert container["image"] == "docker.io/rwthika/robotkube-mqtt-client:2025-04"
     assert container["args"][3] == "standalone.launch.ros2.xml"
-    assert container["env"] == [{"name": "ROS_DOMAIN_ID", "value": "0"}]
+
+
+@pytest.mark.parametrize(
+    ("ros", "middleware"),
+    [
+        ("", "rmw_cyclonedds_cpp"),
+        ("    ros: {rmw: rmw_fastrtps_cpp}\n", "rmw_fastrtps_cpp"),
+        ("    ros: {rmw: image}\n", ""),
+    ],
+    ids=["not said", "named", "the images' own"],
+)
+def test_services_and_clients_of_a_node_have_one_middleware(ros: str, middleware: str) -> None:
+    nodes = skeleton()[NODES]
+    assert nodes.count(SKELETONS) == nodes.count("- id: ")
+    repo = MemoryRepo({NODES: nodes.replace(SKELETONS, ros)})
+    repo.send(goal([application()], [connection()]))
+    services = [one["spec"]["values"]["ros"] for one in repo.objects("HelmRelease").values()]
+    assert {one["rmwImplementation"] for one in services} == {middleware}
+    for deployment in repo.objects("Deployment").values():
+        (container,) = deployment["spec"]["template"]["spec"]["containers"]
+        found = {one["name"]: one["value"] for one in container["env"]}
+        assert found == {"ROS_DOMAIN_ID": "0"} | (
+            {"RMW_IMPLEMENTATION": middleware} if middleware else {}
+        )
 
 
 def test_each_setting_reaches_the_client() -> None:

@@ -64,8 +64,10 @@ arbitrary user has no home folder in the image. The values may set another HOME.
 {{- define "ros.env" -}}
 - name: ROS_DOMAIN_ID
   value: {{ .Values.ros.domainId | int | toString | toJson }}
+{{- with .Values.ros.rmwImplementation }}
 - name: RMW_IMPLEMENTATION
-  value: {{ toJson .Values.ros.rmwImplementation }}
+  value: {{ toJson . }}
+{{- end }}
 {{- $named := dict }}
 {{- range .Values.ros.env }}{{ $_ := set $named .name true }}{{ end }}
 {{- if not (hasKey $named "HOME") }}
