@@ -150,6 +150,13 @@ class Ledger:
         usual = {one.topic for one in topics if one.source == source and not one.further}
         yield from sorted(usual - {but})
 
+    def further_topics(self, role: str, part: str) -> Iterator[InputTopic]:
+        """Yield the further topics of sources that are called ``part`` in names of topics."""
+        for claim in self._claims("further", part):
+            for topic in claim.application.inputs.get(role, ()):
+                if topic.further and topic.part == part:
+                    yield topic
+
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
         return self._ids("brings", target, topic)
