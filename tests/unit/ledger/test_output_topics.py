@@ -231,6 +231,31 @@ def test_a_claim_that_a_person_writes_or_restores_must_not_bring_a_topic_twice()
     ]
 
 
+def test_a_persons_claim_of_another_type_changes_nothing_of_what_the_application_is() -> None:
+    appdef = yaml.safe_load(skeleton()["appdefs/object-detection-fusion/appdef.yaml"])
+    appdef["services"] = {"x": appdef["services"]["object-detection"] | {"prefix": "x"}}
+    del appdef["deploymentRequest"]
+    values = "values/object-detection.yaml.j2"
+    repo = MemoryRepo(
+        {
+            "appdefs/other/appdef.yaml": yaml.safe_dump(appdef | {"name": "other"}),
+            f"appdefs/other/{values}": skeleton()[f"appdefs/object-detection-fusion/{values}"],
+        }
+    )
+    repo.send(join(CLOUD))
+    (claim,) = repo.state.ledger
+    (more,) = claims_after(join(FRONT, who="vehicle01"))
+    written = replace(more, demand="z", held=replace(more.application, appdef="other"))
+    after = replace(repo.state, ledger=rebuilt([claim, written]))
+    assert not list(faults_of_edit(repo.state, after, [ClaimChange(None, written)]))
+    services = MemoryRepo(state=after).books()["services"].values()
+    (inputs,) = [one["inputs"] for one in services if one["service"] == "object-fusion"]
+    assert inputs["object_list"] == {
+        "/vehicle00_local_objectlist": ["vehicle01"],
+        PLAIN: ["vehicle01"],
+    }
+
+
 def without_marks(claim: Claim) -> Any:
     inputs = {
         role: tuple(topic._replace(further=False) for topic in topics)

@@ -129,7 +129,7 @@ def _requesters_of_topics(claims: Iterable[Claim]) -> _Requesters:
 def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _Requesters]:
     found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
     for claim in claims_of(release, active.ledger):
-        for role, topic, key in demanded_inputs(active.config, release, claim.application):
+        for role, topic, key in demanded_inputs(active, release, claim.application):
             found[role][topic].update(claim.holders(key))
     return {role: _sorted(topics) for role, topics in found.items()}
 
