@@ -38,6 +38,11 @@ class ClaimChange:
         assert claim is not None  # noqa: S101 - a change has at least one side
         return claim.key
 
+    @property
+    def only_renews(self) -> bool:
+        """Whether at most the lease of a claim changed."""
+        return bool(self.before and self.after and self.before.booked == self.after.booked)
+
 
 @dataclass(frozen=True, slots=True)
 class Changes:

@@ -30,7 +30,10 @@ from demandops.settings import LEDGER_API_VERSION
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
 REMEMBERED = timedelta(minutes=15)
-"""For how long a shutdown is remembered."""
+"""For how long the same shutdown is a repeat."""
+
+_KEPT = timedelta(hours=1)
+"""For how long its file is kept, because a repeat may wait in a journal while others are booked."""
 
 _FORGOTTEN = 10
 """How many old shutdowns one booking forgets at most."""
@@ -101,9 +104,9 @@ class RecentShutdowns:
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
         """Return the shutdowns without the forgotten ones, and the digests of these.
 
-        Forgotten are those of ``requesters`` and some that are older than 15 minutes.
+        Forgotten are those of ``requesters`` and some that are older than an hour.
         """
-        first = _minute(now - REMEMBERED)
+        first = _minute(now - _KEPT)
         ended = sorted(one for one in self.by_minute if one < first)
         old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))
         forgotten = {*islice(old, _FORGOTTEN)}
