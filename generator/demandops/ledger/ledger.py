@@ -79,7 +79,7 @@ class Ledger:
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
-    ``shutdowns`` are those of the last 15 minutes.
+    ``shutdowns`` are the recent ones.
     """
 
     claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)

@@ -1,4 +1,4 @@
-"""Recent shutdowns: those of the last 15 minutes, so that one that is sent again is recognized.
+"""Recent shutdowns, so that one that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
 record the repeat would release another demand of the same requesters. A join in the name of one
