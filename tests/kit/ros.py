@@ -15,7 +15,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,12 +92,31 @@ class Served:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
         return data
 
-    def wait_for(self, text: str) -> None:
-        """Wait until the log has a text."""
-        end = time.monotonic() + DEADLINE_S
-        while text not in self.log.read_text():
-            assert time.monotonic() < end, f"the log does not say: {text}"
+    def wait_for(self, text: str, seconds: float = DEADLINE_S) -> None:
+        """Wait until the log has a text; if it does not come, say what the process does instead."""
+        end = time.monotonic() + seconds
+        while True:
+            is_over = self.process.poll() is not None or time.monotonic() >= end
+            if text in self.log.read_text():
+                return
+            assert not is_over, f"the log does not say: {text}\n{self.last_words()}"
             time.sleep(0.05)
+
+    def last_words(self) -> str:
+        """Return how the process ended; or abort it, and return where it was, and its log."""
+        code, pid = self.process.poll(), self.process.pid
+        lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
+        if code is None:
+            lines.append(f"load of the machine: {os.getloadavg()}")
+            for task in sorted(Path(f"/proc/{pid}/task").iterdir()):
+                with suppress(OSError):  # it may end meanwhile
+                    name, _, stat = (task / "stat").read_text().rpartition(") ")
+                    state, *_, user, system = stat.split()[:13]
+                    waits = (task / "wchan").read_text()
+                    lines.append(f"{name}) {state} in {waits}, ticks {user} and {system}")
+            self.process.send_signal(signal.SIGABRT)  # Python prints where each thread is
+            self.process.wait(30)
+        return "\n".join([*lines, self.log.read_text()])
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
         self.process.send_signal(number)
@@ -122,6 +141,7 @@ class Servers:
             **os.environ,
             "ROS_DOMAIN_ID": str(self._domain),
             "ROS_LOG_DIR": str(self._folder / "ros-log"),
+            "PYTHONFAULTHANDLER": "1",
             **self._environment,
         }
         with log.open("w") as sink:
