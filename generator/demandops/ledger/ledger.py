@@ -40,7 +40,7 @@ class ClaimChange:
 
     @property
     def only_renews(self) -> bool:
-        """Whether at most the lease of a claim changed."""
+        """Whether a demand that adds claims changed at most the lease of this one."""
         return bool(self.before and self.after and self.before.booked == self.after.booked)
 
 

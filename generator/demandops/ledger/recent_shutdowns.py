@@ -1,8 +1,8 @@
 """Recent shutdowns, so that one that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
-record the repeat would release another demand of the same requesters. A join in the name of one
-of the requesters ends the record, because a later shutdown may mean what was joined.
+record the repeat would release another demand of the same requesters. A join that adds something
+in the name of one of the requesters ends the record: a later shutdown may mean what was joined.
 
 Each is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
 """
