@@ -16,7 +16,7 @@ HANGS = """
 import sys, threading
 
 def hang():
-    print("hangs", file=sys.stderr)
+    sys.stderr.write("hangs\\n")
     threading.Event().wait()
 
 threading.Thread(target=hang).start()
@@ -72,7 +72,7 @@ def test_a_missing_state_repo_is_refused_with_the_remedy(tmp_path: Path, demando
     ("program", "told"),
     [
         ("raise SystemExit('over')", r"ended with 1\nover\n"),
-        (HANGS, r"(?s)runs as \d+\n.* ticks .*line 6 in hang\n.*line 6 in hang\n"),
+        (HANGS, r"(?s)runs as \d+\n.*: ran \d+\.\d s, waited .*line 6 in hang\n.*line 6 in hang\n"),
     ],
 )
 def test_a_test_that_waits_in_vain_tells_what_the_process_does(
