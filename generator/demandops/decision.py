@@ -152,6 +152,8 @@ def decide(
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
     clashes = list(topic_clash.faults(request, state, after, keys))
+    for change in changes.claims if isinstance(request, Restoration) else ():
+        clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
     if clashes:
         raise Refused(clashes)
     rendered = changeset.build_changeset(
@@ -264,13 +266,11 @@ def changeset_of_edit(
     return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
 
 
-def policy_faults_of_edit(
-    before: World, after: World, changes: Iterable[ClaimChange]
-) -> Iterator[Fault]:
-    """Yield why policy refuses claims that a person wrote, each located in the claim's file.
+def faults_of_edit(before: World, after: World, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
+    """Yield why claims that a person wrote are refused, each located in the claim's file.
 
-    A claim must be permitted and within the quotas, as if a demand asked for it. An edit that only
-    takes requesters away is always allowed, like a release.
+    A claim must be permitted, within the quotas and without a topic clash, as if a demand asked for
+    it. An edit that only takes requesters away is always allowed, like a release.
 
     Args:
         before, after: the world before and after the edit.
@@ -283,6 +283,7 @@ def policy_faults_of_edit(
         not_permitted = permission.faults(restoration.request_for(claim), after.config)
         for each in chain(not_permitted, quota.faults(before, after, Changes((change,)))):
             yield each.within(claim_file.path_of(claim.key))
+        yield from topic_clash.faults_of_claim(claim, before, after)
 
 
 def _only_reduces(change: ClaimChange) -> bool:

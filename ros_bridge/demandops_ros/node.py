@@ -174,7 +174,7 @@ class DemandNode(Node):  # type: ignore[misc]
                 lambda future: self._in_executor(partial(journaled.set_result, future.result()))
             )
             if await journaled:
-                if len(self._goals) == _DEFAULT_DEPTH + 1:
+                if len(self._goals) > _DEFAULT_DEPTH:  # a burst may be journaled together
                     self.get_logger().warning(_SHALLOW, once=True)
                 self.executor.create_task(self._forget_unless_accepted, goal)
                 return GoalResponse.ACCEPT

@@ -25,8 +25,8 @@ from demandops.service import Generator
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.logging import LoggingSeverity, set_logger_level
-from rclpy.node import Node
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.logging import LoggingSeverity, get_logger, set_logger_level
 from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import parameters, reference_parameters
@@ -38,11 +38,11 @@ _FLUSH_S = 0.3
 
 
 class RosLogHandler(logging.Handler):
-    """Passes the generator's log records to the node's log."""
+    """Passes the generator's log records to ROS's log."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, logger: RcutilsLogger) -> None:
         super().__init__()
-        self._log = node.get_logger()
+        self._log = logger
         self.setFormatter(OneLineFormatter())
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -114,7 +114,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
 ) -> None:
     """Run the ROS 2 node that accepts demands.
 
-        Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
+    Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
     fetch_interval, requester_queue_limit (how many demands of one requester may wait), log_level
@@ -140,6 +140,8 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
                 "fetch_interval": fetch_interval,
             }
         )
+        # the generator takes demands from the journal before there is a node
+        _log_to(get_logger("demandops"), settings["log_level"])
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
@@ -179,6 +181,13 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         rclpy.try_shutdown()
 
 
+def _log_to(logger: RcutilsLogger, level: str) -> None:
+    set_logger_level(logger.name, LoggingSeverity[level.upper()])
+    library_log = logging.getLogger("demandops")
+    library_log.handlers, library_log.propagate = [RosLogHandler(logger)], False
+    library_log.setLevel(logging.DEBUG)
+
+
 def _run(
     generator: Generator,
     settings: dict[str, Any],
@@ -198,10 +207,7 @@ def _run(
         shown = generator.address if name == "state_repo" else value
         # read only, because the parameters are read at the start
         node.declare_parameter(name, shown, parameters.descriptor(name, read_only=True))
-    set_logger_level(node.get_logger().name, LoggingSeverity[settings["log_level"].upper()])
-    library_log = logging.getLogger("demandops")
-    library_log.handlers, library_log.propagate = [RosLogHandler(node)], False
-    library_log.setLevel(logging.DEBUG)
+    _log_to(node.get_logger(), settings["log_level"])
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     # the executor spins in a thread, so that the main thread notices a signal at once

@@ -68,6 +68,7 @@ def test_it_is_demanded_with_yaml_alone(demandops: Run, state: GitRepo, tmp_path
     assert (row["outcome"], row["warnings"]) == ("booked", [UNCARRIED])
     ran = demandops("bookkeeping", "--state-repo", state.path, "--output", "json")
     found = ran.json()["services"]
+    assert "rate = 1 " in demandops("bookkeeping", "--state-repo", state.path).out
     told = ("applications", "service", "node", "source", "source_topic", "inputs", "requesters")
     assert {name: {key: entry[key] for key in told} for name, entry in found.items()} == {
         "drv-vehicle00-vehicle00": {

@@ -373,7 +373,7 @@ class TestBookkeeping:
         ran = demandops("bookkeeping", "--state-repo", joined.path)
         assert (ran.code, ran.err) == (0, "")
         cells = [[c.strip() for c in line.split("│")] for line in ran.out.splitlines()]
-        assert ["", "od-edge-vehicle00", "object-detection", "edge", "vehicle00", CLOUD[0],
+        assert ["", "od-edge-vehicle00", "object-detection", "0.1.0", "edge", "vehicle00", CLOUD[0],
                 "vehicle00", ""] in cells  # fmt: skip
         assert ["", "vehicle00/edge", "mqtt", "vehicle00", "edge", CLOUD[0],
                 "vehicle00", ""] in cells  # fmt: skip
@@ -477,6 +477,29 @@ class TestDiff:
         assert back.out.splitlines()[1] == "    - requester vehicle01"
         assert "- connection vehicle01/edge for vehicle01" in back.out.splitlines()
         assert back.out.splitlines()[-1].startswith(f"- release {TARGET_END} (")
+
+    def test_who_holds_a_topic_no_longer_is_told(
+        self, demandops: Run, state: Any, request_json: Run
+    ) -> None:
+        ego = [("/a", "vehicle00"), ("/b", "vehicle00")]
+        link = {"id": "vehicle00/edge", "who": ["vehicle00", "station00"]}
+        both = application(who=link["who"], ego=ego, clouds=[])
+        request_json(goal([both], [connection(**link, topics=["/a", "/b"])]))
+        one = application(who=["vehicle00"], ego=ego[:1], clouds=[])
+        leaves = connection(**{**link, "who": ["vehicle00"]}, topics=["/a"])
+        request_json(goal([one], [leaves], shutdown=True))
+        ran = demandops("diff", "main~1", "main", "--state-repo", state.path)
+        assert ran.out.splitlines() == [
+            f"~ service {FUSION}",
+            "    - ego_data /a for vehicle00",
+            "~ connection vehicle00/edge",
+            "    - topic /a for vehicle00",
+            "no difference in releases",
+        ]
+        shown = demandops("bookkeeping", "--state-repo", state.path).out
+        cells = [[c.strip() for c in line.split("│")][-3:-1] for line in shown.splitlines()]
+        rows = [["/a (station00)", "station00"], ["/b", "vehicle00"]]
+        assert [one for one in cells if one[:1] and one[0].startswith("/")] == rows * 2
 
     def test_the_json_tells_the_same(self, demandops: Run, joined: Any) -> None:
         ran = demandops("diff", "main~1", "main", "--state-repo", joined.path, "--output", "json")

@@ -15,7 +15,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,12 +92,45 @@ class Served:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
         return data
 
-    def wait_for(self, text: str) -> None:
-        """Wait until the log has a text."""
-        end = time.monotonic() + DEADLINE_S
-        while text not in self.log.read_text():
-            assert time.monotonic() < end, f"the log does not say: {text}"
+    def wait_for(self, text: str, seconds: float = DEADLINE_S) -> None:
+        """Wait until the log has a text; if it does not come, say what the process does instead.
+
+        Time in which the process waits for a processor does not count: with much else to do, this
+        machine has let a start wait for half a minute that needs two seconds.
+        """
+        began = time.monotonic()
+        while True:
+            _, waited = self._scheduled(self.process.pid)
+            ended = self.process.poll() is not None
+            if text in self.log.read_text():
+                return
+            is_late = time.monotonic() - began - waited >= seconds
+            assert not (ended or is_late), f"the log does not say: {text}\n{self.last_words()}"
             time.sleep(0.05)
+
+    def last_words(self) -> str:
+        """Return how the process ended; or abort it, and return where it was, and its log."""
+        code, pid = self.process.poll(), self.process.pid
+        lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
+        if code is None:
+            for task in sorted(Path(f"/proc/{pid}/task").iterdir()):
+                with suppress(OSError):  # it may end meanwhile
+                    name, waits = ((task / file).read_text().strip() for file in ("comm", "wchan"))
+                    ran, waited = self._scheduled(int(task.name))
+                    times = f"ran {ran:.1f} s, waited {waited:.1f} s for a processor"
+                    lines.append(f"{name}: {times}, now in {waits}")
+            self.process.send_signal(signal.SIGABRT)  # Python prints where each thread is
+            self.process.wait(30)
+        return "\n".join([*lines, self.log.read_text()])
+
+    def _scheduled(self, thread: int) -> tuple[float, float]:
+        """Return for how many seconds a thread ran, and waited for a processor."""
+        try:
+            path = Path(f"/proc/{self.process.pid}/task/{thread}/schedstat")
+            ran, waited, _ = map(int, path.read_text().split())
+        except (OSError, ValueError):  # it ended
+            return 0.0, 0.0
+        return ran / 1e9, waited / 1e9
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
         self.process.send_signal(number)
@@ -122,6 +155,7 @@ class Servers:
             **os.environ,
             "ROS_DOMAIN_ID": str(self._domain),
             "ROS_LOG_DIR": str(self._folder / "ros-log"),
+            "PYTHONFAULTHANDLER": "1",
             **self._environment,
         }
         with log.open("w") as sink:

@@ -32,11 +32,13 @@ def _goal(number: int) -> rig.Goal:
 def _killed_in_a_burst(served: Served, client: Client, goals: range, pause: float) -> list[Sent]:
     """Kill a node that has accepted a goal, and return the goals."""
     served.wait_for("taking demands")
-    while True:  # it may still know only the node that was killed
+    for _ in range(30):  # it may still know only the node that was killed
         first = client.send(_goal(0))
         with suppress(AssertionError):
             client.wait(lambda: first.answered, 2)  # noqa: B023
             break
+    else:
+        raise AssertionError(served.last_words())
     sent = [client.send(_goal(number)) for number in goals]
     end = time.monotonic() + pause
     client.wait(lambda: time.monotonic() >= end and any(goal.accepted for goal in sent))

@@ -83,7 +83,7 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node("of_a_test", context=context)
-    handler = RosLogHandler(node)
+    handler = RosLogHandler(node.get_logger())
     for level in (logging.DEBUG, logging.INFO, logging.ERROR):
         handler.handle(logging.LogRecord("x", level, "", 1, "of level %d", (level,), None))
     node.destroy_node()
@@ -136,6 +136,7 @@ def test_a_hundred_goals_at_once_are_all_answered_and_none_is_lost(
     booked = {f"c{number}" for number in range(2000, 2120)}
     assert shared.bookkeeping()["connections"].keys() >= booked
     assert git(shared.state_repo, "rev-list", "--count", f"{before}..main") == "120"
+    assert shared.log.read_text().count("more than 10 goals are open: a client with ROS 2's") == 1
 
 
 def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
@@ -154,6 +155,22 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
     assert (waiting.status, committed.status) == ("cancelled", "succeeded")
     assert list(served.bookkeeping()["connections"]) == ["c1"]
     assert git(bare, "rev-list", "--count", "main") == "2"
+
+
+def test_a_restart_logs_what_it_takes_from_the_journal(
+    serve: Serve, client: Client, bare: Path
+) -> None:
+    remote = held_remote(bare)
+    killed = serve(remote)
+    client.ready()
+    sent = client.send(connection(1))
+    client.wait(lambda: sent.accepted is True)
+    killed.process.kill()
+    served = serve(remote)
+    (bare / "go").touch()
+    served.wait_for("taking demands")
+    served.wait_for("('request1') from the journal: pushed")
+    assert re.search(r"\[INFO\] .*\[demandops\]: resuming demand \S+ from", served.log.read_text())
 
 
 def test_a_stopped_node_first_finishes_the_open_goals(

@@ -1,13 +1,27 @@
-"""What `demandops serve` refuses at its start, with the remedy."""
+"""What `demandops serve` refuses at its start, with the remedy; a start that hangs is told."""
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tests.kit.cli import Run
+from tests.kit.ros import Served
 
+HANGS = """
+import sys, threading
+
+def hang():
+    sys.stderr.write("hangs\\n")
+    threading.Event().wait()
+
+threading.Thread(target=hang).start()
+hang()
+"""
 LOG_LEVEL = "parameter log_level is 'loud'; it takes debug, info, warn, error, fatal"
 
 
@@ -52,3 +66,24 @@ def test_a_missing_state_repo_is_refused_with_the_remedy(tmp_path: Path, demando
         f"error: {tmp_path}/nowhere does not exist; make a state repo with "
         f"`demandops init {tmp_path}/nowhere --bare`\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("raise SystemExit('over')", r"ended with 1\nover\n"),
+        (HANGS, r"(?s)runs as \d+\n.*: ran \d+\.\d s, waited .*line 6 in hang\n.*line 6 in hang\n"),
+    ],
+)
+def test_a_test_that_waits_in_vain_tells_what_the_process_does(
+    tmp_path: Path, program: str, told: str
+) -> None:
+    log = tmp_path / "log"
+    with log.open("w") as sink:
+        command = [sys.executable, "-X", "faulthandler", "-c", program]
+        served = Served(subprocess.Popen(command, stderr=sink, text=True), "", log, {}, 0)
+    if program == HANGS:
+        served.wait_for("hangs\nhangs\n")
+    with pytest.raises(AssertionError, match=told):
+        served.wait_for("taking demands", 60 if program != HANGS else 0.5)
+    assert served.process.returncode in (1, -signal.SIGABRT)

@@ -26,6 +26,11 @@ class InputTopic(NamedTuple):
     type: str = ""
     further: bool = False
 
+    @property
+    def part(self) -> str:
+        """Its source as part of a topic name, with the topic if it is a further one."""
+        return naming.topic_part(self.source, self.topic if self.further else "")
+
 
 @dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
@@ -156,7 +161,9 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
             yield ("node", topic.source)
-            if not topic.further:
+            if topic.further:
+                yield ("further", topic.part)
+            else:
                 yield ("usual", topic.source, role)
         yield ("topics", naming.topic_part(self.id))
 

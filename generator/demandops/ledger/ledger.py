@@ -38,6 +38,11 @@ class ClaimChange:
         assert claim is not None  # noqa: S101 - a change has at least one side
         return claim.key
 
+    @property
+    def only_renews(self) -> bool:
+        """Whether a demand that adds claims changed at most the lease of this one."""
+        return bool(self.before and self.after and self.before.booked == self.after.booked)
+
 
 @dataclass(frozen=True, slots=True)
 class Changes:
@@ -74,7 +79,7 @@ class Ledger:
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
-    ``shutdowns`` are those of the last 15 minutes.
+    ``shutdowns`` are the recent ones.
     """
 
     claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
@@ -149,6 +154,13 @@ class Ledger:
         topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
         usual = {one.topic for one in topics if one.source == source and not one.further}
         yield from sorted(usual - {but})
+
+    def further_topics(self, role: str, part: str) -> Iterator[InputTopic]:
+        """Yield the further topics of sources that are called ``part`` in names of topics."""
+        for claim in self._claims("further", part):
+            for topic in claim.application.inputs.get(role, ()):
+                if topic.further and topic.part == part:
+                    yield topic
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""

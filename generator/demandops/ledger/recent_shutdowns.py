@@ -1,8 +1,8 @@
-"""Recent shutdowns: those of the last 15 minutes, so that one that is sent again is recognized.
+"""Recent shutdowns, so that one that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
-record the repeat would release another demand of the same requesters. A join in the name of one
-of the requesters ends the record, because a later shutdown may mean what was joined.
+record the repeat would release another demand of the same requesters. A join that adds something
+in the name of one of the requesters ends the record: a later shutdown may mean what was joined.
 
 Each is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
 """
@@ -30,7 +30,10 @@ from demandops.settings import LEDGER_API_VERSION
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
 REMEMBERED = timedelta(minutes=15)
-"""For how long a shutdown is remembered."""
+"""For how long the same shutdown is a repeat."""
+
+_KEPT = timedelta(hours=1)
+"""For how long its file is kept, because a repeat may wait in a journal while others are booked."""
 
 _FORGOTTEN = 10
 """How many old shutdowns one booking forgets at most."""
@@ -101,9 +104,9 @@ class RecentShutdowns:
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
         """Return the shutdowns without the forgotten ones, and the digests of these.
 
-        Forgotten are those of ``requesters`` and some that are older than 15 minutes.
+        Forgotten are those of ``requesters`` and some that are older than an hour.
         """
-        first = _minute(now - REMEMBERED)
+        first = _minute(now - _KEPT)
         ended = sorted(one for one in self.by_minute if one < first)
         old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))
         forgotten = {*islice(old, _FORGOTTEN)}

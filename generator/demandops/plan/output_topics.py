@@ -40,7 +40,7 @@ def instance_of(config: Config, role: str, topic: InputTopic) -> str:
     """Return what ``{instance}`` is for the service that has ``topic`` as its input."""
     usual = usual_topic(config, topic.source, role)
     is_usual = topic.topic == usual or (usual is None and not topic.further)
-    return naming.topic_part(topic.source, "" if is_usual else topic.topic)
+    return topic._replace(further=not is_usual).part
 
 
 def named(pattern: str, instance: str) -> str:

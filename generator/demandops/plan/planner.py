@@ -165,13 +165,14 @@ def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str
 
 
 def demanded_inputs(
-    config: Config, release: ServiceRelease, app: Application
+    world: World, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
     """Yield role and topic of each input that an application gives a service, and its root.
 
     The root is the demanded topic that the input is or is made from; it may be empty.
     """
     service, key = release.service, release.key
+    app = _first(world, app).with_inputs(app.inputs)
     if service.roots:
         kept = {*roots_of(app, service, key)}
         left = {
@@ -180,7 +181,7 @@ def demanded_inputs(
         }
         app = app.with_inputs(left)
     for role in service.inputs:
-        for one in made(config, app, _origin(config, key, role, app)):
+        for one in made(world.config, app, _origin(world.config, key, role, app)):
             yield role, one.topic.topic, one.root
 
 

@@ -16,7 +16,7 @@ from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, policy_faults_of_edit
+from demandops.decision import State, faults_of_edit
 from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
 from demandops.ledger import claim_file, ended_override_file
@@ -155,7 +155,7 @@ def _plan(
     start = state_in_effect.start_at(objects, tip)
     known = start.state
     edited = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, known.ledger)
-    refused = list(policy_faults_of_edit(known, state, edited))
+    refused = list(faults_of_edit(known, state, edited))
     if refused:
         raise InvalidInput(refused)
     subjects = ledger_files.changed_subjects(known.ledger, state.ledger)

@@ -1,6 +1,6 @@
 """Text from outside stays a value: no message is forged, and no commit passes for the generator's.
 
-A claim that a person writes by hand is judged by policy, like a demand.
+A claim that a person writes by hand is judged like a demand.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.demand.claim import ClaimKey
 from demandops.ledger import claim_file
 from demandops.service import Generator
 from demandops.staterepo import reader
 from demandops.staterepo.load import problem_report
 from demandops.staterepo.pull_request import merge_check
+from demandops.subject import Subject, SubjectKind
 
 from tests.kit import goals, rig
 from tests.kit.repo import FORGER, git, read
@@ -107,13 +109,15 @@ def with_rules(bare: Path, **quotas: int) -> str:
     return yaml.safe_dump(data)
 
 
-def by_hand(bare: Path, requester: str, demand: str = "by-hand") -> dict[str, str | None]:
+def by_hand(
+    bare: Path, requester: str, app: str = "edge/d1", demand: str = "by-hand"
+) -> dict[str, str | None]:
     """A claim like the one of user1, for another requester."""
     path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
     data = yaml.safe_load(read(bare, path))
-    data |= {"demand": demand, "requesters": [requester]}
-    folder = path.rsplit("/", 1)[0]
-    return {f"{folder}/{claim_file.segment(demand)}.yaml": yaml.safe_dump(data)}
+    data |= {"application": app, "demand": demand, "requesters": [requester]}
+    key = ClaimKey(Subject(SubjectKind.APPLICATION, app), demand)
+    return {claim_file.path_of(key): yaml.safe_dump(data)}
 
 
 def held(bare: Path) -> set[tuple[str, ...]]:
@@ -123,22 +127,24 @@ def held(bare: Path) -> set[tuple[str, ...]]:
 
 
 @pytest.mark.parametrize(
-    ("requester", "most", "why"),
+    ("requester", "most", "app", "why"),
     [
-        ("control-room", 10, "no rule of access domain 'perception' is for 'control-room'"),
-        ("user1", 2, "'user1' would hold 3 claims"),
+        ("control-room", 10, "edge/d1", "no rule of access domain 'perception' is for 'control-ro"),
+        ("user1", 2, "edge/d1", "'user1' would hold 3 claims"),
+        ("user1", 10, "edge-d1", "which application 'edge/d1' publishes on 'edge' already; use an"),
     ],
 )
-def test_a_claim_by_hand_that_policy_refuses_is_held_back(
-    bare: Path, person: Person, requester: str, most: int, why: str
+def test_a_claim_by_hand_that_a_demand_could_not_book_is_held_back(
+    bare: Path, person: Person, requester: str, most: int, app: str, why: str
 ) -> None:
     demands = [goals.put(f"d{number}", f"user{number}") for number in range(1, 4)]
     with rig.running(bare) as generator:
         rig.book(generator, *demands[:2])
-        claim = by_hand(bare, requester)
+        claim = by_hand(bare, requester, app)
         person.change({POLICY: with_rules(bare, claimsPerRequester=most)})
         person.fetch()
         for path, text in claim.items():
+            (person.folder / path).parent.mkdir(parents=True, exist_ok=True)
             (person.folder / path).write_text(str(text))
         (fault,) = merge_check.check(person.folder).faults
         assert why in str(fault)

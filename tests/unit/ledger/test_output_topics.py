@@ -1,4 +1,4 @@
-"""Detection and fusion publish the reference's topics; two never publish one topic on a node."""
+"""Detection and fusion publish the reference's topics; a node never gets a topic twice."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.decision import faults_of_edit
 from demandops.demand.claim import Claim
+from demandops.ledger.claim_file import path_of
+from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.operations.restoration import Restoration
 from demandops.plan.output_topics import with_booked_topics_marked
 
 from tests.kit.config import skeleton
-from tests.kit.goals import APP, CLOUD, Topic, application, goal
+from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal
 from tests.kit.memory import MemoryRepo, rebuilt
 
 FRONT, REAR = ("/front/points", "vehicle01"), ("/rear/points", "vehicle01")
@@ -139,6 +143,117 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
         "publishes on 'cloud' already; name the usual one of the two as topics.point_cloud of "
         "'vehicle01' in inventory/nodes.yaml"
     ]
+
+
+def bringing(topic: str, **more: Any) -> Any:
+    return goal([], [connection("link", topics=["/other"], targets=[topic], **more)])
+
+
+@pytest.mark.parametrize("at_once", [True, False])
+def test_an_application_whose_topic_a_connection_brings_is_refused(at_once: bool) -> None:
+    repo = MemoryRepo()
+    link, app = bringing("/edge_1_global_objectlist"), join(CLOUD, id="edge/1")
+    if at_once:
+        app["connections"] = link["connections"]
+    else:
+        repo.send(link)
+    assert repo.faults(app) == [
+        "apps[0].header.id: its fused_objects is /edge_1_global_objectlist, which connection "
+        "'link' brings to 'edge' already; use another application id"
+    ]
+
+
+def test_a_source_whose_topic_a_connection_brings_is_refused() -> None:
+    repo = MemoryRepo()
+    repo.send(bringing(PLAIN))
+    assert repo.faults(join(FRONT)) == [
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its object_list is "
+        f"{PLAIN}, which connection 'link' brings to 'edge' already; let the connection give it "
+        "another name there"
+    ]
+    repo.send(join(REAR, FRONT, shutdown=False) | {"apps": [application(node="cloud")]})
+
+
+@pytest.mark.parametrize(("topic", "cloud"), [(PLAIN, FRONT), (REAR_SLUG, REAR)])
+def test_a_connection_that_brings_what_a_service_publishes_is_refused(
+    topic: str, cloud: Topic
+) -> None:
+    repo = MemoryRepo()
+    repo.send(join(FRONT, REAR))
+    clash = (
+        f"connection 'link' brings {topic} to 'edge', where object-detection for {cloud[0]} of "
+        "'vehicle01' publishes it already; use a connection that gives it another name there"
+    )
+    assert repo.faults(bringing(topic)) == [f"connections[0].target_topics[0]: {clash}"]
+    repo.send(bringing(topic, ends=("edge", "vehicle00")))
+    back = {"id": "link", "type": "mqtt", "source": "edge", "target": "vehicle01"}
+    back |= {"topics": [{"source": topic, "target": "/other", "reverse": True}]}
+    head = {"kind": "Demand", "demand": "d", "requesters": ["vehicle01"]}
+    assert MemoryRepo(state=repo.state).faults(head | {"connections": [back | {"id": "back"}]}) == [
+        f"connections[0].topics[0].source: {clash.replace('link', 'back')}"
+    ]
+
+
+def claims_after(*goals: Any) -> list[Claim]:
+    """Return the claims of goals that are each decided alone."""
+    repos = [MemoryRepo() for _ in goals]
+    for repo, one in zip(repos, goals, strict=True):
+        repo.send(one)
+    return [claim for repo in repos for claim in repo.state.ledger]
+
+
+def test_what_clashes_already_may_be_asked_for_again_and_released() -> None:
+    link, cloud = bringing(PLAIN), join(FRONT)
+    ledger = rebuilt(claims_after(link, cloud))
+    repo = MemoryRepo(state=replace(MemoryRepo().state, ledger=ledger))
+    goals = (link, link | {"id": "again"}, join(FRONT, who="vehicle00"), cloud | {"shutdown": True})
+    outcomes = [repo.decide(one).outcome for one in goals]
+    assert outcomes == ["unchanged", "booked", "booked", "released"]
+
+
+def test_a_claim_that_a_person_writes_or_restores_must_not_bring_a_topic_twice() -> None:
+    here = MemoryRepo()
+    here.send(join(CLOUD, id="edge/fusion-1"))
+    app, link = claims_after(
+        join(CLOUD, id="edge-fusion/1"), bringing("/edge_fusion_1_global_trajectories")
+    )
+    both = replace(here.state, ledger=rebuilt([*here.state.ledger, app, link]))
+    changes = [ClaimChange(None, claim) for claim in (app, link)]
+    found = [*map(str, faults_of_edit(here.state, both, changes))]
+    refusal = here.take(Restoration("rollback", claims=tuple(both.ledger)))
+    assert sorted(str(refusal).splitlines()) == sorted(found)
+    assert found == [
+        f"{path_of(app.key)}: id: its fused_objects is /edge_fusion_1_global_objectlist, which "
+        "application 'edge/fusion-1' publishes on 'edge' already; use another application id",
+        f"{path_of(link.key)}: topics[0].target: connection 'link' brings "
+        "/edge_fusion_1_global_trajectories to 'edge', where application 'edge/fusion-1' "
+        "publishes it already; use a connection that gives it another name there",
+    ]
+
+
+def test_a_persons_claim_of_another_type_changes_nothing_of_what_the_application_is() -> None:
+    appdef = yaml.safe_load(skeleton()["appdefs/object-detection-fusion/appdef.yaml"])
+    appdef["services"] = {"x": appdef["services"]["object-detection"] | {"prefix": "x"}}
+    del appdef["deploymentRequest"]
+    values = "values/object-detection.yaml.j2"
+    repo = MemoryRepo(
+        {
+            "appdefs/other/appdef.yaml": yaml.safe_dump(appdef | {"name": "other"}),
+            f"appdefs/other/{values}": skeleton()[f"appdefs/object-detection-fusion/{values}"],
+        }
+    )
+    repo.send(join(CLOUD))
+    (claim,) = repo.state.ledger
+    (more,) = claims_after(join(FRONT, who="vehicle01"))
+    written = replace(more, demand="z", held=replace(more.application, appdef="other"))
+    after = replace(repo.state, ledger=rebuilt([claim, written]))
+    assert not list(faults_of_edit(repo.state, after, [ClaimChange(None, written)]))
+    services = MemoryRepo(state=after).books()["services"].values()
+    (inputs,) = [one["inputs"] for one in services if one["service"] == "object-fusion"]
+    assert inputs["object_list"] == {
+        "/vehicle00_local_objectlist": ["vehicle01"],
+        PLAIN: ["vehicle01"],
+    }
 
 
 def without_marks(claim: Claim) -> Any:

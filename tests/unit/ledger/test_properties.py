@@ -13,11 +13,12 @@ import pytest
 from demandops.decision import Decision, rendered_files
 from demandops.demand.claim import ClaimKey, demand_id
 from demandops.ledger import claim_file
+from demandops.ledger.recent_shutdowns import SHUTDOWNS_ROOT
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import TIMES, chances, examples, told
-from tests.kit.goals import application, connection, goal
+from tests.kit.goals import application, connection, goal, link
 from tests.kit.memory import MemoryRepo, ledger_in, outcome
 from tests.model.books import Books, Demand, Goal, Result
 from tests.model.goals import SKELETON, Maker, ego, shutdown_of
@@ -132,6 +133,19 @@ def test_a_subject_listed_twice_in_one_shutdown_costs_one_claim_only() -> None:
 
     (left,) = repo.state.ledger
     assert left.request == "second"
+
+
+def test_a_repeat_that_waited_in_a_journal_is_a_repeat_when_others_were_booked_meanwhile() -> None:
+    repo = MemoryRepo()
+    repo.send(goal([], [connection()], id="a"))
+    repo.send(goal([], [connection()], id="b"))
+    ends = goal([], [connection()], id="a", shutdown=True)
+    repo.send(ends)
+    repo.send(link(0), repo.now + timedelta(minutes=50))
+    assert repo.decide(ends, repo.now + timedelta(minutes=10)).outcome == "unchanged"
+    repo.send(link(1), repo.now + timedelta(minutes=62))
+    assert not repo.state.ledger.shutdowns.by_digest
+    assert not any(path.startswith(SHUTDOWNS_ROOT) for path in repo.files)
 
 
 def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> None:

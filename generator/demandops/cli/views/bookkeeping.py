@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 
 import click
 from rich.table import Table
 
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import at_option, progress, state_repo_option, warn_of
-from demandops.plan.views.bookkeeping import as_data
+from demandops.plan.views.bookkeeping import ConnectionEntry, ServiceEntry, as_data
 from demandops.plan.views.bookkeeping import bookkeeping as derive
 from demandops.staterepo import reader
 
@@ -28,10 +28,11 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     services = [
         (
             name,
-            entry.service,
+            "\n".join([entry.service, *(f"{key} = {v}" for key, v in entry.parameters.items())]),
+            entry.version,
             entry.node,
             entry.source or ", ".join(entry.applications),
-            "\n".join(topic for topics in entry.inputs.values() for topic in topics),
+            "\n".join(line for topics in entry.inputs.values() for line in _lines(topics, entry)),
             "\n".join(entry.requesters),
         )
         for name, entry in books.services.items()
@@ -42,7 +43,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
             entry.type,
             entry.source,
             entry.target,
-            "\n".join(entry.topics),
+            "\n".join(_lines(entry.topics, entry)),
             "\n".join(entry.requesters),
         )
         for id, entry in books.connections.items()
@@ -57,8 +58,9 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         )
         for entry in books.suspended
     ]
+    kinds = ("Service", "Kind", "Version", "Node", "For", "Takes in", "Requesters")
     tables = [
-        _table("Services", ("Service", "Kind", "Node", "For", "Takes in", "Requesters"), services),
+        _table("Services", kinds, services),
         _table(
             "Connections", ("Connection", "By", "From", "To", "Topics", "Requesters"), connections
         ),
@@ -67,6 +69,12 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         columns = ("Subject", "Demand", "Requesters", "By", "Reason")
         tables.append(_table("Suspended", columns, suspended))
     show(output, as_data(books, commit), [*tables, f"at {commit}"])
+
+
+def _lines(topics: Mapping[str, list[str]], entry: ServiceEntry | ConnectionEntry) -> Iterator[str]:
+    """Yield each topic, with its requesters if they are not all of the entry's."""
+    for topic, who in topics.items():
+        yield topic if who == entry.requesters else f"{topic} ({', '.join(who)})"
 
 
 def _table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:

@@ -32,5 +32,7 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     changes = claim_changes(start, ledger, keys)
     if not changes:
         return start, Changes()
-    shutdowns, forgotten = start.shutdowns.forget(now, request.requesters())
+    # a join that only renews must not make a repeat a new shutdown: it would end another demand
+    adds = not all(change.only_renews for change in changes)
+    shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
     return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)

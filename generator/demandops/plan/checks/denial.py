@@ -33,12 +33,7 @@ def faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[F
     denying = [one for one in reversed(after.overrides) if one.deny]
     if not denying or not request.adds_claims:
         return
-    renewed = {
-        change.key.subject: change.before is not None
-        and change.after is not None
-        and change.before.booked == change.after.booked
-        for change in changes.claims
-    }
+    renewed = {change.key.subject: change.only_renews for change in changes.claims}
     for one in request.demanded:
         if renewed.get(one.held.subject, True):
             continue

@@ -1,6 +1,7 @@
-"""Topic clashes: two services on one node would publish the same topic, so a demand is refused.
+"""Topic clashes: a node would have two sources of one topic, so a demand is refused.
 
-Topics are named as the reference names them, so two ids may give one name: ``a/b`` and ``a-b``.
+Topics are named as the reference names them, so two ids may give one name: ``a/b`` and ``a-b``. A
+connection may also bring a topic to a node where a service publishes the same one.
 """
 
 from __future__ import annotations
@@ -12,48 +13,102 @@ from itertools import islice
 from demandops import naming
 from demandops.config.appdef import Service
 from demandops.config.config import NODES_FILE
+from demandops.connections.connection import Connection
 from demandops.demand.application import Application
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Demanded, DemandRequest
 from demandops.errors import Fault, fault
+from demandops.ledger.claim_file import path_of
+from demandops.ledger.operations.restoration import request_for
 from demandops.ledger.world import World
 from demandops.plan.output_topics import outputs, usual_topic
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import ReleaseKey, claims_needing, is_needed, keys_of
+from demandops.plan.release_keys import (
+    ReleaseKey,
+    claims_needing,
+    is_needed,
+    keys_of,
+    keys_of_claims,
+)
 from demandops.subject import Subject, SubjectKind
 
 
 def faults(
     request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new service with a topic that another on its node publishes.
+    """Yield a fault for each new service or route with a topic that its node has already.
 
     Args:
-        request: the demand.
+        request: the demand. One that only releases has no faults.
         before, after: the world before and after it.
         keys: the releases that it may change.
     """
+    if not request.adds_claims:
+        return
     for key in keys:
-        if not isinstance(key, ServiceKey) or is_needed(before, key):
+        if isinstance(key, ServiceKey) and not is_needed(before, key):
+            for service in _service(after, key):
+                yield from _of_service(request, after, key, service)
+    for one in request.demanded:
+        if isinstance(one.held, Connection):
+            yield from _of_connection(one, one.held, before)
+
+
+def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
+    """Yield the faults of a claim that a person wrote or restores, located in its file."""
+    keys = keys_of_claims(after, [claim])
+    for found in faults(request_for(claim), before, after, keys):
+        yield found.within(path_of(claim.key))
+
+
+def _of_service(
+    request: DemandRequest, after: World, key: ServiceKey, service: Service
+) -> Iterator[Fault]:
+    clashes = (
+        (name, topic, *clash)
+        for name, topic in _topics(after, service, key).items()
+        for clash in _clashes(after, key, service, topic)
+    )
+    for name, topic, clash, remedy in islice(clashes, 1):
+        yield fault(
+            _field(request, key, service),
+            f"its {name} is {topic}, which {clash} '{key.node}' already; {remedy}",
+            code="conflict",
+        )
+
+
+def _clashes(
+    world: World, key: ServiceKey, service: Service, topic: str
+) -> Iterator[tuple[str, str]]:
+    """Yield what else gives the node of ``key`` this topic, and the remedy."""
+    for other in _publishers(world, key.node, topic, but=key):
+        yield f"{_words(other)} publishes on", _remedy(key, other, service)
+    for id in world.ledger.connections_bringing(key.node, topic):
+        yield f"connection '{id}' brings to", _remedy(key, None, service)
+
+
+def _of_connection(one: Demanded, connection: Connection, before: World) -> Iterator[Fault]:
+    """Yield a fault for each new route to a topic that a service published before the demand."""
+    for index, route in enumerate(connection.topics):
+        _, node = route.sender_and_receiver(*connection.nodes)
+        topic = route.written_topic
+        if connection.id in before.ledger.connections_bringing(node, topic):
             continue
-        for service in _service(after, key):
-            clashes = (
-                (name, topic, other)
-                for name, topic in _topics(after, service, key).items()
-                for other in _others(after, key, topic)
+        for other in islice(_publishers(before, node, topic), 1):
+            yield one.fault(
+                f"topics[{index}].{'source' if route.reverse else 'target'}",
+                f"connection '{connection.id}' brings {topic} to '{node}', where "
+                f"{_words(other)} publishes it already; use a connection that gives it another "
+                "name there",
+                code="conflict",
             )
-            for name, topic, other in islice(clashes, 1):
-                yield fault(
-                    _field(request, key, service),
-                    f"its {name} is {topic}, which {_words(other)} publishes on '{key.node}' "
-                    f"already; {_remedy(key, other, service)}",
-                    code="conflict",
-                )
 
 
 def _service(world: World, key: ServiceKey) -> Iterator[Service]:
     """Yield the service of a key, if it must run."""
     for claim in claims_needing(world, key)[:1]:
-        yield world.config.services[claim.application.appdef][key.service]
+        first = world.ledger.application(claim.subject.id) or claim.application
+        yield world.config.services[first.appdef][key.service]
 
 
 def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
@@ -62,8 +117,10 @@ def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
     return outputs(world.config, service, key, further=bool(booked and booked.further))
 
 
-def _others(world: World, key: ServiceKey, topic: str) -> Iterator[ServiceKey]:
-    """Yield the other services on the node of ``key`` that publish ``topic``.
+def _publishers(
+    world: World, node: str, topic: str, *, but: ServiceKey | None = None
+) -> Iterator[ServiceKey]:
+    """Yield the services on a node that publish ``topic``, without ``but``.
 
     An appdef's pattern says which instance of its service would, and the ledger whether it runs.
     """
@@ -75,38 +132,42 @@ def _others(world: World, key: ServiceKey, topic: str) -> Iterator[ServiceKey]:
                 match = re.fullmatch(expression, topic)
                 if match is None:
                     continue
-                found = _named(world, key, name, service, match[1]) if others else _all(world, key)
-                for other in found:
-                    if other != key and other.service == name and is_needed(world, other):
-                        yield other
+                found = (
+                    _named(world, node, name, service, match[1], but)
+                    if others
+                    else _all(world, node, name)
+                )
+                yield from (key for key in found if key != but and is_needed(world, key))
 
 
 def _named(
-    world: World, key: ServiceKey, name: str, service: Service, instance: str
+    world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the instances of a service on the node of ``key`` that are called ``instance``."""
+    """Yield the instances of a service on a node that are called ``instance``."""
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope == "node":
-        if naming.topic_part(key.node) == instance:
-            yield ServiceKey(name, key.node)
+        if naming.topic_part(node) == instance:
+            yield ServiceKey(name, node)
         return
     if role is None:
         for id in ledger.applications_in_topics(instance):
-            yield ServiceKey(name, key.node, application=id)
+            yield ServiceKey(name, node, application=id)
         return
     for source in config.nodes_by_topic_part.get(instance, ()):
         usual = usual_topic(config, source, role)
-        own = str(key.topic) if source == key.source else ""
+        own = str(but.topic) if but and source == but.source else ""
         for topic in (usual,) if usual else ledger.usual_topics(role, source, but=own):
-            yield ServiceKey(name, key.node, source=source, topic=topic)
+            yield ServiceKey(name, node, source=source, topic=topic)
+    for further in ledger.further_topics(role, instance):
+        yield ServiceKey(name, node, source=further.source, topic=further.topic)
 
 
-def _all(world: World, key: ServiceKey) -> Iterator[ServiceKey]:
-    """Yield the services on the node of ``key``."""
-    for id in world.ledger.applications_at(key.node):
-        for other in keys_of(world, Subject(SubjectKind.APPLICATION, id)):
-            if isinstance(other, ServiceKey) and other.node == key.node:
-                yield other
+def _all(world: World, node: str, name: str) -> Iterator[ServiceKey]:
+    """Yield the instances of a service on a node."""
+    for id in world.ledger.applications_at(node):
+        for key in keys_of(world, Subject(SubjectKind.APPLICATION, id)):
+            if isinstance(key, ServiceKey) and (key.node, key.service) == (node, name):
+                yield key
 
 
 def _words(key: ServiceKey) -> str:
@@ -117,9 +178,11 @@ def _words(key: ServiceKey) -> str:
     return f"{key.service} for {key.topic} of '{key.source}'"
 
 
-def _remedy(key: ServiceKey, other: ServiceKey, service: Service) -> str:
+def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service) -> str:
     if key.application is not None:
         return "use another application id"
+    if other is None:
+        return "let the connection give it another name there"
     if "node" in (key.scope, other.scope):
         return f"change this output in {service.file}"
     if key.source == other.source:

@@ -129,7 +129,7 @@ def _requesters_of_topics(claims: Iterable[Claim]) -> _Requesters:
 def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _Requesters]:
     found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
     for claim in claims_of(release, active.ledger):
-        for role, topic, key in demanded_inputs(active.config, release, claim.application):
+        for role, topic, key in demanded_inputs(active, release, claim.application):
             found[role][topic].update(claim.holders(key))
     return {role: _sorted(topics) for role, topics in found.items()}
 
@@ -185,26 +185,30 @@ def _changes(
         elif name not in old:
             yield EntryChange(kind, name, "added", new[name].requesters)
         elif old[name] != new[name]:
-            had, has = list(_facts(old[name])), list(_facts(new[name]))
+            had, has = list(_facts(old[name], new[name])), list(_facts(new[name], old[name]))
             lost = tuple(fact for fact in had if fact not in has)
             gained = tuple(fact for fact in has if fact not in had)
             yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
 
 
-def _facts(entry: _Entry) -> Iterator[str]:
+def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
+    """Yield what is to be said of an entry where it differs from another of the same name."""
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"
         yield f"by {entry.type}"
-        yield from _topic_facts("topic", entry.topics)
-        return
-    yield f"on {entry.node}"
-    yield from (f"for {application}" for application in entry.applications)
-    yield f"version {entry.version}"
-    yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
-    for role, topics in sorted(entry.inputs.items()):
-        yield from _topic_facts(role, topics)
+    else:
+        yield f"on {entry.node}"
+        yield from (f"for {application}" for application in entry.applications)
+        yield f"version {entry.version}"
+        yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
+    topics, known = _topics(entry), _topics(other)
+    for what, who in sorted(topics.items()):
+        yield what
+        # who comes or goes altogether is named above
+        yield from (f"{what} for {one}" for one in who if what in known and one in other.requesters)
 
 
-def _topic_facts(what: str, topics: _Requesters) -> Iterator[str]:
-    yield from (f"{what} {topic}" for topic in topics)
+def _topics(entry: _Entry) -> _Requesters:
+    inputs = {"topic": entry.topics} if isinstance(entry, ConnectionEntry) else entry.inputs
+    return {f"{role} {topic}": who for role, of in inputs.items() for topic, who in of.items()}

@@ -7,7 +7,7 @@ of the ledger that is not in effect. A restart and ``demandops verify`` start fr
 They then apply people's later changes with the same code as a running generator.
 
 People's changes that cannot be planned are not applied (quarantine). If a claim cannot be planned,
-for example because it names an unknown node, or if policy refuses it, its file stays as it is and
+for example because it names an unknown node, or if it is refused, its file stays as it is and
 its last valid version is in effect. If the new configuration is the reason, the old configuration
 stays in effect.
 """
@@ -20,7 +20,7 @@ from urllib.parse import quote, unquote
 
 from pygit2 import Oid, Repository, Tree
 
-from demandops.decision import State, changeset_of_edit, policy_faults_of_edit, rendered_files
+from demandops.decision import State, changeset_of_edit, faults_of_edit, rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import ClaimChange
@@ -180,8 +180,8 @@ class Judgement:
     """People's changes, and the faults of subjects with the new and with the old configuration.
 
     If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
-    be planned with the new one only, the new configuration is at fault. If policy refuses a claim
-    that a person wrote, that claim is at fault. ``refused`` has these faults, with the new
+    be planned with the new one only, the new configuration is at fault. If a claim that a person
+    wrote is refused, that claim is at fault. ``refused`` has these faults, with the new
     configuration.
     """
 
@@ -250,7 +250,7 @@ def judge(
     """Return the subjects that people changed since ``before`` and that cannot be accepted.
 
     Args:
-        held_back: the claim files that were refused, as a record says; without one, policy decides.
+        held_back: the claim files that were refused, as a record says; without one, judge them.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)
@@ -274,7 +274,7 @@ def judge(
     def refused_in(state: State) -> Faults:
         found: dict[Subject, tuple[Fault, ...]] = {}
         for change in by_people:
-            faults = tuple(policy_faults_of_edit(before.state, state, [change]))
+            faults = tuple(faults_of_edit(before.state, state, [change]))
             if faults:
                 found[change.key.subject] = (*found.get(change.key.subject, ()), *faults)
         return found

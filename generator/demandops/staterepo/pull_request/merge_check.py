@@ -17,7 +17,7 @@ from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.decision import State, policy_faults_of_edit, rendered_files, try_configuration
+from demandops.decision import State, faults_of_edit, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger, changes_on
@@ -170,12 +170,12 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield why policy refuses claims that the edit adds or changes."""
+        """Yield why claims that the edit adds or changes are refused."""
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
             changes = changes_on(old.ledger, state.ledger, subjects)
-            yield from policy_faults_of_edit(
+            yield from faults_of_edit(
                 old, state, [one for one in changes if claim_file.path_of(one.key) in self.files]
             )
 
