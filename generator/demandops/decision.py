@@ -29,7 +29,7 @@ from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
 from demandops.plan import implied_connections, output_topics
-from demandops.plan.checks import denial, quota, topic_clash
+from demandops.plan.checks import denial, quota, topic_clash, version_difference
 from demandops.plan.flows import flows
 from demandops.plan.overrides.claim_overrides import (
     with_kept_claims,
@@ -159,6 +159,12 @@ def decide(
     rendered = changeset.build_changeset(
         state, after, changes, keys, state.engine, read, state.plans
     )
+    differing = list(
+        version_difference.differences(request, state, after, changes.claims, rendered.plans)
+    )
+    refused = [found.fault for found in differing if found.policy == "refuse"]
+    if refused:
+        raise Refused(refused)
     after = state.followed_by(ledger, rendered.plans)
     on_stage("booked")
     outcome: Outcome = "unchanged"
@@ -176,9 +182,13 @@ def decide(
             *rendered.blocked,
             *_repeat(changes),
             *denial.warnings(request, after),
+            *filter(None, (found.warning() for found in differing)),
         ),
-        approval=permission.approval_reasons(
-            request, ((c.before, c.after) for c in changes.claims), state.config
+        approval=(
+            *permission.approval_reasons(
+                request, ((c.before, c.after) for c in changes.claims), state.config
+            ),
+            *filter(None, (found.approval_reason() for found in differing)),
         ),
         overrides=rendered.overrides,
     )

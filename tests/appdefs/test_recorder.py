@@ -153,6 +153,8 @@ def test_two_applications_of_different_kinds_share_a_driver(books: MemoryRepo) -
     assert drivers == {
         "drv-vehicle00-vehicle00": {
             "version": "0.1.0",
+            "application_version": None,
+            "versions_asked": {},
             "parameters": {"rate": 1},
             "applications": ["cloud/monitor", "edge/record"],
             "service": "driver",

@@ -302,7 +302,7 @@ def test_one_thing_has_the_documented_keys_in_every_command(
     assert keys["commit"] == [*ask("log")[0]] == list(told["started"])[:-1]
     assert keys["claim"] == [*back["restored"][0]] == [*told["claims"][0]][:-3]
     assert keys["subject"] == [*told["subject"]] == [*told["claims"][0]["subject"]]
-    assert keys["release"] == [*told["releases"][0]] == [*ask("status")["releases"][0]][:-6]
+    assert keys["release"] == [*told["releases"][0]] == [*ask("status")["releases"][0]][:-9]
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
     assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
     assert keys["fault"] == [*failed.json()["faults"][0]]

@@ -323,6 +323,8 @@ class TestBookkeeping:
                     "source": "vehicle00",
                     "source_topic": CLOUD[0],
                     "version": "0.1.0",
+                    "application_version": None,
+                    "versions_asked": {},
                     "parameters": {},
                     "inputs": {"point_cloud": {CLOUD[0]: ["vehicle00"]}},
                     "requesters": ["vehicle00"],
@@ -334,6 +336,8 @@ class TestBookkeeping:
                     "source": None,
                     "source_topic": None,
                     "version": "0.1.0",
+                    "application_version": None,
+                    "versions_asked": {},
                     "parameters": {},
                     "inputs": {
                         "ego_data": {},

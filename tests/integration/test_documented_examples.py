@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,16 @@ from click.testing import CliRunner
 from demandops.cli.main import cli
 from demandops.config.load import load
 from demandops.decision import State, decide, refusal_text, rendered_files
+from demandops.demand.demand_request import Expire
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.render.output_check import check_files
 from demandops.staterepo import skeleton
+from demandops.staterepo.history import commit_message
 
-from tests.kit.config import configuration
+from tests.kit.config import configuration, edited
+from tests.kit.memory import MemoryRepo
 
 DOCS = Path(__file__).parents[2] / "docs"
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=timezone.utc)
@@ -107,6 +110,33 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
     assert "NetworkPolicy" not in rendered_files(state())[path]
 
 
+def test_the_versions_of_the_documentation_are_an_update_and_back() -> None:
+    listed = block("versions.md", "apiVersion: demandops/v1\nkind: Versions")
+    source = "{oci: 'oci://charts.example/object-fusion', version: 0.2.0}"
+    charts = f"{skeleton.files()['registry/charts.yaml']}    channels: {{next: {source}}}\n"
+    definition = "appdefs/object-detection-fusion/appdef.yaml"
+    repo = MemoryRepo(
+        {"registry/versions.yaml": listed, "registry/charts.yaml": charts}
+        | edited(definition, "inputs:\n", "versions: update\ninputs:\n"),
+        now=NOW,
+    )
+    first, second = map(
+        yaml.safe_load,
+        (block("versions.md", f"kind: Demand\ndemand: {who}00") for who in ("station", "vehicle")),
+    )
+    repo.send(first)
+    (application,) = second["applications"]
+    upgrade = second | {"applications": [application | {"version": "2.0.0"}]}
+    reason = block("versions.md", "application definition").strip()
+    assert repo.decide(upgrade).approval == (reason,)
+    end = Expire(id=second["demand"], demand=second["demand"])
+    said = [text.strip() for text in blocks("versions.md") if "Desired state:" in text]
+    for goal, text in zip((second, end), said, strict=True):
+        decision = repo.send(goal, repo.now + timedelta(minutes=20 if goal is end else 0))
+        assert decision.approval == ()
+        assert f"\n{text}\n" in commit_message.of_decision(decision, "op", NOW)
+
+
 def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
     runner, files = CliRunner(), skeleton.files()
     listed = dict(
@@ -129,5 +159,5 @@ def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
 
 def test_schemas_are_written_to_a_folder(tmp_path: Path) -> None:
     ran = CliRunner().invoke(cli, ["schema", "--write", str(tmp_path / "schemas")])
-    assert ran.output == f"15 schemas in {tmp_path / 'schemas'}\n"
-    assert len(list((tmp_path / "schemas").glob("*.json"))) == 15
+    assert ran.output == f"16 schemas in {tmp_path / 'schemas'}\n"
+    assert len(list((tmp_path / "schemas").glob("*.json"))) == 16

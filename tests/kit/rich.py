@@ -9,7 +9,7 @@ from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
-from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile
+from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
 from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
@@ -29,6 +29,7 @@ CONFIG_MODELS: dict[str, type[BaseModel]] = {
     "registry/charts.yaml": ChartsFile,
     "registry/images.yaml": ImagesFile,
     "registry/clients.yaml": ClientsFile,
+    "registry/versions.yaml": VersionsFile,
     APPDEF: ApplicationDefinition,
     SERVICE: ServiceDefinition,
     "overrides/values.yaml": OverrideFile,
@@ -157,12 +158,27 @@ mqtt:{_CLIENT}
   messages: [std_msgs, sensor_msgs, perception_msgs]
 zenoh:{_CLIENT}
 ros:{_CLIENT}"""
+_VERSIONS = f"""
+apiVersion: demandops/v1
+kind: Versions
+applications:
+  object-detection-fusion:
+    default: 1.0.0
+    channels: {{next: 1.1.0}}
+    versions:
+      1.0.0: {{}}
+      1.1.0:
+        charts: {{object-detection: 0.2.0}}
+        images:
+          object-detection: {{repository: mirror.example/od, tag: v2, digest: '{_DIGEST}'}}
+"""
 _APPDEF = """
 apiVersion: demandops/v1
 kind: ApplicationDefinition
 name: object-detection-fusion
 description: Detects and fuses
 approval: none
+versions: update
 inputs:
   ego_data: {description: State of a vehicle, type: perception_msgs/msg/EgoData}
   point_cloud: {description: Lidar points, type: sensor_msgs/msg/PointCloud2}
@@ -246,6 +262,7 @@ def rich() -> dict[str, str]:
             "registry/charts.yaml": _CHARTS,
             "registry/images.yaml": _IMAGES,
             "registry/clients.yaml": _CLIENTS,
+            "registry/versions.yaml": _VERSIONS,
             APPDEF: _APPDEF,
             SERVICE: _SERVICE,
             "appdefs/lidar-driver/values/lidar-driver.yaml.j2": "replicas: {{ replicas }}\n",

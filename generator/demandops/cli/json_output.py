@@ -13,11 +13,14 @@ import click
 from rich.table import Table
 
 from demandops.cli.output import console
-from demandops.config.override import ImagePin, Override, format_time
+from demandops.config.override import Override, format_time
+from demandops.config.registry import ImagePin
 from demandops.demand.claim import Claim
 from demandops.errors import DemandOpsError, InvalidInput, fault
 from demandops.ledger import claim_file
-from demandops.plan.release import Release
+from demandops.ledger.ledger import Ledger
+from demandops.plan.release import Release, ServiceRelease
+from demandops.plan.views.release_causes import versions_asked
 from demandops.quoting import json_escaped
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
@@ -97,6 +100,7 @@ def claim_data(claim: Claim) -> Json:
         "subject": subject_data(claim.subject),
         "demand": claim.demand,
         "request": claim.request,
+        "version": (claim.is_on_application and claim.application.version) or None,
         "requesters": list(claim.requesters),
         "since": time_data(claim.booked),
         "lease": {"seconds": lease.seconds, "until": time_data(lease.until)} if lease else None,
@@ -118,6 +122,17 @@ def place_data(release: Release) -> Json:
 def release_data(release: Release) -> Json:
     """Return a release as JSON data."""
     return {"name": release.name, **place_data(release), "file": path_of(release)}
+
+
+def version_data(release: Release, ledger: Ledger) -> Json:
+    """Return the versions of a release that runs, and those that demands name."""
+    if not isinstance(release, ServiceRelease):
+        return {"version": None, "application_version": None, "versions_asked": {}}
+    return {
+        "version": release.chart.version,
+        "application_version": release.version.name or None,
+        "versions_asked": versions_asked(release, ledger),
+    }
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,6 +86,17 @@ at_option = click.option(
     help="A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h; default: "
     "the newest commit.",
 )
+
+
+def version_text(data: Mapping[str, Any]) -> str:
+    """Return the version that a service runs, and below it the versions that demands name."""
+    asked = data["versions_asked"].items()
+    return "\n".join(
+        [
+            data["application_version"] or data["version"] or "",
+            *(f"{version} asked by {', '.join(requesters)}" for version, requesters in asked),
+        ]
+    )
 
 
 @contextmanager

@@ -34,6 +34,14 @@ TopicPattern = Annotated[
 """A topic name; ``{instance}`` is replaced by the service's source or application."""
 
 
+VersionPolicy = Literal["refuse", "update", "upgrade"]
+"""What follows if demands ask for different versions of what they share.
+
+``refuse``: the later one is refused. ``update``: the newest version runs; another major version
+needs a person's approval. ``upgrade``: the newest version runs.
+"""
+
+
 class Input(CamelModel):
     """A role of demanded topics, for example ``point_cloud``."""
 
@@ -178,6 +186,7 @@ class ApplicationDefinition(FileModel):
     uses: dict[DnsLabel, dict[Word, str]] = Field(default_factory=dict)
     services: dict[DnsLabel, OwnService] = Field(default_factory=dict)
     approval: Approval = "none"
+    versions: VersionPolicy = "refuse"
 
     @model_validator(mode="after")
     def _consistent(self) -> ApplicationDefinition:

@@ -11,7 +11,15 @@ from demandops.config.appdef import ApplicationDefinition, Service, ServiceDefin
 from demandops.config.inventory import Broker, Cluster, Node
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
-from demandops.config.registry import DEFAULT_SETTINGS, Chart, ClientsFile, Image
+from demandops.config.registry import (
+    DEFAULT_SETTINGS,
+    ApplicationVersion,
+    Chart,
+    ClientsFile,
+    Image,
+    ImagePin,
+    VersionList,
+)
 from demandops.config.repo_settings import RepoSettings
 from demandops.errors import Refused
 
@@ -22,6 +30,7 @@ DOMAINS_FILE = "policy/access-domains.yaml"
 CHARTS_FILE = "registry/charts.yaml"
 IMAGES_FILE = "registry/images.yaml"
 CLIENTS_FILE = "registry/clients.yaml"
+VERSIONS_FILE = "registry/versions.yaml"
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
 """The top-level entries of a state repo that hold the configuration; people own them."""
@@ -50,12 +59,17 @@ class Config:
     files: Mapping[str, str]
     overrides: Mapping[str, Override] = field(default_factory=dict)
     clients: ClientsFile = DEFAULT_SETTINGS
+    versions: Mapping[str, VersionList] = field(default_factory=dict)
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
     """The nodes by what their id becomes in names of topics, which several may share."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The roles of which a service of any appdef runs once for each topic, sorted."""
+    application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
+        init=False, compare=False, repr=False
+    )
+    """Appdef → version or channel → what it runs; an empty name stands for the default."""
 
     def __post_init__(self) -> None:
         """Set what follows from the other fields."""
@@ -67,6 +81,26 @@ class Config:
         services = (one for services in self.services.values() for one in services.values())
         roles = tuple(sorted({one.root for one in services if one.root}))
         object.__setattr__(self, "roles_with_services", roles)
+        versions = {name: self._versions(name) for name in self.services}
+        object.__setattr__(self, "application_versions", versions)
+
+    def _versions(self, appdef: str) -> dict[str, ApplicationVersion]:
+        used = {service.chart for service in self.services[appdef].values()}
+        charts = {name: chart for name, chart in self.charts.items() if name in used}
+
+        def made(
+            name: str, wanted: Mapping[str, str], images: Mapping[str, ImagePin]
+        ) -> ApplicationVersion:
+            sources = {name: c.at(wanted.get(name, "")) or c for name, c in charts.items()}
+            return ApplicationVersion(appdef, name, sources, images)
+
+        listed = self.versions.get(appdef)
+        if listed is None:
+            words = {"", *(word for chart in charts.values() for word in chart.versions())}
+            return {word: made("", dict.fromkeys(charts, word), {}) for word in words}
+        known = {name: made(name, one.charts, one.images) for name, one in listed.versions.items()}
+        named = {"": listed.default, **listed.channels}
+        return known | {word: known[version] for word, version in named.items()}
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.
@@ -94,8 +128,11 @@ class Config:
 
     def versions_of(self, appdef: str) -> list[str]:
         """Return the channels and versions that a demand for this appdef may request."""
-        charts = {service.chart for service in self.services[appdef].values()}
-        return sorted({known for chart in charts for known in self.charts[chart].versions()})
+        return sorted(self.application_versions[appdef].keys() - {""})
+
+    def versions_file(self, appdef: str) -> str:
+        """Return the file that has the versions of an appdef."""
+        return VERSIONS_FILE if appdef in self.versions else CHARTS_FILE
 
     def parameters_of(self, appdef: str) -> set[str]:
         """Return the parameters that a demand for this appdef may set."""

@@ -16,6 +16,7 @@ from demandops.config.config import (
     DOMAINS_FILE,
     IMAGES_FILE,
     NODES_FILE,
+    VERSIONS_FILE,
     Config,
 )
 from demandops.config.config_reader import ConfigReader
@@ -34,6 +35,7 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
         _check_charts,
         _check_services,
         _check_uses,
+        _check_versions,
         _check_wire_types,
         _check_connection_types,
         _check_overrides,
@@ -166,6 +168,51 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                     f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; one service "
                     "runs for both, so name them alike",
                 )
+
+
+def _check_versions(config: Config, reader: ConfigReader) -> None:
+    for name, appdef in config.appdefs.items():
+        if appdef.versions != "refuse" and _is_unlisted(reader, name):
+            reader.add_fault(
+                f"appdefs/{name}/appdef.yaml",
+                "versions",
+                f"is {appdef.versions}, but {VERSIONS_FILE} does not list the versions of '{name}' "
+                "and their order; add them, or remove this",
+            )
+    for name, listed in config.versions.items():
+        if name not in config.appdefs:
+            if f"appdefs/{name}/appdef.yaml" not in reader.files:  # else it has faults of its own
+                known = suggestion(name, config.appdefs)
+                message = f"'{name}' is not an application definition{known}"
+                reader.add_fault(VERSIONS_FILE, f"applications.{name}", message)
+            continue
+        services = config.services.get(name, {}).values()
+        if not services:  # the definition has faults of its own
+            continue
+        charts = {service.chart for service in services}
+        images = {image for service in services for image in service.images}
+        for version, contents in listed.versions.items():
+            where = f"applications.{name}.versions.{version}"
+            for chart, wanted in contents.charts.items():
+                _check_used(f"{where}.charts.{chart}", chart, charts, name, reader)
+                found = config.charts.get(chart) if chart in charts else None
+                if found is not None and found.at(wanted) is None:
+                    known = suggestion(wanted, [source.version for source in found.sources()])
+                    message = f"'{wanted}' is not a version of {chart} in {CHARTS_FILE}{known}"
+                    reader.add_fault(VERSIONS_FILE, f"{where}.charts.{chart}", message)
+            for image in contents.images:
+                _check_used(f"{where}.images.{image}", image, images, name, reader)
+
+
+def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
+    """Return whether no list of versions is of an appdef, not even an invalid one."""
+    return VERSIONS_FILE not in reader.files or reader.is_missing(VERSIONS_FILE, appdef)
+
+
+def _check_used(where: str, name: str, used: set[str], appdef: str, reader: ConfigReader) -> None:
+    if name not in used:
+        message = f"no service of {appdef} uses '{name}'{suggestion(name, used)}"
+        reader.add_fault(VERSIONS_FILE, where, message)
 
 
 def _check_connection_types(config: Config, reader: ConfigReader) -> None:

@@ -24,6 +24,7 @@ from demandops.config.config import (
     DOMAINS_FILE,
     IMAGES_FILE,
     NODES_FILE,
+    VERSIONS_FILE,
     Config,
 )
 from demandops.config.config_reader import ConfigReader
@@ -38,6 +39,8 @@ from demandops.config.registry import (
     ClientsFile,
     Image,
     ImagesFile,
+    VersionList,
+    VersionsFile,
 )
 from demandops.config.repo_settings import ROOT_FILE, Flux, RepoSettings
 from demandops.errors import InvalidInput
@@ -94,6 +97,7 @@ def load(files: Mapping[str, str]) -> Config:
         charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
         images=_read_images(reader),
         clients=_read_clients(reader),
+        versions=_read_versions(reader),
         appdefs=appdefs,
         definitions=definitions,
         services=MappingProxyType(services),
@@ -118,6 +122,12 @@ def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
 def _read_clients(reader: ConfigReader) -> ClientsFile:
     found = reader.read_file(CLIENTS_FILE, ClientsFile) if CLIENTS_FILE in reader.files else None
     return found or DEFAULT_SETTINGS
+
+
+def _read_versions(reader: ConfigReader) -> Mapping[str, VersionList]:
+    if VERSIONS_FILE not in reader.files:
+        return {}
+    return reader.read_items(VERSIONS_FILE, VersionsFile, "applications", VersionList)
 
 
 def _read_definitions(

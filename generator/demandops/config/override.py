@@ -28,14 +28,7 @@ from demandops.config.base_model import (
 )
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.policy import matches
-from demandops.config.registry import (
-    ClientSettings,
-    Digest,
-    Image,
-    MqttClientSettings,
-    Repository,
-    Tag,
-)
+from demandops.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
 from demandops.errors import InvalidInput
 from demandops.identifiers import id_problem
 from demandops.quoting import quoted
@@ -149,29 +142,6 @@ class Selector(FrozenModel):
         )
 
 
-class ImagePin(FrozenModel):
-    """Changes to an image of the registry; absent fields leave it unchanged."""
-
-    repository: Repository | None = None
-    tag: Tag | None = None
-    digest: Digest | None = None
-
-    @model_validator(mode="after")
-    def _says_something(self) -> ImagePin:
-        if not (self.repository or self.tag or self.digest):
-            raise ValueError("changes nothing; give a tag, a digest or a repository")
-        return self
-
-    def over(self, image: Image) -> Image:
-        """Return the pinned image. A pinned tag removes the image's digest, and the reverse."""
-        anew = self.tag or self.digest
-        return Image(
-            repository=self.repository or image.repository,
-            tag=self.tag if anew else image.tag,
-            digest=self.digest if anew else image.digest,
-        )
-
-
 class OverrideFile(FileModel):
     """``overrides/<name>.yaml``; if several match, the one with the higher priority wins."""
 
@@ -270,13 +240,12 @@ class Shaping:
 
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
-    def image(self, image: str, images: Mapping[str, Image]) -> Image:
-        """Return an image of the registry's ``images``, with the pins of overrides."""
-        found = images[image]
+    def image(self, name: str, image: Image) -> Image:
+        """Return an image of the registry with the pins of overrides."""
         for override, effects in self.by:
-            if "images" in effects and override.images and image in override.images:
-                found = override.images[image].over(found)
-        return found
+            if "images" in effects and override.images and name in override.images:
+                image = override.images[name].over(image)
+        return image
 
     @property
     def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:

@@ -1,4 +1,4 @@
-"""The registry: the source and version of each chart and image, and how clients run.
+"""The registry: sources and versions of charts, images and applications, and how clients run.
 
 A chart is in a folder of the state repo (the default), an OCI registry or an HTTP chart repository.
 """
@@ -6,6 +6,9 @@ A chart is in a folder of the state repo (the default), an OCI registry or an HT
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
@@ -21,6 +24,7 @@ from demandops.config.base_model import (
     Word,
 )
 from demandops.config.inventory import Rmw
+from demandops.errors import suggestion
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
@@ -140,6 +144,104 @@ class ImagesFile(FileModel):
     kind: Literal["Images"]
     registry: Repository | None = None
     images: dict[DnsLabel, Image]
+
+
+class ImagePin(FrozenModel):
+    """Changes to an image of the registry; absent fields leave it unchanged."""
+
+    repository: Repository | None = None
+    tag: Tag | None = None
+    digest: Digest | None = None
+
+    @model_validator(mode="after")
+    def _says_something(self) -> ImagePin:
+        if not (self.repository or self.tag or self.digest):
+            raise ValueError("changes nothing; give a tag, a digest or a repository")
+        return self
+
+    def over(self, image: Image) -> Image:
+        """Return the pinned image. A pinned tag removes the image's digest, and the reverse."""
+        anew = self.tag or self.digest
+        return Image(
+            repository=self.repository or image.repository,
+            tag=self.tag if anew else image.tag,
+            digest=self.digest if anew else image.digest,
+        )
+
+
+class VersionContents(CamelModel):
+    """What one version of an application runs.
+
+    A chart that is not listed has its default version, an image that of ``registry/images.yaml``.
+    """
+
+    charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
+    images: dict[DnsLabel, ImagePin] = Field(default_factory=dict)
+
+
+class VersionList(CamelModel):
+    """The versions of one application definition, its default, and channels."""
+
+    default: ChartVersion
+    channels: dict[Word, ChartVersion] = Field(default_factory=dict)
+    versions: dict[ChartVersion, VersionContents]
+
+    @model_validator(mode="after")
+    def _listed(self) -> VersionList:
+        named = {"default": self.default} | {f"channels.{k}": v for k, v in self.channels.items()}
+        problems = [
+            f"{field}: '{version}' is not in versions{suggestion(version, self.versions)}"
+            for field, version in named.items()
+            if version not in self.versions
+        ]
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self
+
+
+class VersionsFile(FileModel):
+    """``registry/versions.yaml``, which a state repo may leave out.
+
+    A definition without an entry has the versions of its charts.
+    """
+
+    kind: Literal["Versions"]
+    applications: dict[DnsLabel, VersionList]
+
+
+Precedence = tuple[tuple[int, ...], bool, tuple[tuple[bool, int, str], ...], str]
+
+
+def precedence(version: str) -> Precedence:
+    """Return the place of a version in the order of Semantic Versioning 2.0.0 (item 11)."""
+    numbers, _, before = version.partition("-")
+    words = (
+        (not word.isdigit(), int(word) if word.isdigit() else 0, word) for word in before.split(".")
+    )
+    return tuple(map(int, numbers.split("."))), not before, tuple(words), version
+
+
+@dataclass(frozen=True)
+class ApplicationVersion:
+    """One version of an application definition, with the chart sources and image pins that it has.
+
+    ``name`` is empty if the definition has no entry in ``registry/versions.yaml``.
+    """
+
+    appdef: str
+    name: str
+    charts: Mapping[str, ChartSource]
+    images: Mapping[str, ImagePin]
+
+    @cached_property
+    def rank(self) -> tuple[Precedence, ...]:
+        """Its place among the versions of the definition; two of one rank are the same."""
+        charts = (chart.version for _, chart in sorted(self.charts.items()))
+        return tuple(map(precedence, [self.name] if self.name else charts))
+
+    def image(self, name: str, image: Image) -> Image:
+        """Return an image of the registry with the version's pin."""
+        return self.images[name].over(image) if name in self.images else image
 
 
 _EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]

@@ -135,7 +135,7 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
         yield fault(
             "version",
             f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
-            f"registry/charts.yaml{suggestion(app.version, versions)}",
+            f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
         )
 
 

@@ -165,6 +165,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
                 yield ("further", topic.part)
             else:
                 yield ("usual", topic.source, role)
+        if self.version:
+            yield ("version", self.id, self.version)
         yield ("topics", naming.topic_part(self.id))
 
 

@@ -115,6 +115,16 @@ class Ledger:
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 
+    def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
+        """Return the ``known`` versions that claims on an application ask for.
+
+        An empty one stands for claims that ask for none, or for one that is not known.
+        """
+        by_version = {word: self.index.get(("version", application, word)) for word in known}
+        found = {word: len(keys) for word, keys in by_version.items() if keys}
+        claims = self.claims.get(Subject(SubjectKind.APPLICATION, application)) or ()
+        return {*found, ""} if len(claims) > sum(found.values()) else {*found}
+
     def subjects(self, kind: SubjectKind) -> list[str]:
         """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)

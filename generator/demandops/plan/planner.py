@@ -14,7 +14,6 @@ from demandops import naming
 from demandops.config.appdef import Parameter, Scaling, Service
 from demandops.config.config import Config
 from demandops.config.override import Override
-from demandops.config.registry import ChartSource
 from demandops.connections import route as routes
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import ConnectionType
@@ -30,6 +29,7 @@ from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, claims_needing, services_of
+from demandops.plan.running_version import version_of_service
 from demandops.subject import TopicKey
 
 
@@ -69,18 +69,21 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     parts = list(_parts(world, service, key, apps))
     inputs = {role: _inputs(config, key, role, parts) for role in sorted(service.inputs)}
     further = service.root is not None and parts[0].inputs[service.root][0].further
+    applications = tuple(dict.fromkeys(app.id for app in apps))
+    version = version_of_service(world, service, applications)
     return ServiceRelease(
         key=key,
         name=service_name(config, service, key),
         node=node,
         domain=domain,
         service=service,
-        chart=_chart(config, service, apps),
+        version=version,
+        chart=version.charts[service.chart],
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(_merged_parameters(service.parameters, claims)),
         replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
-        applications=tuple(dict.fromkeys(app.id for app in apps)),
+        applications=applications,
         requesters=_requesters(claims, service, key),
     )
 
@@ -100,21 +103,6 @@ def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> t
         for topic in roots_of(claim.application, service, key)
     )
     return tuple(sorted({who for names in holders for who in names}))
-
-
-def _chart(config: Config, service: Service, apps: Iterable[Application]) -> ChartSource:
-    chart = config.charts[service.chart]
-    wanted = {app.version for app in apps}
-    charts = {version: chart.at(version) or chart for version in wanted}
-    if len({source.version for source in charts.values()}) > 1:
-        versions = " and ".join(
-            f"{source.version} (for '{version}')" for version, source in sorted(charts.items())
-        )
-        message = (
-            f"demands that share {service.chart} request versions {versions}; request the same one"
-        )
-        raise Refused.at("version", message, code="conflict")
-    return next(iter(charts.values()))
 
 
 def _parts(

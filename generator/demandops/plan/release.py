@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from demandops.config.appdef import Scope, Service
-from demandops.config.config import CHARTS_FILE, Config
+from demandops.config.config import CHARTS_FILE, VERSIONS_FILE, Config
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping
 from demandops.config.policy import AccessDomain
-from demandops.config.registry import ChartSource
+from demandops.config.registry import ApplicationVersion, ChartSource, Image
 from demandops.connections.connection_type import Client
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
@@ -42,13 +42,17 @@ class ServiceKey:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRelease:
-    """The desired state of one service: one Helm release."""
+    """The desired state of one service: one Helm release.
+
+    ``chart`` is that of ``version``, unless an override pins another.
+    """
 
     key: ServiceKey
     name: str
     node: Node
     domain: AccessDomain
     service: Service
+    version: ApplicationVersion
     chart: ChartSource
     inputs: Mapping[str, tuple[InputTopic, ...]]
     outputs: Mapping[str, str]
@@ -63,6 +67,10 @@ class ServiceRelease:
         """The registry's names of its images."""
         return self.service.images
 
+    def image(self, name: str, config: Config) -> Image:
+        """Return one of its images, as its version and overrides pin it."""
+        return self.shaping.image(name, self.version.image(name, config.images[name]))
+
     @property
     def description(self) -> str:
         """Its description in commit messages."""
@@ -75,6 +83,13 @@ class ServiceRelease:
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
             f"replicas {self.replicas}",
+            *([f"version {self.version.name}"] if self.version.name else []),
+            f"chart {self.chart.version}",
+            *(
+                f"image {name} {pin.digest or pin.tag or pin.repository}"
+                for name, pin in sorted(self.version.images.items())
+                if name in self.images
+            ),
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
@@ -83,6 +98,9 @@ class ServiceRelease:
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "what it is"
         yield config.values_template(self.service), "", "its Helm values"
+        if self.version.name:
+            entry = f"applications.{self.version.appdef}.versions.{self.version.name}"
+            yield VERSIONS_FILE, entry, "its version"
         chart, name = self.chart, self.service.chart
         where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
         yield CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}"

@@ -15,11 +15,12 @@ from demandops.connections.connection_type import ClientKey
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
-from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.ledger import ClaimChange
 from demandops.ledger.world import World
 from demandops.plan.flows import instances, node_of, roots_of
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import ServiceKey
+from demandops.plan.running_version import running_version, same_version
 from demandops.subject import Subject, SubjectKind
 
 ReleaseKey = ServiceKey | ClientKey
@@ -117,8 +118,8 @@ def affected_keys(
 ) -> tuple[ReleaseKey, ...]:
     """Return the key of every release that these changes of claims may add, change or remove.
 
-    The cost grows with the number of changed topics. If a change moves or redefines an application,
-    it grows with all topics of the application.
+    The cost grows with the number of changed topics. If a change moves or redefines an application
+    or changes its version, it grows with all topics of the application.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.
@@ -129,7 +130,7 @@ def affected_keys(
         subject, claims = change.key.subject, _differing(change)
         for world, claim in zip((before, after), claims, strict=True):
             own = [claim] if claim and world.ledger.get(claim.key) else []
-            if not _decided_alike(before.ledger, after.ledger, subject):
+            if not _decided_alike(before, after, subject):
                 own += world.ledger.claims_on(subject)
             keys |= dict.fromkeys(keys_of_claims(world, own, strict=world is after))
     return tuple(keys)
@@ -158,12 +159,15 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
     return app.with_inputs(inputs)
 
 
-def _decided_alike(before: Ledger, after: Ledger, subject: Subject) -> bool:
-    """Return whether an application has the same node and definition in both ledgers."""
+def _decided_alike(before: World, after: World, subject: Subject) -> bool:
+    """Return whether an application has the same node, definition and version in both worlds."""
     if subject.kind is not SubjectKind.APPLICATION:
         return True
-    one, other = before.application(subject.id), after.application(subject.id)
-    return not one or not other or (one.appdef, one.node) == (other.appdef, other.node)
+    one, other = before.ledger.application(subject.id), after.ledger.application(subject.id)
+    if not one or not other:
+        return True
+    versions = (running_version(world, subject.id) for world in (before, after))
+    return (one.appdef, one.node) == (other.appdef, other.node) and same_version(*versions)
 
 
 def all_keys(world: World) -> tuple[ReleaseKey, ...]:

@@ -54,7 +54,7 @@ def render(client: Client, config: Config, engine: Engine) -> str:
         },
         resources=settings.resources.model_dump(),
         host_network=node.host_network if settings.host_network is None else settings.host_network,
-        image=client.shaping.image(kind.image, config.images).reference(),
+        image=client.shaping.image(kind.image, config.images[kind.image]).reference(),
     )
 
 

@@ -61,10 +61,7 @@ def _context(release: ServiceRelease, config: Config) -> dict[str, object]:
         },
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
-        "images": {
-            name: release.shaping.image(name, config.images).parts()
-            for name in release.service.images
-        },
+        "images": {name: release.image(name, config).parts() for name in release.service.images},
         "replicas": release.replicas,
     }
     if release.key.application is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from datetime import datetime, timezone
 
@@ -38,11 +38,25 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     return {appdef.name: list(_services(appdef, node, plain)) for appdef in config.appdefs.values()}
 
 
-def _services(appdef: ApplicationDefinition, node: str, config: Config) -> Iterator[ServiceRelease]:
+def _other_versions(
+    config: Config, trials: Mapping[str, list[ServiceRelease]]
+) -> Iterator[ServiceRelease]:
+    """Yield the services of a trial demand for each listed version that is not the default."""
+    plain = replace(config, overrides={})
+    for name, listed in config.versions.items() if trials else ():
+        node = trials[name][0].node.id
+        for version in listed.versions:
+            if version != listed.default:
+                yield from _services(config.appdefs[name], node, plain, version)
+
+
+def _services(
+    appdef: ApplicationDefinition, node: str, config: Config, version: str = ""
+) -> Iterator[ServiceRelease]:
     inputs = {
         role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
     }
-    app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs)
+    app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs, version=version)
     request = Join("rehearsal", (Demanded(app, ("rehearsal",), str),))
     ledger, changes = apply(Ledger(), request, _NEVER)
     before, after = World(config, Ledger()), World(config, ledger)
@@ -70,7 +84,8 @@ def overridden_releases(
 def render_trial_demands(world: World, engine: Engine) -> None:
     """Render every service of every appdef once, with invented claims on a real node.
 
-    This checks an appdef before its first demand, without overrides and with each override that is
+    A service is rendered once for each version that ``registry/versions.yaml`` lists. This checks
+    an appdef before its first demand, without overrides and with each override that is
     in effect. An override fails only if no appdef that it applies to renders with it.
 
     Raises:
@@ -80,7 +95,7 @@ def render_trial_demands(world: World, engine: Engine) -> None:
     invented = trial_releases(config)
     faults = [
         fault
-        for releases in invented.values()
+        for releases in (*invented.values(), _other_versions(config, invented))
         for fault in _render_faults(releases, config, engine)
     ]
     for override in () if faults else world.overrides:

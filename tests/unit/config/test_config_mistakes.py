@@ -22,6 +22,7 @@ BROKERS = "inventory/brokers.yaml"
 DOMAINS = "policy/access-domains.yaml"
 CHARTS = "registry/charts.yaml"
 IMAGES = "registry/images.yaml"
+VERSIONS = "registry/versions.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
 V1 = "- id: vehicle01\n"
@@ -53,6 +54,14 @@ def second_definition(*edits: tuple[str, str]) -> dict[str, str]:
     for old, new in edits:
         copy["appdefs/copy/appdef.yaml"] = copy["appdefs/copy/appdef.yaml"].replace(old, new)
     return copy
+
+
+def versions(default: str, listed: Mapping[str, object], **more: object) -> dict[str, str]:
+    """Return a ``registry/versions.yaml`` for the skeleton's application definition."""
+    entry = {"default": default, "versions": listed, **more}
+    applications = {"object-detection-fusion": entry}
+    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
+    return {VERSIONS: json.dumps(head | {"applications": applications})}
 
 
 URL = "https://git.example/state.git"
@@ -317,6 +326,26 @@ uses:
 """
         }
     ),
+    "an order of versions that nobody wrote down": edited(
+        APPDEF, "inputs:\n", "versions: update\ninputs:\n"
+    ),
+    "a policy that does not exist": edited(APPDEF, "inputs:\n", "versions: patch\ninputs:\n"),
+    "a default and a channel that are not listed": versions(
+        "1.0.1", {"1.0.0": {}}, channels={"next": "1.1.0"}
+    ),
+    "a version that is none": versions("1.0", {"1.0": {}}),
+    "versions of an application that does not exist": {
+        VERSIONS: versions("1.0.0", {"1.0.0": {}})[VERSIONS].replace("fusion", "fuison")
+    },
+    "what no service has, and a chart in a version that does not exist": versions(
+        "1.1.0",
+        {
+            "1.1.0": {
+                "charts": {"object-fuson": "0.2.0", "object-fusion": "0.2.0"},
+                "images": {"mqtt-client": {"tag": "v"}},
+            }
+        },
+    ),
 }
 """What a configuration is refused for, as the files that are other than the skeleton's."""
 
@@ -355,6 +384,7 @@ def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
         {ROOT: f"{skeleton()[ROOT]}argocd:\n  url: {URL}\n"},
         shared(),
         shared(("each: cloud\n", ""), ("scope: topic", "scope: node")),
+        versions("1.0.0", {"1.0.0": {}, "2.0.0-rc.1": {"charts": {"object-fusion": "0.1.0"}}}),
     ],
 )
 def test_what_is_odd_but_works(changed: dict[str, str]) -> None:

@@ -29,7 +29,7 @@ from hypothesis import strategies as st
 from tests.kit.chance import examples
 from tests.kit.config import configuration
 
-TEXTS = ["".join(chars) for size in range(6) for chars in product("ab", repeat=size)]
+TEXTS = ["".join(chars) for size in range(7) for chars in product("ab", repeat=size)]
 pattern = st.text("ab*?", min_size=1, max_size=4)
 
 
@@ -210,5 +210,5 @@ def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     values: Any = {}
     for _, patch in shaped.shaping.patches:
         values = merge_patch(values, patch)
-    images = {name: shaped.shaping.image(name, config().images) for name in release.service.images}
+    images = {name: shaped.image(name, config()) for name in release.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, repr(_sorted(values)), images

@@ -15,7 +15,7 @@ from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
 from demandops.config.policy import AccessDomainsFile
-from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile
+from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
 from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
@@ -37,6 +37,7 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "reference-map": (ReferenceMap, "the file of `demandops import --map`"),
     "service": (ServiceDefinition, "appdefs/<name>/service.yaml"),
     "state-repo": (RepoSettings, "demandops.yaml"),
+    "versions": (VersionsFile, "registry/versions.yaml"),
 }
 
 

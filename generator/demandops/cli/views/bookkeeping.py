@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
 
 import click
 from rich.table import Table
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import at_option, progress, state_repo_option, warn_of
+from demandops.cli.output import at_option, progress, state_repo_option, version_text, warn_of
 from demandops.plan.views.bookkeeping import ConnectionEntry, ServiceEntry, as_data
 from demandops.plan.views.bookkeeping import bookkeeping as derive
 from demandops.staterepo import reader
@@ -29,7 +30,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         (
             name,
             "\n".join([entry.service, *(f"{key} = {v}" for key, v in entry.parameters.items())]),
-            entry.version,
+            version_text(asdict(entry)),
             entry.node,
             entry.source or ", ".join(entry.applications),
             "\n".join(line for topics in entry.inputs.values() for line in _lines(topics, entry)),

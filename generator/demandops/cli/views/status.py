@@ -11,12 +11,13 @@ from typing import Any
 import click
 from rich.table import Table
 
-from demandops.cli.json_output import output_option, release_data, show
-from demandops.cli.output import errors, progress, state_repo_option
+from demandops.cli.json_output import output_option, release_data, show, version_data
+from demandops.cli.output import errors, progress, state_repo_option, version_text
 from demandops.cluster import access
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import Health, History, ObjectSelector, Target
 from demandops.cluster.object_cache import ObjectCache
+from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
@@ -48,8 +49,11 @@ def status(state_repo: str, access_file: Path | None, output: str) -> None:
         targets = rollout_targets.targets_of_state(snapshot.state)
         stores = _read(clusters, [target for _, target in targets])
         commit = str(snapshot.commit)
+        ledger = without_suspended(snapshot.state).ledger
         rows = [
-            release_data(release) | _state(target, commit, stores, repo.repository)
+            release_data(release)
+            | version_data(release, ledger)
+            | _state(target, commit, stores, repo.repository)
             for release, target in targets
         ]
     faults = [{"code": "invalid", **asdict(problem)} for problem in problems]
@@ -110,12 +114,15 @@ def _state(
 
 
 def _table(rows: Iterable[dict[str, Any]]) -> Table:
-    table = Table("Release", "What", "Node", "Cluster", "Seen", "Health", "Since", "Reason")
+    table = Table(
+        "Release", "What", "Version", "Node", "Cluster", "Seen", "Health", "Since", "Reason"
+    )
     for row in rows:
         reason = f"{row['object']}: {row['reason']}" if row["object"] else row["reason"] or ""
         table.add_row(
             row["name"],
             row["what"].partition(" on ")[0],
+            version_text(row),
             row["node"],
             row["cluster"],
             (row["seen"] or "")[:_SHORT],

@@ -271,8 +271,9 @@ def _claim_lines(claims: list[dict[str, Any]]) -> Iterator[str]:
         until = (
             f", lease of {lease['seconds']} s until {time_text(lease['until'])}" if lease else ""
         )
+        version = f", version {claim['version']}" if claim["version"] else ""
         yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
-        yield f"    demand {claim['demand']}, request '{claim['request']}'{until}"
+        yield f"    demand {claim['demand']}, request '{claim['request']}'{version}{until}"
         yield f"    {claim['file']}"
         if claim["suspended_by"]:
             yield f"    suspended by {_override_text(claim['suspended_by'])}"

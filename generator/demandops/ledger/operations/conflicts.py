@@ -30,13 +30,6 @@ def _of_application(one: Demanded, app: Application, ledger: Ledger) -> Iterator
     for name, new, current, holding, remedy in (
         ("node", app.node, known.node, "on", "request that node, or wait until it is released"),
         ("appdef", app.appdef, known.appdef, "as", "use another application id"),
-        (
-            "version",
-            app.version,
-            known.version,
-            "in version",
-            "request the same version, or use another application id",
-        ),
     ):
         if new != current:
             yield one.fault(

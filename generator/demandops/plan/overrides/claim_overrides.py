@@ -22,7 +22,7 @@ from demandops.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey
 from demandops.demand.demand_request import Demanded
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.ledger.world import World
-from demandops.subject import Subject
+from demandops.subject import Subject, SubjectKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +99,22 @@ class UnsuspendedClaims(Ledger):
         """Return one claim, or ``None`` if it is suspended."""
         claim = Ledger.get(self, key)
         return claim if claim and self._is_active(claim) else None
+
+    def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
+        """Return the ``known`` versions that claims that are not suspended ask for."""
+        booked = Ledger.versions_asked(self, application, known)
+        asked = {
+            word
+            for word in booked
+            if any(self.get(key) for key in self.index.get(("version", application, word)) or ())
+        }
+        claims = self.claims.get(Subject(SubjectKind.APPLICATION, application)) or ()
+        if "" in booked and any(
+            claim.application.version not in booked - {""} and self._is_active(claim)
+            for claim in claims
+        ):
+            asked.add("")
+        return asked
 
     def is_carried_to(self, target: str, topic: str) -> bool:
         """Return whether a claimed connection brings ``topic`` to the node ``target``."""

@@ -25,7 +25,8 @@ _Requesters: TypeAlias = dict[str, list[str]]
 class ServiceEntry:
     """One service, its requesters and those of its inputs (role → topic → requesters).
 
-    ``version`` is its chart's.
+    ``version`` is its chart's, ``application_version`` that of ``registry/versions.yaml``.
+    ``versions_asked`` has the requesters of each version that claims name.
     """
 
     applications: list[str]
@@ -34,6 +35,8 @@ class ServiceEntry:
     source: str | None
     source_topic: str | None
     version: str
+    application_version: str | None
+    versions_asked: dict[str, list[str]]
     parameters: dict[str, object]
     inputs: dict[str, _Requesters]
     requesters: list[str]
@@ -85,6 +88,8 @@ def bookkeeping(world: World) -> Bookkeeping:
             source=release.key.source,
             source_topic=release.key.topic,
             version=release.chart.version,
+            application_version=release.version.name or None,
+            versions_asked=release_causes.versions_asked(release, active.ledger),
             parameters=dict(release.parameters),
             inputs=_requesters_of_inputs(release, active),
             requesters=list(release.requesters),
@@ -201,6 +206,10 @@ def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
         yield f"on {entry.node}"
         yield from (f"for {application}" for application in entry.applications)
         yield f"version {entry.version}"
+        if entry.application_version:
+            yield f"application version {entry.application_version}"
+        for version, requesters in entry.versions_asked.items():
+            yield f"version {version} for {', '.join(requesters)}"
         yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
     topics, known = _topics(entry), _topics(other)
     for what, who in sorted(topics.items()):

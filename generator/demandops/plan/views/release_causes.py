@@ -45,6 +45,15 @@ def _takes(claim: Claim, release: Release) -> bool:
     return takes(claim.application, release.service, release.key)
 
 
+def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
+    """Return the versions that claims on its applications name, and who asks for each."""
+    found: dict[str, set[str]] = {}
+    for claim in claims_of(release, ledger):
+        if claim.application.version:
+            found.setdefault(claim.application.version, set()).update(claim.requesters)
+    return {version: sorted(requesters) for version, requesters in sorted(found.items())}
+
+
 def how_to_release(claim: Claim) -> str:
     """Return how the requesters release a claim."""
     if claim.keeping_override is not None:
@@ -56,12 +65,14 @@ def how_to_release(claim: Claim) -> str:
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
     """Return (file, entry, what it decides) of the configuration that shapes a release."""
-    images = [image for image in release.images if image in config.images]
+    images = {name: config.images[name] for name in release.images if name in config.images}
+    if isinstance(release, ServiceRelease):
+        images = {name: release.version.image(name, image) for name, image in images.items()}
     node, domain = release.node, release.domain
     return [
         (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
         *release.shaping_entries(config),
-        *((IMAGES_FILE, f"images.{name}", config.images[name].reference()) for name in images),
+        *((IMAGES_FILE, f"images.{name}", one.reference()) for name, one in images.items()),
         (NODES_FILE, node.id, f"in cluster {node.cluster}"),
         (DOMAINS_FILE, domain.name, f"namespace {domain.namespace}"),
     ]

@@ -1,0 +1,193 @@
+"""Version differences: a demand asks for another version than others of what they share.
+
+``versions`` of the application definition says what follows: the demand is refused, or the newest
+version runs, which may need a person's approval first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from demandops.config.appdef import VersionPolicy
+from demandops.config.registry import ApplicationVersion, precedence
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Demanded, DemandRequest
+from demandops.errors import Fault
+from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.world import World
+from demandops.plan.overrides.claim_overrides import without_suspended
+from demandops.plan.release import Release, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey, claims_needing
+from demandops.plan.running_version import (
+    contents,
+    newest_asked,
+    running_version,
+    same_version,
+    version_of_service,
+)
+from demandops.subject import Subject
+
+_STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "update", "upgrade")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A demanded version, and the newest that others ask for, of ``what`` they share."""
+
+    what: str
+    appdef: str
+    policy: VersionPolicy
+    demanded: str
+    others: str
+    newer: bool
+    """Whether the demanded version is the newer one."""
+    fault: Fault
+    """The refusal, if the policy is to refuse."""
+
+    def matters_to(self, asked: str) -> bool:
+        """Return whether it does; a demand that names no version takes a newer one that runs."""
+        return bool(asked) or self.newer or self.policy == "refuse"
+
+    def approval_reason(self) -> str:
+        """Return what requires an approval, or an empty text."""
+        same = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
+        if self.policy == "upgrade" or same:
+            return ""
+        change = (
+            f"the upgrade of {self.what} from version {self.others} to {self.demanded}"
+            if self.newer
+            else f"version {self.demanded} of {self.what}, which runs {self.others}"
+        )
+        return f"application definition '{self.appdef}', for {change}"
+
+    def warning(self) -> str:
+        """Return what runs instead of the demanded version, or an empty text."""
+        others = f"{self.what} runs version {self.others}, which others ask for"
+        return "" if self.newer else f"{others}, not {self.demanded}"
+
+
+def differences(
+    request: DemandRequest,
+    before: World,
+    after: World,
+    changes: Iterable[ClaimChange],
+    plans: Mapping[ReleaseKey, Release | None],
+) -> Iterator[Difference]:
+    """Yield the versions that a demand asks for and others do not.
+
+    Args:
+        request: the demand.
+        before, after: the world before and after it.
+        changes: the claims that it changes.
+        plans: the releases that it may change, as they are after it.
+    """
+    if not request.adds_claims:
+        return
+    listed = {one.held.subject: one for one in request.demanded}
+    mine: dict[str, tuple[Demanded, str]] = {}
+    for change in changes:
+        one, claim, old = listed.get(change.key.subject), change.after, change.before
+        if one is None or claim is None or not claim.is_on_application:
+            continue
+        mine[claim.application.id] = one, claim.application.version
+        if old is None or old.application.version != claim.application.version:
+            yield from _of_application(one, claim, after)
+    for release in plans.values():
+        if isinstance(release, ServiceRelease) and len(release.applications) > 1:
+            yield from _of_service(release, mine, before, without_suspended(after))
+
+
+def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
+    """Yield the version that a claim asks for, if it is not the newest that others ask for."""
+    app, ledger = claim.application, after.ledger
+    known = after.config.application_versions[app.appdef]
+    if len({known[word].rank for word in ledger.versions_asked(app.id, known)}) < 2:
+        return
+    others = ledger.replace(claim.key, None)
+    own, theirs = known.get(app.version, known[""]), newest_asked(others, app.id, known)
+    if same_version(own, theirs):
+        return
+    holders, word = _who_asks(others, app.subject, theirs, known)
+    message = (
+        f"{_words(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
+        f"{holders} in {_words(word, theirs)}; request the same version, or use another "
+        "application id"
+    )
+    found = Difference(
+        f"application '{app.id}'",
+        app.appdef,
+        after.config.appdefs[app.appdef].versions,
+        own.name,
+        theirs.name,
+        own.rank > theirs.rank,
+        one.fault("version", message, code="conflict"),
+    )
+    if found.matters_to(app.version):
+        yield found
+
+
+def _who_asks(
+    ledger: Ledger,
+    subject: Subject,
+    version: ApplicationVersion,
+    known: Mapping[str, ApplicationVersion],
+) -> tuple[str, str]:
+    """Return the requesters of the first claim that asks for a version, and its word for it."""
+    for claim in ledger.claims_on(subject):
+        word = claim.application.version
+        if same_version(known.get(word, known[""]), version):
+            return ", ".join(claim.requesters), word if word in known else ""
+    return "", ""
+
+
+def _words(word: str, version: ApplicationVersion) -> str:
+    named = f"version '{word}'" if word else "the default version"
+    return f"{named} ({version.name})" if version.name not in ("", word) else named
+
+
+def _of_service(
+    release: ServiceRelease,
+    mine: Mapping[str, tuple[Demanded, str]],
+    before: World,
+    after: World,
+) -> Iterator[Difference]:
+    """Yield the versions of a shared service that applications of the demand bring anew."""
+    service, key, config = release.service, release.key, after.config
+    versions = {id: running_version(after, id) for id in release.applications}
+    if len({contents(version, service) for version in versions.values() if version}) == 1:
+        return
+    for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
+    what = f"{key.service} {for_what}"
+    for id, (one, asked) in mine.items():
+        others = [other for other in versions if other != id]
+        own, theirs = versions.get(id), version_of_service(after, service, others)
+        if own is None or contents(own, service) == contents(theirs, service):
+            continue
+        if same_version(running_version(before, id), own) and any(
+            claim.application.id == id for claim in claims_needing(before, key)
+        ):
+            continue
+        by_name = own.appdef == theirs.appdef and own.name
+        new, current = (
+            version.name if by_name else version.charts[service.chart].version
+            for version in (own, theirs)
+        )
+        sharing = ", ".join(f"'{other}'" for other in others[:3])
+        message = (
+            f"{what} would run in version {new}, but in {current} for {sharing}, which share it; "
+            "request the same version"
+        )
+        appdefs = (config.appdefs[version.appdef] for version in (own, theirs))
+        strictest = min(appdefs, key=lambda appdef: _STRICTNESS.index(appdef.versions))
+        found = Difference(
+            what,
+            strictest.name,
+            strictest.versions,
+            new,
+            current,
+            precedence(new) > precedence(current),
+            one.fault("version", message, code="conflict"),
+        )
+        if found.matters_to(asked):
+            yield found

@@ -1,0 +1,73 @@
+"""The version that runs: the newest one that is asked for.
+
+A claim on an application asks for a version, or else for the default. The application runs the
+newest of them. A service that applications share runs the newest that one of them runs. So what
+runs follows from the claims that are there, whatever their order. Whether a demand may ask is
+decided before, in :mod:`demandops.plan.checks.version_difference`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from demandops.config.appdef import Service
+from demandops.config.config import CHARTS_FILE
+from demandops.config.registry import ApplicationVersion, precedence
+from demandops.errors import Refused
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
+
+
+def running_version(world: World, application: str) -> ApplicationVersion | None:
+    """Return the version that an application runs, or ``None`` if it or its appdef is gone."""
+    app = world.ledger.application(application)
+    known = world.config.application_versions.get(app.appdef) if app else None
+    return newest_asked(world.ledger, application, known) if known else None
+
+
+def newest_asked(
+    ledger: Ledger, application: str, known: Mapping[str, ApplicationVersion]
+) -> ApplicationVersion:
+    """Return the newest of the ``known`` versions that claims on an application ask for."""
+    asked = ledger.versions_asked(application, known)
+    return max((known[word] for word in asked or ("",)), key=lambda version: version.rank)
+
+
+def same_version(one: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
+    """Return whether two versions of one appdef are the same."""
+    return (one and one.rank) == (other and other.rank)
+
+
+def version_of_service(
+    world: World, service: Service, applications: Iterable[str]
+) -> ApplicationVersion:
+    """Return the version in which a service runs that these applications share.
+
+    Of several appdefs that define the service, the one with the newest chart counts.
+
+    Raises:
+        Refused: if two appdefs have the same chart with different images.
+    """
+    newest: dict[str, ApplicationVersion] = {}
+    for found in filter(None, (running_version(world, id) for id in applications)):
+        known = newest.setdefault(found.appdef, found)
+        if found.rank > known.rank:
+            newest[found.appdef] = found
+    versions = [version for _, version in sorted(newest.items())]
+    best = max(versions, key=lambda version: precedence(version.charts[service.chart].version))
+    for other in versions:
+        its, own = contents(other, service), contents(best, service)
+        if its[0] == own[0] and its != own:
+            message = (
+                f"application definitions '{best.appdef}' and '{other.appdef}' share "
+                f"{service.chart} {own[0]}, but pin different images; pin the same, or give each "
+                f"another version of the chart in {CHARTS_FILE}"
+            )
+            raise Refused.at("version", message, code="conflict")
+    return best
+
+
+def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
+    """Return what a version says about a service: the chart's version and the images' pins."""
+    pins = (version.images.get(name) for name in service.images)
+    return version.charts[service.chart].version, *pins

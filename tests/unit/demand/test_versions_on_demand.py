@@ -1,0 +1,287 @@
+"""What runs is the newest version that is asked for, and who must approve that."""
+
+from __future__ import annotations
+
+import json
+from random import Random
+from typing import Any
+
+import pytest
+from demandops.config.registry import precedence
+from demandops.decision import State, rendered_files, try_configuration
+from demandops.errors import InvalidInput, Refused
+from hypothesis import given
+
+from tests.kit.chance import chances, examples
+from tests.kit.config import edited, override, skeleton
+from tests.kit.memory import MemoryRepo, ledger_in, rebuilt
+
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+LISTED = ("0.9.0", "1.0.0", "1.1.0-rc.2", "1.1.0-rc.10", "1.1.0", "1.10.0", "2.0.0")
+"""The versions, oldest first."""
+CHANNELS = {"stable": "1.0.0", "testing": "1.1.0"}
+DEFAULT = "1.0.0"
+NODES = ("edge", "cloud")
+
+
+def config(policy: str, **more: Any) -> dict[str, str]:
+    """Return a configuration in which each version pins the images of the two services."""
+    pins = {
+        version: {
+            "images": {name: {"tag": version} for name in ("object-detection", "object-fusion")}
+        }
+        for version in LISTED
+    }
+    entry = {"default": DEFAULT, "channels": CHANNELS, "versions": pins} | more
+    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
+    made = {
+        "registry/versions.yaml": json.dumps(
+            head | {"applications": {"object-detection-fusion": entry}}
+        )
+    }
+    return made | edited(APPDEF, "inputs:\n", f"versions: {policy}\ninputs:\n")
+
+
+def put(
+    demand: str, version: str = "", id: str = "edge/a", cloud: str = "/points"
+) -> dict[str, Any]:
+    inputs = {"point_cloud": [{"topic": cloud, "source": "edge"}]}
+    app = {"id": id, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
+    app |= {"version": version} if version else {}
+    return {
+        "kind": "Demand",
+        "demand": demand,
+        "requesters": [f"for-{demand}"],
+        "applications": [app],
+    }
+
+
+def release(demand: str) -> dict[str, Any]:
+    return {
+        "kind": "Demand",
+        "operation": "release",
+        "demand": demand,
+        "requesters": [f"for-{demand}"],
+    }
+
+
+def running(repo: MemoryRepo) -> dict[str, str]:
+    """Return service → the version that it runs."""
+    return {name: entry["application_version"] for name, entry in repo.books()["services"].items()}
+
+
+ASKS = "application definition 'object-detection-fusion', for "
+
+
+EDGE = "application 'edge/a'"
+UPGRADE = f"{ASKS}the upgrade of {EDGE} from version"
+RUNS = f"{EDGE} runs version"
+
+
+@pytest.mark.parametrize(
+    ("policy", "first", "then", "approval", "warning"),
+    [
+        pytest.param("update", "", "1.1.0", "", "", id="an update"),
+        pytest.param("update", "testing", "1.1.0", "", "", id="the same by another name"),
+        pytest.param(
+            "update", "1.1.0", "1.1.0-rc.2",
+            "", f"{RUNS} 1.1.0, which others ask for, not 1.1.0-rc.2", id="an older one",
+        ),
+        pytest.param("update", "2.0.0", "", "", "", id="one that names none takes an upgrade"),
+        pytest.param("upgrade", "", "2.0.0", "", "", id="an upgrade that needs nobody"),
+        pytest.param("update", "", "2.0.0", f"{UPGRADE} 1.0.0 to 2.0.0", "", id="an upgrade"),
+        pytest.param(
+            "update", "0.9.0", "", f"{UPGRADE} 0.9.0 to 1.0.0", "", id="the default is an upgrade"
+        ),
+        pytest.param(
+            "update", "2.0.0", "1.1.0",
+            f"{ASKS}version 1.1.0 of {EDGE}, which runs 2.0.0",
+            f"{RUNS} 2.0.0, which others ask for, not 1.1.0", id="an older major version by name",
+        ),
+    ],
+)  # fmt: skip
+def test_what_follows_from_another_version(
+    policy: str, first: str, then: str, approval: str, warning: str
+) -> None:
+    repo = MemoryRepo(config(policy))
+    assert repo.send(put("a", first)).approval == (), "who comes first contradicts nobody"
+    decision = repo.send(put("b", then))
+    assert decision.outcome == "booked"
+    assert decision.approval == ((approval,) if approval else ())
+    assert decision.warnings == ((warning,) if warning else ())
+    again = repo.send(put("b", then, cloud="/more"))
+    assert again.approval == (), "what is booked already asks nobody again"
+    assert repo.send(release("b")).approval == ()
+
+
+def test_an_update_and_its_end_say_what_changes_in_one_commit_each() -> None:
+    repo = MemoryRepo(config("update"))
+    repo.send(put("a"))
+    before = repo.rendered()
+    there = repo.send(put("b", "testing"))
+    assert [change.details for change in there.releases] == [
+        ("- version 1.0.0", f"- image {name} 1.0.0", "+ version 1.1.0", f"+ image {name} 1.1.0")
+        for name in ("object-detection", "object-fusion")
+    ]
+    back = repo.send(release("b"))
+    assert [change.details for change in back.releases] == [
+        ("- version 1.1.0", f"- image {name} 1.1.0", "+ version 1.0.0", f"+ image {name} 1.0.0")
+        for name in ("object-detection", "object-fusion")
+    ]
+    assert repo.rendered() == before
+
+
+def test_an_update_reaches_what_only_others_need() -> None:
+    repo = MemoryRepo(config("update"))
+    repo.send(put("a"))
+    repo.send(put("b", "testing", cloud="/more"))
+    assert {*running(repo).values()} == {"1.1.0"}
+    repo.send(release("b"))
+    assert {*running(repo).values()} == {"1.0.0"}
+
+
+def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
+    repo = MemoryRepo(config("update"))
+    repo.send(put("a"))
+    asks = repo.send(put("b", "2.0.0", id="edge/b"))
+    what = "object-detection for /points of 'edge'"
+    assert asks.approval == (f"{ASKS}the upgrade of {what} from version 1.0.0 to 2.0.0",)
+    names = running(repo)
+    assert sorted(names.values()) == ["1.0.0", "2.0.0", "2.0.0"]
+    # a third one shares what runs already
+    assert repo.send(put("c", "2.0.0", id="edge/c")).approval == ()
+    older = repo.send(put("d", "1.0.0", id="edge/d"))
+    assert older.approval == (f"{ASKS}version 1.0.0 of {what}, which runs 2.0.0",)
+    assert older.warnings == (f"{what} runs version 2.0.0, which others ask for, not 1.0.0",)
+
+
+def test_two_applications_of_one_demand_must_agree_where_versions_are_refused() -> None:
+    repo = MemoryRepo(config("refuse"))
+    goal = put("a", "1.0.0")
+    goal["applications"] += put("a", "1.1.0", id="edge/b")["applications"]
+    end = "which share it; request the same version"
+    what = "object-detection for /points of 'edge' would run in version"
+    assert repo.faults(goal) == [
+        f"applications[0].version: {what} 1.0.0, but in 1.1.0 for 'edge/b', {end}",
+        f"applications[1].version: {what} 1.1.0, but in 1.0.0 for 'edge/a', {end}",
+    ]
+
+
+def test_an_override_is_above_the_version() -> None:
+    pinned = override({"services": ["object-detection"]}, images={"object-detection": {"tag": "p"}})
+    repo = MemoryRepo(config("update") | {"overrides/pin.yaml": pinned})
+    repo.send(put("a"))
+    repo.send(put("b", "1.1.0"))
+    tags = {
+        release["spec"]["values"]["image"]["tag"]
+        for release in repo.objects("HelmRelease").values()
+    }
+    assert tags == {"p", "1.1.0"}
+
+
+def test_a_denied_claim_asks_for_nothing() -> None:
+    denied = override({"requesters": ["for-b"]}, deny=True)
+    repo = MemoryRepo(config("update"))
+    repo.send(put("a"))
+    repo.send(put("b", "1.1.0"))
+    state = State.of(
+        MemoryRepo(config("update") | {"overrides/deny.yaml": denied}).config, repo.state.ledger
+    )
+    assert {*running(MemoryRepo(state=state)).values()} == {"1.0.0"}
+    assert {*running(repo).values()} == {"1.1.0"}
+
+
+def test_a_version_that_is_gone_from_the_registry_is_the_default() -> None:
+    repo = MemoryRepo(config("update"))
+    repo.send(put("a", "testing"))
+    state = State.of(MemoryRepo(config("update", channels={})).config, repo.state.ledger)
+    assert {*running(MemoryRepo(state=state)).values()} == {DEFAULT}
+
+
+def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
+    before = "1.0.0-1 1.0.0-2 1.0.0-10 1.0.0-a 1.0.0-a.1 1.0.0-a.b 1.0.0-b"
+    listed = f"{before} 1.0.0 1.0.2 1.0.10 1.2.0 2.0.0".split()
+    shuffled = sorted(listed)
+    assert shuffled != listed
+    assert sorted(shuffled, key=precedence) == listed
+
+
+class Walk:
+    """Demands join and leave by chance; what runs is what the rule says."""
+
+    def __init__(self, random: Random, policy: str) -> None:
+        self.random = random
+        self.repo = MemoryRepo(config(policy))
+        self.asked: dict[str, tuple[str, str, str]] = {}
+
+    def step(self) -> None:
+        demand = self.random.choice("abcde")
+        if demand in self.asked and self.random.random() < 0.4:
+            del self.asked[demand]
+            self.repo.send(release(demand))
+        else:
+            wanted = (
+                self.random.choice(["", *LISTED, *CHANNELS]),
+                self.random.choice(["edge/a", "edge/b"]),
+                self.random.choice(["/points", "/more"]),
+            )
+            before = running(self.repo)
+            taken = self.repo.take(put(demand, *wanted))
+            if isinstance(taken, Refused):
+                assert {one.code for one in taken.faults} == {"conflict"}
+                assert running(self.repo) == before
+            else:
+                self.asked[demand] = wanted
+
+    def assert_as_the_rule_says(self) -> None:
+        """The newest that is asked for, of an application and then of what shares a service."""
+        newest: dict[str, str] = {}
+        for version, app, _ in self.asked.values():
+            name = CHANNELS.get(version, version or DEFAULT)
+            newest[app] = max(name, newest.get(app, name), key=LISTED.index)
+        for entry in self.repo.books()["services"].values():
+            versions = [newest[app] for app in entry["applications"]]
+            assert entry["application_version"] == max(versions, key=LISTED.index)
+
+    def assert_rendered_from_the_claims(self) -> None:
+        """The files are those of the claims alone, in whatever order they came."""
+        claims = sorted(self.repo.state.ledger, key=lambda claim: str(claim.key))
+        self.random.shuffle(claims)
+        for ledger in (rebuilt(claims), ledger_in(self.repo.files)):
+            files = rendered_files(State.of(self.repo.config, ledger))
+            assert files == self.repo.below("clusters", "bootstrap")
+
+
+@pytest.mark.parametrize("policy", ["refuse", "update", "upgrade"])
+@examples(15)
+@given(random=chances)
+def test_what_runs_follows_from_the_claims_whatever_their_order(
+    random: Random, policy: str
+) -> None:
+    walk = Walk(random, policy)
+    for _ in range(12):
+        walk.step()
+        walk.assert_as_the_rule_says()
+    walk.assert_rendered_from_the_claims()
+
+
+def test_each_listed_version_is_rendered_before_anybody_asks_for_it() -> None:
+    folder = "appdefs/object-detection-fusion/charts/next"
+    chart = {
+        f"{folder}/Chart.yaml": "apiVersion: v2\nname: object-fusion\nversion: 9.0.0\n",
+        f"{folder}/values.schema.json": json.dumps({"required": ["missing"]}),
+    }
+    last = "    version: 0.1.0\n"
+    text = skeleton()["registry/charts.yaml"]
+    assert text.endswith(last)
+    chart["registry/charts.yaml"] = (
+        f"{text}    channels: {{next: {{folder: {folder}, version: 9.0.0}}}}\n"
+    )
+    newest = {"1.0.0": {}, "3.0.0": {"charts": {"object-fusion": "9.0.0"}}}
+    state = MemoryRepo(config("update", versions=newest, channels={}) | chart).state
+    with pytest.raises(InvalidInput) as invalid:
+        try_configuration(state)
+    template = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
+    assert [str(found) for found in invalid.value.faults] == [
+        f'{template}: values: "missing" is a required property; fix the template or {folder}'
+    ]
