@@ -325,10 +325,10 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
         held = one.held
         if isinstance(held, Application):
             for flow in flows(world.config, held):
-                if not ledger.is_carried_to(flow.receiver, flow.topic.topic):
+                if not ledger.is_carried_to(flow.receiver, flow.target):
                     yield (
                         f"application '{held.id}': no connection carries {flow.name} "
-                        f"{flow.topic.topic} of '{flow.sender}' to '{flow.receiver}'"
+                        f"{flow.topic} of '{flow.sender}' to '{flow.receiver}'"
                     )
             continue
         if one.note:

@@ -46,7 +46,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         if not isinstance(app, Application) or one.connect == "none":
             continue
         for flow in flows(config, app):
-            if (flow.receiver, flow.topic.topic) in brought or not _is_valid(flow, config):
+            if (flow.receiver, flow.target) in brought or not _is_valid(flow, config):
                 continue
             needed = _connection(flow, one.connect, ledger)
             place = partial(_input_field, one.place(_field(app, flow)))
@@ -73,13 +73,14 @@ def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
 
 
 def _is_valid(flow: Flow, config: Config) -> bool:
-    return {flow.sender, flow.receiver} <= config.domain_of.keys() and not topic_problem(
-        flow.topic.topic
-    )
+    known = {flow.sender, flow.receiver} <= config.domain_of.keys()
+    return known and not topic_problem(flow.topic) and not topic_problem(flow.target)
 
 
 def _field(app: Application, flow: Flow) -> str:
     """Return the field of an application that needs a flow."""
+    if flow.delivery is not None:
+        return f"deliver[{flow.delivery}]"
     if not flow.root:
         return "node"
     role, topic, source = flow.root
@@ -89,15 +90,13 @@ def _field(app: Application, flow: Flow) -> str:
 
 def _connection(flow: Flow, type: str, ledger: Ledger) -> Connection:
     """Return the connection that carries a flow, with only its topic."""
-    name, ends = flow.topic.topic, (flow.sender, flow.receiver)
-    for id in ledger.connections_bringing(flow.receiver, name):
+    ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
+    for id in ledger.connections_bringing(flow.receiver, flow.target):
         for claim in ledger.connection_claims(id):
-            known, route = claim.connection, claim.connection.route(name)
-            if route is None or route.source != route.target:
-                continue
-            if route.sender_and_receiver(*known.nodes) == ends:
-                return Connection(id, known.type, *known.nodes, "", (route,))
+            known = claim.connection
+            for route in filter(None, map(known.route, names)):
+                same = (route.read_topic, route.written_topic) == names
+                if same and route.sender_and_receiver(*known.nodes) == ends:
+                    return Connection(id, known.type, *known.nodes, "", (route,))
     kind = None if type == "auto" else type_named(type)
-    return Connection(
-        f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (Route(name, name),)
-    )
+    return Connection(f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (Route(*names),))

@@ -21,6 +21,7 @@ from demandops.errors import Fault, fault
 from demandops.ledger.claim_file import path_of
 from demandops.ledger.operations.restoration import request_for
 from demandops.ledger.world import World
+from demandops.plan.flows import flows
 from demandops.plan.output_topics import outputs, usual_topic
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import (
@@ -52,6 +53,8 @@ def faults(
     for one in request.demanded:
         if isinstance(one.held, Connection):
             yield from _of_connection(one, one.held, before)
+        else:
+            yield from _of_deliveries(one, one.held, after)
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
@@ -102,6 +105,20 @@ def _of_connection(one: Demanded, connection: Connection, before: World) -> Iter
                 "name there",
                 code="conflict",
             )
+
+
+def _of_deliveries(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
+    """Yield a fault for each delivered topic that comes to its node from another node too."""
+    for flow in flows(after.config, app) if app.deliver else ():
+        ids = after.ledger.connections_bringing(flow.receiver, flow.target)
+        for id in ids if flow.delivery is not None else ():
+            other = after.ledger.connection(id)
+            if other is not None and {*other.nodes} != {flow.sender, flow.receiver}:
+                yield one.fault(
+                    f"deliver[{flow.delivery}].output",
+                    f"{flow.target} comes to '{flow.receiver}' by '{id}' already; leave it out",
+                    code="conflict",
+                )
 
 
 def _service(world: World, key: ServiceKey) -> Iterator[Service]:
