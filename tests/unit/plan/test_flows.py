@@ -254,7 +254,7 @@ def in_clusters(files: Mapping[str, str]) -> dict[str, str]:
     return {path: text for path, text in files.items() if path.startswith("clusters/")}
 
 
-@examples(60)
+@examples(30)
 @given(chances, st.integers(1, 8))
 def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carried(
     random: Random, length: int
