@@ -55,7 +55,7 @@ def node_of(app: Application, service: Service, source: str) -> str:
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
     """Yield the instances of a service that an application needs."""
     if service.scope == "application":
-        yield ServiceKey(service.name, app.node, application=app.id)
+        yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:
         for topic in app.inputs.get(service.root, ()):
             node = node_of(app, service, topic.source)
@@ -82,10 +82,11 @@ def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
             yield Made(one, one.source, (origin, one.topic, one.source))
         return
     producer = config.services[app.appdef][name]
-    pattern, node = producer.outputs[output], "" if producer.at_source else app.node
+    pattern = producer.outputs[output]
     if not producer.roots:
-        instance = app.id if producer.scope == "application" else app.node
-        yield Made(InputTopic(named(pattern, naming.topic_part(instance)), app.node), node)
+        node = node_of(app, producer, "")
+        instance = naming.topic_part(app.id if producer.scope == "application" else node)
+        yield Made(InputTopic(named(pattern, instance), node), node)
         return
     for role in producer.roots:
         for one in app.inputs.get(role, ()):
@@ -93,7 +94,8 @@ def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
                 instance_of(config, role, one) if producer.root else naming.topic_part(one.source)
             )
             topic = InputTopic(named(pattern, instance), one.source)
-            yield Made(topic, node or one.source, (role, one.topic, one.source))
+            node = node_of(app, producer, one.source)
+            yield Made(topic, node, (role, one.topic, one.source))
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
@@ -141,4 +143,4 @@ def _parts(app: Application, service: Service) -> Iterator[tuple[str, Applicatio
         for source, inputs in sorted(by_source.items()):
             yield node_of(app, service, source), app.with_inputs(inputs)
     else:
-        yield app.node, app
+        yield node_of(app, service, ""), app

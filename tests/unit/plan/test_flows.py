@@ -13,14 +13,15 @@ from typing import Any, NamedTuple
 import yaml
 from demandops.decision import rendered_files
 from demandops.plan.planner import plan
-from demandops.plan.release import ServiceKey, ServiceRelease
-from demandops.plan.release_keys import all_keys
+from demandops.plan.release import Release, ServiceKey, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey, all_keys
+from demandops.plan.traced_plan import TracedPlan
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
 from tests.kit.config import brokers, skeleton
-from tests.kit.memory import MemoryRepo, outcome
+from tests.kit.memory import MemoryRepo
 
 ROLES = ("a", "b")
 TYPES = ("one", "two")
@@ -174,6 +175,12 @@ class Demands:
             del self.held[demand]
             return head | {"operation": "release"}
         ids = self.random.sample(sorted(self.where), self.random.randint(1, 2))
+        for id in ids:
+            others = {
+                app["id"] for other, apps in self.held.items() if other != demand for app in apps
+            }
+            if id not in others:
+                self.where[id] = self.random.choice(NODES)
         self.held[demand] = [self._application(id) for id in ids]
         return head | {"applications": self.held[demand]}
 
@@ -262,10 +269,14 @@ def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carri
     graphs = Graphs(random)
     demands = Demands(random, graphs)
     repo = MemoryRepo(graphs.files)
+    traced, releases = TracedPlan(repo.config), dict[ReleaseKey, Release | None]()
     for _ in range(length):
-        assert outcome(taken := repo.take(demands.next())) != "refused", taken
+        decision = repo.send(demands.next())
         running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
         held = (app for apps in demands.held.values() for app in apps)
         assert running == {key for app in held for key in instances(graphs, app)}
         assert_every_topic_comes_in_one_way(repo, demands)
+        releases |= traced.advance(repo.state.ledger, decision.changes.claims)
+        planned = {key: plan(repo.state, key) for key in all_keys(repo.state)}
+        assert {key: one for key, one in releases.items() if one} == planned
         assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))
