@@ -192,6 +192,10 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     """
     subjects = request.subjects()
     ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    if isinstance(request, Decommission):
+        ledger, changes = implied_connections.without_idle_deliveries(
+            state.ledger, replace(state, ledger=ledger), changes
+        )
     after = replace(state, ledger=ledger)
     refusals = list(denial.faults(request, after, changes))
     refusals = refusals or list(quota.faults(state, after, changes))

@@ -16,10 +16,13 @@ from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named
 from demandops.connections.route import Route
 from demandops.demand.application import Application
+from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.identifiers import topic_problem
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.world import World
 from demandops.plan.flows import Flow, flows
+from demandops.subject import Subject, SubjectKind
 
 
 def _input_field(field: str, path: str) -> str:
@@ -70,6 +73,32 @@ _Ends: TypeAlias = "tuple[str, ...]"
 def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
     assert isinstance(one.held, Connection)  # noqa: S101 - the caller knows
     return replace(one, held=replace(one.held, topics=tuple(dict.fromkeys(topics))))
+
+
+def without_idle_deliveries(
+    before: Ledger, after: World, changes: Changes
+) -> tuple[Ledger, Changes]:
+    """Return a booking without the deliveries of what reduced claims no longer have made.
+
+    A demand gives its connections back itself. Only one that a decommissioned node has reduced
+    still holds connections between other nodes.
+    """
+    ledger, keys = after.ledger, [change.key for change in changes.claims]
+    for change in changes.claims:
+        if change.before is None or change.key.subject.kind is not SubjectKind.APPLICATION:
+            continue
+        wanted = flows(after.config, change.after.application) if change.after else []
+        still = {(flow.receiver, flow.target) for flow in wanted}
+        for flow in flows(after.config, change.before.application):
+            place = (flow.receiver, flow.target)
+            for id in ledger.connections_bringing(*place) if place not in still else ():
+                key = ClaimKey(Subject(SubjectKind.CONNECTION, id), change.key.demand)
+                claim = ledger.get(key)
+                if claim is not None and flow.delivery is not None:
+                    left = claim.held.without_topics({(flow.topic,)})
+                    ledger = ledger.replace(key, replace(claim, held=left) if left else None)
+                    keys.append(key)
+    return ledger, replace(changes, claims=claim_changes(before, ledger, keys))
 
 
 def _is_valid(flow: Flow, config: Config) -> bool:
