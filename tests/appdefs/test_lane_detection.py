@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from demandops.demand.application import Application
 
 from tests.kit.config import skeleton
 from tests.kit.goals import CLOUD, application, connection, goal
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import MemoryRepo, rebuilt
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "lane-detection"
 PAGE = (EXAMPLE / "README.md").read_text()
@@ -96,3 +98,32 @@ def test_object_detection_reads_the_driver_that_lane_detection_has(books: Memory
     assert list(of_lidars(books)) == ["lidar-vehicle00-vehicle00"]
     books.send(join | {"shutdown": True})
     assert of_lidars(books) == {}
+
+
+def test_the_bookkeeping_reads_claims_that_a_person_made_to_disagree(books: MemoryRepo) -> None:
+    (app,) = DEMAND["applications"]
+    app = app | {"inputs": {"point_cloud": [{"topic": "/points", "source": "vehicle01"}]}}
+    books.send(DEMAND | {"applications": [app]})
+    books.send(DEMAND | {"demand": "more", "applications": [app | {"id": "edge/more"}]})
+    claims = [
+        replace(claim, held=marked_further(claim.application))
+        if claim.demand == "more" and claim.is_on_application
+        else claim
+        for claim in books.state.ledger
+    ]
+    books.state = replace(books.state, ledger=rebuilt(claims))
+    services = books.books()["services"].values()
+    lanes = [
+        one
+        for one in services
+        if (one["service"], one["source"]) == ("lane-detection", "vehicle01")
+    ]
+    assert [one["inputs"] for one in lanes] == [{"points": {"/vehicle01_points": ["vehicle00"]}}]
+
+
+def marked_further(app: Application) -> Application:
+    inputs = {
+        role: tuple(one._replace(further=True) for one in topics)
+        for role, topics in app.inputs.items()
+    }
+    return app.with_inputs(inputs)
