@@ -135,12 +135,12 @@ def _parts(app: Application, service: Service) -> Iterator[tuple[str, Applicatio
         for one in app.inputs.get(service.root, ()):
             yield node_of(app, service, one.source), app.with_inputs({service.root: (one,)})
     elif service.at_source:
-        by_source: dict[str, dict[str, tuple[InputTopic, ...]]] = {}
+        by_source: dict[str, dict[str, list[InputTopic]]] = {}
         for role in service.roots:
             for one in app.inputs.get(role, ()):
-                of = by_source.setdefault(one.source, {})
-                of[role] = (*of.get(role, ()), one)
+                by_source.setdefault(one.source, {}).setdefault(role, []).append(one)
         for source, inputs in sorted(by_source.items()):
-            yield node_of(app, service, source), app.with_inputs(inputs)
+            part = {role: tuple(topics) for role, topics in inputs.items()}
+            yield node_of(app, service, source), app.with_inputs(part)
     else:
         yield node_of(app, service, ""), app

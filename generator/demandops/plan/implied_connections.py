@@ -48,11 +48,19 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         app = one.held
         if not isinstance(app, Application) or one.connect == "none":
             continue
+        places = {
+            (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
+            for role, topics in app.inputs.items()
+            for index, topic in enumerate(topics)
+        }
         for flow in flows(config, app):
             if (flow.receiver, flow.target) in brought or not _is_valid(flow, config):
                 continue
             needed = _connection(flow, one.connect, ledger)
-            place = partial(_input_field, one.place(_field(app, flow)))
+            field = places.get(flow.root, "node")
+            if flow.delivery is not None:
+                field = f"deliver[{flow.delivery}]"
+            place = partial(_input_field, one.place(field))
             ends = (needed.id, *needed.nodes)
             first.setdefault(ends, replace(one, held=needed, place=place, connect="none"))
             routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
@@ -104,17 +112,6 @@ def without_idle_deliveries(
 def _is_valid(flow: Flow, config: Config) -> bool:
     known = {flow.sender, flow.receiver} <= config.domain_of.keys()
     return known and not topic_problem(flow.topic) and not topic_problem(flow.target)
-
-
-def _field(app: Application, flow: Flow) -> str:
-    """Return the field of an application that needs a flow."""
-    if flow.delivery is not None:
-        return f"deliver[{flow.delivery}]"
-    if not flow.root:
-        return "node"
-    role, topic, source = flow.root
-    listed = [one[:2] for one in app.inputs[role]]
-    return f"inputs.{role}[{listed.index((topic, source))}]"
 
 
 def _connection(flow: Flow, type: str, ledger: Ledger) -> Connection:
