@@ -22,7 +22,7 @@ from demandops.identifiers import topic_problem
 from demandops.ledger.ledger import Changes, Ledger, claim_changes
 from demandops.ledger.world import World
 from demandops.plan.flows import Flow, flows
-from demandops.subject import Subject, SubjectKind
+from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
@@ -48,7 +48,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         app = one.held
         if not isinstance(app, Application) or one.connect == "none":
             continue
-        places = {
+        places: dict[TopicKey, str] = {
             (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
             for role, topics in app.inputs.items()
             for index, topic in enumerate(topics)

@@ -52,7 +52,7 @@ def faults(
                 yield from _of_service(request, after, key, service)
     for one in request.demanded:
         if isinstance(one.held, Connection):
-            yield from _of_connection(one, one.held, before)
+            yield from _of_connection(one, one.held, before, after)
         else:
             yield from _of_deliveries(one, one.held, after)
 
@@ -90,14 +90,20 @@ def _clashes(
         yield f"connection '{id}' brings to", _remedy(key, None, service)
 
 
-def _of_connection(one: Demanded, connection: Connection, before: World) -> Iterator[Fault]:
-    """Yield a fault for each new route to a topic that a service published before the demand."""
+def _of_connection(
+    one: Demanded, connection: Connection, before: World, after: World
+) -> Iterator[Fault]:
+    """Yield a fault for each new route to a topic that a service published before, and still does.
+
+    An application that moves may have its output brought back.
+    """
     for index, route in enumerate(connection.topics):
         _, node = route.sender_and_receiver(*connection.nodes)
         topic = route.written_topic
         if connection.id in before.ledger.connections_bringing(node, topic):
             continue
-        for other in islice(_publishers(before, node, topic), 1):
+        others = (one for one in _publishers(before, node, topic) if is_needed(after, one))
+        for other in islice(others, 1):
             yield one.fault(
                 f"topics[{index}].{'source' if route.reverse else 'target'}",
                 f"connection '{connection.id}' brings {topic} to '{node}', where "
