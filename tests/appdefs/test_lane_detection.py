@@ -6,6 +6,7 @@ import json
 import re
 from collections import defaultdict
 from dataclasses import replace
+from difflib import unified_diff
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,37 @@ def test_what_the_page_says_runs_and_ends_with_the_demand(books: MemoryRepo) -> 
         name: DEMAND[name] for name in ("demand", "requesters")
     }})  # fmt: skip
     assert (running(books), carried(books)) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    ("file", "lines"),
+    [
+        (
+            "appdef.yaml",
+            [
+                *("-# vehicles.", "-    each: point_cloud"),
+                "+# vehicles. Unlike the one that `init` creates, it reads the points of the shared "
+                "lidar driver.",
+                *("+uses:", "+  lidar-driver: {packets: point_cloud}", "+"),
+                *("+    each: cloud", "+    inputs: {cloud: lidar-driver.points}"),
+            ],
+        ),
+        (
+            "values/object-detection.yaml.j2",
+            [
+                "-  pointCloudTopic: {{ source_topic }}",
+                "+  pointCloudTopic: {{ inputs.cloud[0].topic }}",
+            ],
+        ),
+    ],
+)
+def test_its_object_detection_is_that_of_init_but_for_the_driver(
+    file: str, lines: list[str]
+) -> None:
+    path = f"appdefs/object-detection-fusion/{file}"
+    texts = [text.splitlines() for text in (skeleton()[path], (EXAMPLE / path).read_text())]
+    found = [line for line in unified_diff(*texts, n=0) if line[:2] not in ("--", "++", "@@")]
+    assert sorted(found) == sorted(lines)
 
 
 def of_lidars(books: MemoryRepo) -> dict[str, Any]:
