@@ -202,6 +202,10 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     """
     subjects = request.subjects()
     ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    if isinstance(request, Decommission):
+        ledger, changes = implied_connections.without_idle_deliveries(
+            state.ledger, replace(state, ledger=ledger), changes
+        )
     after = replace(state, ledger=ledger)
     refusals = list(denial.faults(request, after, changes))
     refusals = refusals or list(quota.faults(state, after, changes))
@@ -335,10 +339,10 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
         held = one.held
         if isinstance(held, Application):
             for flow in flows(world.config, held):
-                if not ledger.is_carried_to(flow.receiver, flow.topic.topic):
+                if not ledger.is_carried_to(flow.receiver, flow.target):
                     yield (
                         f"application '{held.id}': no connection carries {flow.name} "
-                        f"{flow.topic.topic} of '{flow.sender}' to '{flow.receiver}'"
+                        f"{flow.topic} of '{flow.sender}' to '{flow.receiver}'"
                     )
             continue
         if one.note:

@@ -75,6 +75,38 @@ def test_the_deployment_request_of_the_documentation_runs() -> None:
     assert len(decision.changes.claims) == 2
 
 
+def test_the_application_definition_of_the_documentation_runs() -> None:
+    definitions = [yaml.safe_load(text) for text in blocks("appdef.md") if "kind: " in text]
+    files: dict[str, Any] = {"registry/charts.yaml": {"charts": {}}}
+    files["registry/images.yaml"] = {"images": {}}
+    for one in definitions:
+        folder = f"appdefs/{one['name']}"
+        kind = "appdef" if one["kind"] == "ApplicationDefinition" else "service"
+        files[f"{folder}/{kind}.yaml"] = one
+        for service in one.get("services", {"": one}).values():
+            files[f"{folder}/{service['values']}"] = {"any": 1}
+            name, source = service["chart"], {"http": "https://charts.example", "version": "1.0.0"}
+            files["registry/charts.yaml"]["charts"][name] = source
+            for image in service["images"]:
+                entry = {"repository": f"registry.example/{image}", "tag": "1"}
+                files["registry/images.yaml"]["images"][image] = entry
+    for path in ("registry/charts.yaml", "registry/images.yaml"):
+        section = next(iter(files[path]))
+        whole = yaml.safe_load(skeleton.files("flux")[path])
+        whole[section] |= files[path][section]
+        files[path] = whole
+    on = state(**{path: yaml.safe_dump(data) for path, data in files.items()})
+    (app,) = (goal := demand())["applications"]
+    clouds = {"point_cloud": app["inputs"]["point_cloud"]}
+    goal["applications"] = [{**app, "type": "recorder", "inputs": clouds}]
+    services = as_data(bookkeeping(decided(on, goal).state), "")["services"]
+    assert {entry["service"]: entry["node"] for entry in services.values()} == {
+        "lidar-driver": "vehicle00",
+        "filter": "vehicle00",
+        "recorder": "edge",
+    }
+
+
 @pytest.mark.parametrize(
     ("requester", "node", "start"),
     [

@@ -311,6 +311,8 @@ applications:
       ego_data:
         - {topic: /ego, source: vehicle00, type: perception_msgs/msg/EgoData}
     parameters: {rate: 5}
+    deliver:
+      - {output: object-fusion.raw_objects, node: vehicle00, topic: /raw}
   - id: second
     type: object-detection-fusion
     node: edge

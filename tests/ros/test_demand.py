@@ -94,11 +94,11 @@ def test_a_refusal_names_code_field_and_remedy(
     assert caught.value.code == "unknown-application"
     assert "applications[0].type: 'recoder' is not a known application type" in str(caught.value)
     assert "applications[0].node: 'egde' is not in inventory/nodes.yaml" in str(caught.value)
-    later = {"place": {"role": "edge"}, "deliver": [{"output": "recorder.bag", "node": "edge"}]}
+    later = {"place": {"role": "edge"}, "deliver": [{"output": "driver.bag", "node": "edge"}]}
     with pytest.raises(DemandError) as caught:
         vehicle.put("refused", [RECORDER | later])
     assert "applications[0].place: is not supported" in str(caught.value)
-    assert "applications[0].deliver: is not supported" in str(caught.value)
+    assert "applications[0].deliver[0].output: 'driver.bag' is not an output" in str(caught.value)
     with pytest.raises(DemandError) as caught:
         vehicle.release("refused")
     assert caught.value.code == "not-held"

@@ -9,13 +9,13 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from demandops.config.appdef import ApplicationDefinition
+from demandops.config.appdef import ApplicationDefinition, Services
 from demandops.config.config import Config
 from demandops.config.repo_settings import ROOT_FILE, Limits
 from demandops.connections import connection_types
 from demandops.connections import route as routes
 from demandops.connections.connection import Connection
-from demandops.demand.application import Application
+from demandops.demand.application import Application, Delivery
 from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put, Release, Renew
 from demandops.demand.lease import LONGEST_S
@@ -54,7 +54,10 @@ def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
     for one in request.demanded:
         held = one.held
         items += len(one.requesters) if request.is_reference else 0
-        items += len(held.all_inputs() if isinstance(held, Application) else held.topics)
+        if isinstance(held, Application):
+            items += len(held.all_inputs()) + len(held.deliver)
+        else:
+            items += len(held.topics)
         if isinstance(held, Application) and held.parameters:
             size = len(json.dumps(dict(held.parameters), default=str))
             if size > limits.parameter_bytes:
@@ -115,9 +118,30 @@ def _application(app: Application, config: Config, claiming: bool) -> Iterator[F
     yield from _node("node", app.node, config)
     for where, topic in inputs:
         yield from _node(f"{where}.source", topic.source, config)
+    for index, delivery in enumerate(app.deliver):
+        where = f"deliver[{index}]"
+        yield from _id(f"{where}.node", delivery.node)
+        yield from _node(f"{where}.node", delivery.node, config)
+        if appdef is not None:
+            yield from _delivery(where, delivery, config.services[appdef.name])
     if appdef is not None and not any(app.inputs.values()):
         roles = " or ".join(sorted(appdef.inputs))
         yield fault("inputs", f"is empty; list at least one topic of {roles}")
+
+
+def _delivery(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
+    name, _, output = delivery.output.partition(".")
+    service = services.get(name)
+    if service is None or output not in service.outputs:
+        known = [f"{one.name}.{output}" for one in services.values() for output in one.outputs]
+        message = f"{quoted(delivery.output)} is not an output{suggestion(delivery.output, known)}"
+        yield fault(f"{where}.output", message)
+    elif delivery.topic and service.roots:
+        message = f"{name} may make several topics, so none can have another name; leave it out"
+        yield fault(f"{where}.topic", message)
+    problem = topic_problem(delivery.topic) if delivery.topic else ""
+    if problem:
+        yield fault(f"{where}.topic", problem)
 
 
 def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) -> Iterator[Fault]:

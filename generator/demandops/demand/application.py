@@ -32,6 +32,17 @@ class InputTopic(NamedTuple):
         return naming.topic_part(self.source, self.topic if self.further else "")
 
 
+class Delivery(NamedTuple):
+    """An output (``<service>.<output>``) that is brought to a node; ``topic`` is its name there.
+
+    Without ``topic`` it keeps its name.
+    """
+
+    output: str
+    node: str
+    topic: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: an appdef at a node with inputs by role.
@@ -46,6 +57,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     inputs: Mapping[str, tuple[InputTopic, ...]]
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     version: str = ""
+    deliver: tuple[Delivery, ...] = ()
 
     def __eq__(self, other: object) -> bool:
         """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
@@ -84,16 +96,17 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def needs(self, node: str) -> bool:
         """Return whether the application depends on a node."""
-        return self.node == node or any(topic.source == node for _, topic in self.all_inputs())
+        delivered = any(one.node == node for one in self.deliver)
+        return delivered or node in self.needed_nodes()
 
     def needed_nodes(self) -> set[str]:
-        """Return the nodes that the application depends on."""
+        """Return the nodes at which services may run: its own and those of its inputs."""
         return {self.node, *(topic.source for _, topic in self.all_inputs())}
 
     def booked(self) -> Application:
         """Return the application as a claim holds it: inputs sorted, each once."""
         inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
-        return self.with_inputs(inputs)
+        return replace(self, deliver=tuple(sorted({*self.deliver}))).with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
         """Return the application with other inputs, without roles that have no topic."""
@@ -101,11 +114,14 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, inputs=MappingProxyType(kept))
 
     def extended(self, more: Application) -> Application:
-        """Return ``more`` with this application's inputs and parameters added."""
+        """Return ``more`` with what this application has of inputs, parameters and deliveries."""
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
         parameters = MappingProxyType({**self.parameters, **more.parameters})
-        return replace(more, inputs=MappingProxyType(inputs), parameters=parameters)
+        deliver = (*self.deliver, *more.deliver)
+        return replace(
+            more, inputs=MappingProxyType(inputs), parameters=parameters, deliver=deliver
+        )
 
     def is_meant_by(self, listed: object) -> bool:
         """Return whether ``listed`` in a shutdown fits this application; an empty node fits any."""
@@ -146,14 +162,18 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return self.with_inputs(left) if any(left.values()) else None
 
     def without_node(self, node: str) -> Application | None:
-        """Return the application without a node's inputs; ``None`` if it has no others."""
+        """Return the application without a node's inputs and what is delivered to the node.
+
+        ``None`` if it has no other inputs, or runs there.
+        """
         if self.node == node:
             return None
+        deliver = tuple(one for one in self.deliver if one.node != node)
         left = {
             role: tuple(topic for topic in topics if topic.source != node)
             for role, topics in self.inputs.items()
         }
-        return self.with_inputs(left) if any(left.values()) else None
+        return replace(self, deliver=deliver).with_inputs(left) if any(left.values()) else None
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
         """Yield the entries by which the ledger's index finds it."""
@@ -167,6 +187,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
                 yield ("usual", topic.source, role)
         if self.version:
             yield ("version", self.id, self.version)
+        for one in self.deliver:
+            yield ("node", one.node)
         yield ("topics", naming.topic_part(self.id))
 
 

@@ -21,7 +21,7 @@ from demandops.config.policy import seconds_of
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
-from demandops.demand.application import Application, InputTopic
+from demandops.demand.application import Application, Delivery, InputTopic
 from demandops.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
 from demandops.demand.goal_validation import is_unicode, parse_valid_part
 from demandops.errors import Fault, fault
@@ -204,9 +204,6 @@ def _not_supported(goal: DemandGoal) -> Iterator[Fault]:
         if app.place != GoalPlace():
             message = "is not supported: this version chooses no nodes; name the node"
             yield fault(f"{where}.place", message)
-        if app.deliver:
-            message = "is not supported by this version; list a connection that carries the output"
-            yield fault(f"{where}.deliver", message)
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
@@ -251,6 +248,10 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
         ),
         parameters=MappingProxyType(parameters),
         version=app.version,
+        deliver=tuple(
+            Delivery(one.output, one.node, absolute_topic(one.topic) if one.topic else "")
+            for one in app.deliver
+        ),
     )
 
 

@@ -21,7 +21,7 @@ from demandops.config.base_model import FrozenModel, parse
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import Route, RouteOptions
-from demandops.demand.application import Application, InputTopic
+from demandops.demand.application import Application, Delivery, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
 from demandops.errors import Fault, InvalidInput, fault
@@ -95,6 +95,12 @@ class _Topic(FrozenModel):
     type: str = ""
     further: bool = False
     requesters: _Requesters = Field(default=(), strict=False)
+
+
+class _Delivery(FrozenModel):
+    output: str
+    node: str
+    topic: str = ""
 
 
 class _Route(RouteOptions):
@@ -173,6 +179,7 @@ class _ApplicationFile(_Claim):
     inputs: dict[str, list[_Topic]] = Field(default_factory=dict)
     parameters: dict[str, Any] = Field(default_factory=dict)
     version: str = ""
+    deliver: tuple[_Delivery, ...] = Field(default=(), strict=False)
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for role, topics in self.inputs.items():
@@ -194,6 +201,7 @@ class _ApplicationFile(_Claim):
             MappingProxyType(inputs),
             MappingProxyType(self.parameters),
             self.version,
+            tuple(sorted(Delivery(one.output, one.node, one.topic) for one in self.deliver)),
         )
 
 
@@ -261,7 +269,9 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
     }
     if app.parameters:
         data["parameters"] = dict(sorted(app.parameters.items()))
-    return data | {"version": app.version} if app.version else data
+    data |= {"version": app.version} if app.version else {}
+    deliver = [{k: v for k, v in one._asdict().items() if v} for one in app.deliver]
+    return data | {"deliver": deliver} if deliver else data
 
 
 def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:

@@ -34,14 +34,17 @@ class Made(NamedTuple):
 class Flow:
     """A topic that is made on one node and needed on another.
 
-    ``name`` is the role, or ``<service>.<output>``. ``root`` is the demanded topic that needs it.
+    ``name`` is the role, or ``<service>.<output>``. ``target`` is the topic's name at the receiver.
+    ``root`` is the demanded topic that needs it, ``delivery`` the index of what is delivered.
     """
 
     name: str
-    topic: InputTopic
+    topic: str
     sender: str
     receiver: str
-    root: TopicKey
+    target: str
+    root: TopicKey = ()
+    delivery: int | None = None
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
@@ -52,7 +55,7 @@ def node_of(app: Application, service: Service, source: str) -> str:
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
     """Yield the instances of a service that an application needs."""
     if service.scope == "application":
-        yield ServiceKey(service.name, app.node, application=app.id)
+        yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:
         for topic in app.inputs.get(service.root, ()):
             node = node_of(app, service, topic.source)
@@ -80,35 +83,50 @@ def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
         return
     producer = config.services[app.appdef][name]
     pattern = producer.outputs[output]
-    if producer.root is not None:
-        role = producer.root
-        for one in app.inputs.get(role, ()):
-            topic = InputTopic(named(pattern, instance_of(config, role, one)), one.source)
-            yield Made(topic, node_of(app, producer, one.source), (role, one.topic, one.source))
-        return
     if not producer.roots:
-        instance = app.id if producer.scope == "application" else app.node
-        topic = InputTopic(named(pattern, naming.topic_part(instance)), app.node)
-        yield Made(topic, node_of(app, producer, ""))
+        node = node_of(app, producer, "")
+        instance = naming.topic_part(app.id if producer.scope == "application" else node)
+        yield Made(InputTopic(named(pattern, instance), node), node)
         return
     for role in producer.roots:
         for one in app.inputs.get(role, ()):
-            topic = InputTopic(named(pattern, naming.topic_part(one.source)), one.source)
-            yield Made(topic, one.source, (role, one.topic, one.source))
+            instance = (
+                instance_of(config, role, one) if producer.root else naming.topic_part(one.source)
+            )
+            topic = InputTopic(named(pattern, instance), one.source)
+            node = node_of(app, producer, one.source)
+            yield Made(topic, node, (role, one.topic, one.source))
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
     """Return what must be carried between nodes for an application, sorted by name."""
-    found: dict[tuple[str, str, str], Flow] = {}
+    found: dict[tuple[str, str, str, str], Flow] = {}
     for service in config.services.get(app.appdef, {}).values():
         for node, part in _parts(app, service):
             for origin in service.inputs.values():
                 for one in made(config, part, origin):
                     if one.node != node:
                         root = one.root or (next(part.topic_keys()) if service.roots else ())
-                        flow = Flow(origin, one.topic, one.node, node, root)
-                        found.setdefault((one.topic.topic, one.node, node), flow)
+                        name = one.topic.topic
+                        flow = Flow(origin, name, one.node, node, name, root)
+                        found.setdefault((name, one.node, node, name), flow)
+    for flow in _deliveries(config, app):
+        found.setdefault((flow.topic, flow.sender, flow.receiver, flow.target), flow)
     return sorted(found.values(), key=lambda flow: flow.name)
+
+
+def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
+    """Yield what must be carried so that the application's outputs are delivered."""
+    for index, delivery in enumerate(app.deliver):
+        name, _, output = delivery.output.partition(".")
+        service = config.services.get(app.appdef, {}).get(name)
+        if service is None or output not in service.outputs:
+            continue  # admission reports it
+        for one in made(config, app, delivery.output):
+            topic = one.topic.topic
+            target = delivery.topic or topic
+            if (one.node, topic) != (delivery.node, target):
+                yield Flow(delivery.output, topic, one.node, delivery.node, target, delivery=index)
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
@@ -117,12 +135,12 @@ def _parts(app: Application, service: Service) -> Iterator[tuple[str, Applicatio
         for one in app.inputs.get(service.root, ()):
             yield node_of(app, service, one.source), app.with_inputs({service.root: (one,)})
     elif service.at_source:
-        by_source: dict[str, dict[str, tuple[InputTopic, ...]]] = {}
+        by_source: dict[str, dict[str, list[InputTopic]]] = {}
         for role in service.roots:
             for one in app.inputs.get(role, ()):
-                of = by_source.setdefault(one.source, {})
-                of[role] = (*of.get(role, ()), one)
+                by_source.setdefault(one.source, {}).setdefault(role, []).append(one)
         for source, inputs in sorted(by_source.items()):
-            yield node_of(app, service, source), app.with_inputs(inputs)
+            part = {role: tuple(topics) for role, topics in inputs.items()}
+            yield node_of(app, service, source), app.with_inputs(part)
     else:
-        yield app.node, app
+        yield node_of(app, service, ""), app

@@ -16,10 +16,13 @@ from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named
 from demandops.connections.route import Route
 from demandops.demand.application import Application
+from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.identifiers import topic_problem
-from demandops.ledger.ledger import Ledger
+from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.world import World
 from demandops.plan.flows import Flow, flows
+from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
@@ -45,11 +48,19 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         app = one.held
         if not isinstance(app, Application) or one.connect == "none":
             continue
+        places: dict[TopicKey, str] = {
+            (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
+            for role, topics in app.inputs.items()
+            for index, topic in enumerate(topics)
+        }
         for flow in flows(config, app):
-            if (flow.receiver, flow.topic.topic) in brought or not _is_valid(flow, config):
+            if (flow.receiver, flow.target) in brought or not _is_valid(flow, config):
                 continue
             needed = _connection(flow, one.connect, ledger)
-            place = partial(_input_field, one.place(_field(app, flow)))
+            field = places.get(flow.root, "node")
+            if flow.delivery is not None:
+                field = f"deliver[{flow.delivery}]"
+            place = partial(_input_field, one.place(field))
             ends = (needed.id, *needed.nodes)
             first.setdefault(ends, replace(one, held=needed, place=place, connect="none"))
             routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
@@ -72,32 +83,46 @@ def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
     return replace(one, held=replace(one.held, topics=tuple(dict.fromkeys(topics))))
 
 
+def without_idle_deliveries(
+    before: Ledger, after: World, changes: Changes
+) -> tuple[Ledger, Changes]:
+    """Return a booking without the deliveries of what reduced claims no longer have made.
+
+    A demand gives its connections back itself. Only one that a decommissioned node has reduced
+    still holds connections between other nodes.
+    """
+    ledger, keys = after.ledger, [change.key for change in changes.claims]
+    for change in changes.claims:
+        if change.before is None or change.key.subject.kind is not SubjectKind.APPLICATION:
+            continue
+        wanted = flows(after.config, change.after.application) if change.after else []
+        still = {(flow.receiver, flow.target) for flow in wanted}
+        for flow in flows(after.config, change.before.application):
+            place = (flow.receiver, flow.target)
+            for id in ledger.connections_bringing(*place) if place not in still else ():
+                key = ClaimKey(Subject(SubjectKind.CONNECTION, id), change.key.demand)
+                claim = ledger.get(key)
+                if claim is not None and flow.delivery is not None:
+                    left = claim.held.without_topics({(flow.topic,)})
+                    ledger = ledger.replace(key, replace(claim, held=left) if left else None)
+                    keys.append(key)
+    return ledger, replace(changes, claims=claim_changes(before, ledger, keys))
+
+
 def _is_valid(flow: Flow, config: Config) -> bool:
-    return {flow.sender, flow.receiver} <= config.domain_of.keys() and not topic_problem(
-        flow.topic.topic
-    )
-
-
-def _field(app: Application, flow: Flow) -> str:
-    """Return the field of an application that needs a flow."""
-    if not flow.root:
-        return "node"
-    role, topic, source = flow.root
-    listed = [one[:2] for one in app.inputs[role]]
-    return f"inputs.{role}[{listed.index((topic, source))}]"
+    known = {flow.sender, flow.receiver} <= config.domain_of.keys()
+    return known and not topic_problem(flow.topic) and not topic_problem(flow.target)
 
 
 def _connection(flow: Flow, type: str, ledger: Ledger) -> Connection:
     """Return the connection that carries a flow, with only its topic."""
-    name, ends = flow.topic.topic, (flow.sender, flow.receiver)
-    for id in ledger.connections_bringing(flow.receiver, name):
+    ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
+    for id in ledger.connections_bringing(flow.receiver, flow.target):
         for claim in ledger.connection_claims(id):
-            known, route = claim.connection, claim.connection.route(name)
-            if route is None or route.source != route.target:
-                continue
-            if route.sender_and_receiver(*known.nodes) == ends:
-                return Connection(id, known.type, *known.nodes, "", (route,))
+            known = claim.connection
+            for route in filter(None, map(known.route, names)):
+                same = (route.read_topic, route.written_topic) == names
+                if same and route.sender_and_receiver(*known.nodes) == ends:
+                    return Connection(id, known.type, *known.nodes, "", (route,))
     kind = None if type == "auto" else type_named(type)
-    return Connection(
-        f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (Route(name, name),)
-    )
+    return Connection(f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (Route(*names),))

@@ -20,7 +20,11 @@ from tests.e2e.rig.kube import Manifest
 
 __all__ = ["test_the_server_does_look", "test_the_server_takes_every_golden_manifest"]
 ROOT = Path(__file__).resolve().parents[3]
-CHARTS = ROOT / "appdefs" / "object-detection-fusion" / "charts"
+FOLDERS = (
+    ROOT / "appdefs" / "object-detection-fusion" / "charts",
+    ROOT / "examples" / "lane-detection" / "appdefs" / "lane-detection" / "charts",
+)
+CHARTS = {path.name: path for folder in FOLDERS for path in folder.iterdir()}
 
 
 # Every corner that a person may set and no golden case does.
@@ -53,6 +57,22 @@ _INPUTS = {"egoData": ["/b", "/a", "/b"], "objectList": ["/list"]}
 VALUES = {
     "object-detection": _COMMON,
     "object-fusion": {**_COMMON, "with inputs": {"inputs": _INPUTS}},
+    "ros-launch": {
+        "as it comes": {},
+        "all set": {
+            "replicas": 0,
+            "image": {"repository": "registry.example/x", "digest": "sha256:" + 64 * "0"},
+            "node": {
+                "selector": {"node_id": "edge"},
+                "tolerations": [{"key": "busy", "operator": "Exists", "effect": "NoSchedule"}],
+                "image_pull_secrets": ["registry"],
+                "host_network": True,
+                "ros": {"domain_id": 42, "rmw": "rmw_zenoh_cpp"},
+            },
+            "launch": {"arguments": {"topic": '$(touch /tmp/x); "#: {'}},
+            "workspaceSetup": ["install/setup.bash"],
+        },
+    },
 }
 CASES = [pytest.param(c, v, id=f"{c} {n}") for c, cases in VALUES.items() for n, v in cases.items()]
 
@@ -69,7 +89,7 @@ def test_a_chart_passes_lint_and_what_it_gives_the_server(
 ) -> None:
     given = tmp_path / "values.json"
     given.write_text(json.dumps(values))
-    rig.helm("lint", "--strict", "--quiet", f"--values={given}", str(CHARTS / chart))
+    rig.helm("lint", "--strict", "--quiet", f"--values={given}", str(CHARTS[chart]))
     made = templated(rig, chart, given, "some-release")
     assert {"Deployment"} <= {manifest["kind"] for manifest in made}
     rig.kube.apply(*made, dry_run=True)
@@ -95,7 +115,7 @@ def test_every_golden_release_gives_what_the_server_takes(
 def templated(rig: Rig, chart: str, values: Path, release: str) -> list[Manifest]:
     """What helm makes of a chart, with the namespace that it would install into."""
     text = rig.helm(
-        "template", release, str(CHARTS / chart), f"--namespace={NAMESPACE}", f"--values={values}"
+        "template", release, str(CHARTS[chart]), f"--namespace={NAMESPACE}", f"--values={values}"
     )
     made = [manifest for manifest in yaml.safe_load_all(text) if manifest]
     for manifest in made:

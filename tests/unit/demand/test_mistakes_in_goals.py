@@ -25,7 +25,7 @@ ELSEWHERE = {
 """Where a fault may also be when the mistake is here."""
 NOT_SUPPORTED = (
     *("DemandGoal.priority", "DemandGoal.positions", "GoalPosition."),
-    *("GoalApplication.place", "GoalPlace.", "GoalApplication.deliver", "GoalDelivery."),
+    *("GoalApplication.place", "GoalPlace."),
 )
 """Fields that no valid goal may set yet."""
 

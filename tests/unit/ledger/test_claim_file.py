@@ -12,7 +12,7 @@ from demandops.connections.connection import Connection
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
 from demandops.connections.route import Route, merged_routes
-from demandops.demand.application import Application, InputTopic
+from demandops.demand.application import Application, Delivery, InputTopic
 from demandops.demand.claim import Claim, ClaimKey, demand_id
 from demandops.demand.demand_request import id_problem
 from demandops.demand.lease import LONGEST_S, Lease
@@ -56,6 +56,7 @@ moments = st.datetimes(
 leases = st.none() | st.builds(Lease, st.integers(1, LONGEST_S), st.integers(0, LONGEST_S), moments)
 people = st.lists(ids, min_size=1, max_size=4, unique=True).map(lambda who: tuple(sorted(who)))
 inputs = st.lists(st.builds(InputTopic, topics, ids, st.just("") | ids), min_size=1, max_size=4)
+deliveries = st.builds(Delivery, ids, ids, st.just("") | topics)
 routes = st.builds(
     Route,
     topics,
@@ -98,6 +99,7 @@ def applications(draw: st.DrawFn) -> Application:
         ),
         parameters=MappingProxyType(draw(st.dictionaries(ids, values, max_size=3))),
         version=draw(st.sampled_from(["", "1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"])),
+        deliver=tuple(sorted(draw(st.sets(deliveries, max_size=2)))),
     )
 
 

@@ -13,14 +13,15 @@ from typing import Any, NamedTuple
 import yaml
 from demandops.decision import rendered_files
 from demandops.plan.planner import plan
-from demandops.plan.release import ServiceKey, ServiceRelease
-from demandops.plan.release_keys import all_keys
+from demandops.plan.release import Release, ServiceKey, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey, all_keys
+from demandops.plan.traced_plan import TracedPlan
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
 from tests.kit.config import brokers, skeleton
-from tests.kit.memory import MemoryRepo, outcome
+from tests.kit.memory import MemoryRepo
 
 ROLES = ("a", "b")
 TYPES = ("one", "two")
@@ -161,8 +162,8 @@ class Graphs:
 class Demands:
     """Demands for applications of both types, made by chance."""
 
-    def __init__(self, random: Random) -> None:
-        self.random = random
+    def __init__(self, random: Random, graphs: Graphs) -> None:
+        self.random, self.graphs = random, graphs
         self.held: dict[str, list[dict[str, Any]]] = {}
         self.where = {id: random.choice(NODES) for id in ("x", "y", "z")}
         self.types = {"x": "one", "y": "one", "z": "two"}
@@ -174,6 +175,12 @@ class Demands:
             del self.held[demand]
             return head | {"operation": "release"}
         ids = self.random.sample(sorted(self.where), self.random.randint(1, 2))
+        for id in ids:
+            others = {
+                app["id"] for other, apps in self.held.items() if other != demand for app in apps
+            }
+            if id not in others:
+                self.where[id] = self.random.choice(NODES)
         self.held[demand] = [self._application(id) for id in ids]
         return head | {"applications": self.held[demand]}
 
@@ -183,27 +190,45 @@ class Demands:
             role, source = self.random.choice(ROLES), self.random.choice(SOURCES)
             topic = f"/{source}/{role}/t{self.random.randint(0, 1)}"
             inputs[role].append({"topic": topic, "source": source})
-        return {"id": id, "type": self.types[id], "node": self.where[id], "inputs": dict(inputs)}
+        app = {"id": id, "type": self.types[id], "node": self.where[id], "inputs": dict(inputs)}
+        return app | {"deliver": self._deliveries(self.types[id])}
+
+    def _deliveries(self, type: str) -> list[dict[str, Any]]:
+        """Return what only one node makes under its name, to be delivered to a node."""
+        services = self.graphs.services[type].items()
+        names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
+        chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
+        return [{"output": f"{name}.out", "node": "station00"} for name in chosen]
 
 
-def instances(graphs: Graphs, demands: Demands) -> Iterator[ServiceKey]:
-    """Yield the services that must run, by what is demanded."""
+def instances(graphs: Graphs, app: dict[str, Any]) -> Iterator[ServiceKey]:
+    """Yield the services that must run for an application as a demand has it."""
+    for name, service in graphs.services[app["type"]].items():
+        if service["scope"] == "application":
+            yield ServiceKey(name, app["node"], application=app["id"])
+        elif service["scope"] == "node" and not service["at_source"]:
+            yield ServiceKey(name, app["node"])
+        for one in (one for role in service["roots"] for one in app["inputs"].get(role, ())):
+            topic, source = one["topic"], one["source"]
+            node = source if service["at_source"] else app["node"]
+            if service["scope"] == "topic":
+                yield ServiceKey(name, node, source=source, topic=topic)
+            else:
+                yield ServiceKey(name, node)
+
+
+def delivered(demands: Demands, services: list[ServiceRelease]) -> Iterator[tuple[str, str]]:
+    """Yield topic and node of what is delivered: what a demand's own inputs are made into."""
     for app in (app for apps in demands.held.values() for app in apps):
-        for name, service in graphs.services[app["type"]].items():
-            if service["scope"] == "application":
-                yield ServiceKey(name, app["node"], application=app["id"])
-            elif service["scope"] == "node" and not service["at_source"]:
-                yield ServiceKey(name, app["node"])
-            for one in (one for role in service["roots"] for one in app["inputs"].get(role, ())):
-                topic, source = one["topic"], one["source"]
-                node = source if service["at_source"] else app["node"]
-                if service["scope"] == "topic":
-                    yield ServiceKey(name, node, source=source, topic=topic)
-                else:
-                    yield ServiceKey(name, node)
+        wanted = {*instances(demands.graphs, app)}
+        for delivery in app["deliver"]:
+            name = delivery["output"].partition(".")[0]
+            for one in services:
+                if one.key.service == name and one.key in wanted:
+                    yield one.outputs["out"], delivery["node"]
 
 
-def assert_every_topic_comes_in_one_way(repo: MemoryRepo) -> None:
+def assert_every_topic_comes_in_one_way(repo: MemoryRepo, demands: Demands) -> None:
     """Compare what services read and publish with what connections carry."""
     releases = [plan(repo.state, key) for key in all_keys(repo.state)]
     services = [one for one in releases if isinstance(one, ServiceRelease)]
@@ -224,6 +249,7 @@ def assert_every_topic_comes_in_one_way(repo: MemoryRepo) -> None:
         for topics in one.inputs.values()
         for topic in topics
     }
+    read |= {*delivered(demands, services)}
     for topic, node in read:
         ways = [source for source, name, target in brought if (name, target) == (topic, node)]
         ways += [node] if (node, topic) in made else []
@@ -235,16 +261,22 @@ def in_clusters(files: Mapping[str, str]) -> dict[str, str]:
     return {path: text for path, text in files.items() if path.startswith("clusters/")}
 
 
-@examples(60)
+@examples(30)
 @given(chances, st.integers(1, 8))
 def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carried(
     random: Random, length: int
 ) -> None:
-    graphs, demands = Graphs(random), Demands(random)
+    graphs = Graphs(random)
+    demands = Demands(random, graphs)
     repo = MemoryRepo(graphs.files)
+    traced, releases = TracedPlan(repo.config), dict[ReleaseKey, Release | None]()
     for _ in range(length):
-        assert outcome(taken := repo.take(demands.next())) != "refused", taken
+        decision = repo.send(demands.next())
         running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
-        assert running == {*instances(graphs, demands)}
-        assert_every_topic_comes_in_one_way(repo)
+        held = (app for apps in demands.held.values() for app in apps)
+        assert running == {key for app in held for key in instances(graphs, app)}
+        assert_every_topic_comes_in_one_way(repo, demands)
+        releases |= traced.advance(repo.state.ledger, decision.changes.claims)
+        planned = {key: plan(repo.state, key) for key in all_keys(repo.state)}
+        assert {key: one for key, one in releases.items() if one} == planned
         assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))

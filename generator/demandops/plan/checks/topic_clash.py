@@ -21,6 +21,7 @@ from demandops.errors import Fault, fault
 from demandops.ledger.claim_file import path_of
 from demandops.ledger.operations.restoration import request_for
 from demandops.ledger.world import World
+from demandops.plan.flows import flows
 from demandops.plan.output_topics import outputs, usual_topic
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import (
@@ -51,7 +52,9 @@ def faults(
                 yield from _of_service(request, after, key, service)
     for one in request.demanded:
         if isinstance(one.held, Connection):
-            yield from _of_connection(one, one.held, before)
+            yield from _of_connection(one, one.held, before, after)
+        else:
+            yield from _of_deliveries(one, one.held, after)
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
@@ -87,14 +90,20 @@ def _clashes(
         yield f"connection '{id}' brings to", _remedy(key, None, service)
 
 
-def _of_connection(one: Demanded, connection: Connection, before: World) -> Iterator[Fault]:
-    """Yield a fault for each new route to a topic that a service published before the demand."""
+def _of_connection(
+    one: Demanded, connection: Connection, before: World, after: World
+) -> Iterator[Fault]:
+    """Yield a fault for each new route to a topic that a service published before, and still does.
+
+    An application that moves may have its output brought back.
+    """
     for index, route in enumerate(connection.topics):
         _, node = route.sender_and_receiver(*connection.nodes)
         topic = route.written_topic
         if connection.id in before.ledger.connections_bringing(node, topic):
             continue
-        for other in islice(_publishers(before, node, topic), 1):
+        others = (one for one in _publishers(before, node, topic) if is_needed(after, one))
+        for other in islice(others, 1):
             yield one.fault(
                 f"topics[{index}].{'source' if route.reverse else 'target'}",
                 f"connection '{connection.id}' brings {topic} to '{node}', where "
@@ -102,6 +111,20 @@ def _of_connection(one: Demanded, connection: Connection, before: World) -> Iter
                 "name there",
                 code="conflict",
             )
+
+
+def _of_deliveries(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
+    """Yield a fault for each delivered topic that comes to its node from another node too."""
+    for flow in flows(after.config, app) if app.deliver else ():
+        ids = after.ledger.connections_bringing(flow.receiver, flow.target)
+        for id in ids if flow.delivery is not None else ():
+            other = after.ledger.connection(id)
+            if other is not None and {*other.nodes} != {flow.sender, flow.receiver}:
+                yield one.fault(
+                    f"deliver[{flow.delivery}].output",
+                    f"{flow.target} comes to '{flow.receiver}' by '{id}' already; leave it out",
+                    code="conflict",
+                )
 
 
 def _service(world: World, key: ServiceKey) -> Iterator[Service]:

@@ -135,7 +135,8 @@ def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _
     found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
     for claim in claims_of(release, active.ledger):
         for role, topic, key in demanded_inputs(active, release, claim.application):
-            found[role][topic].update(claim.holders(key))
+            if topic in found[role]:  # a claim that a person wrote may name it otherwise
+                found[role][topic].update(claim.holders(key))
     return {role: _sorted(topics) for role, topics in found.items()}
 
 

@@ -1,0 +1,161 @@
+"""The example `examples/lane-detection`, played as its page says."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from dataclasses import replace
+from difflib import unified_diff
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from demandops.demand.application import Application
+
+from tests.kit.config import skeleton
+from tests.kit.goals import CLOUD, application, connection, goal
+from tests.kit.memory import MemoryRepo, rebuilt
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "lane-detection"
+PAGE = (EXAMPLE / "README.md").read_text()
+
+
+def blocks(language: str) -> dict[str, str]:
+    """Return the page's blocks of a language by their first line."""
+    found = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+    return {text.partition("\n")[0].lstrip("# "): text for text in found}
+
+
+DEMAND = yaml.safe_load(blocks("yaml")["demand.yaml"])
+
+
+@pytest.fixture
+def books() -> MemoryRepo:
+    files = {
+        path.relative_to(EXAMPLE).as_posix(): path.read_text()
+        for path in EXAMPLE.rglob("*")
+        if path.is_file() and path.suffix != ".md"
+    }
+    for title, text in blocks("yaml").items():
+        path, _, more = title.partition(", ")
+        if more:
+            files[path] = skeleton()[path] + text
+    return MemoryRepo(files)
+
+
+def running(books: MemoryRepo) -> dict[str, list[str]]:
+    by_node: dict[str, list[str]] = defaultdict(list)
+    for entry in books.books()["services"].values():
+        source = f" for {entry['source']}" if entry["source"] else ""
+        by_node[entry["node"]].append(entry["service"] + source)
+    return {node: sorted(names) for node, names in sorted(by_node.items())}
+
+
+def carried(books: MemoryRepo) -> dict[str, list[str]]:
+    return {id: [*one["topics"]] for id, one in books.books()["connections"].items()}
+
+
+def test_what_the_page_says_runs_and_ends_with_the_demand(books: MemoryRepo) -> None:
+    assert books.send(DEMAND).warnings == ()
+    (shown,) = blocks("json").values()
+    assert {"services": running(books), "connections": carried(books)} == json.loads(shown)
+    books.send({"kind": "Demand", "operation": "release", **{
+        name: DEMAND[name] for name in ("demand", "requesters")
+    }})  # fmt: skip
+    assert (running(books), carried(books)) == ({}, {})
+
+
+@pytest.mark.parametrize(
+    ("file", "lines"),
+    [
+        (
+            "appdef.yaml",
+            [
+                *("-# vehicles.", "-    each: point_cloud"),
+                "+# vehicles. Unlike the one that `init` creates, it reads the points of the shared"
+                " lidar driver.",
+                *("+uses:", "+  lidar-driver: {packets: point_cloud}", "+"),
+                *("+    each: cloud", "+    inputs: {cloud: lidar-driver.points}"),
+            ],
+        ),
+        (
+            "values/object-detection.yaml.j2",
+            [
+                "-  pointCloudTopic: {{ source_topic }}",
+                "+  pointCloudTopic: {{ inputs.cloud[0].topic }}",
+            ],
+        ),
+    ],
+)
+def test_its_object_detection_is_that_of_init_but_for_the_driver(
+    file: str, lines: list[str]
+) -> None:
+    path = f"appdefs/object-detection-fusion/{file}"
+    texts = [text.splitlines() for text in (skeleton()[path], (EXAMPLE / path).read_text())]
+    found = [line for line in unified_diff(*texts, n=0) if line[:2] not in ("--", "++", "@@")]
+    assert sorted(found) == sorted(lines)
+
+
+def of_lidars(books: MemoryRepo) -> dict[str, Any]:
+    services = books.books()["services"].items()
+    return {name: one for name, one in services if one["service"] == "lidar-driver"}
+
+
+def test_object_detection_reads_the_driver_that_lane_detection_has(books: MemoryRepo) -> None:
+    books.send(DEMAND)
+    before = of_lidars(books)
+    brought = connection(topics=["/vehicle00_points"])
+    join = goal([application("edge/fusion", who=["operator"], clouds=[CLOUD])], [brought])
+    decision = books.send(join)
+    assert decision.warnings == ()
+    assert not [one for one in decision.releases if "lidar" in one.name]
+    after = of_lidars(books)
+    assert after.keys() == before.keys()
+    shared = after["lidar-vehicle00-vehicle00"]
+    assert shared["applications"] == ["edge/fusion", "edge/lanes"]
+    assert shared["requesters"] == ["operator", "vehicle00"]
+    assert shared["parameters"] == {"rate_hz": 20}
+    (detection,) = (
+        release["spec"]["values"]["detection"]
+        for name, release in books.objects("HelmRelease").items()
+        if name.startswith("od-")
+    )
+    assert detection["pointCloudTopic"] == "/vehicle00_points"
+
+    head = {name: DEMAND[name] for name in ("demand", "requesters")}
+    books.send({"kind": "Demand", "operation": "release"} | head)
+    assert of_lidars(books)["lidar-vehicle00-vehicle00"]["parameters"] == {"rate_hz": 10}
+    assert list(of_lidars(books)) == ["lidar-vehicle00-vehicle00"]
+    books.send(join | {"shutdown": True})
+    assert of_lidars(books) == {}
+
+
+def test_the_bookkeeping_reads_claims_that_a_person_made_to_disagree(books: MemoryRepo) -> None:
+    (app,) = DEMAND["applications"]
+    app = app | {"inputs": {"point_cloud": [{"topic": "/points", "source": "vehicle01"}]}}
+    books.send(DEMAND | {"applications": [app]})
+    books.send(DEMAND | {"demand": "more", "applications": [app | {"id": "edge/more"}]})
+    claims = [
+        replace(claim, held=marked_further(claim.application))
+        if claim.demand == "more" and claim.is_on_application
+        else claim
+        for claim in books.state.ledger
+    ]
+    books.state = replace(books.state, ledger=rebuilt(claims))
+    services = books.books()["services"].values()
+    lanes = [
+        one
+        for one in services
+        if (one["service"], one["source"]) == ("lane-detection", "vehicle01")
+    ]
+    assert [one["inputs"] for one in lanes] == [{"points": {"/vehicle01_points": ["vehicle00"]}}]
+
+
+def marked_further(app: Application) -> Application:
+    inputs = {
+        role: tuple(one._replace(further=True) for one in topics)
+        for role, topics in app.inputs.items()
+    }
+    return app.with_inputs(inputs)
