@@ -74,8 +74,8 @@ def test_what_the_page_says_runs_and_ends_with_the_demand(books: MemoryRepo) -> 
             "appdef.yaml",
             [
                 *("-# vehicles.", "-    each: point_cloud"),
-                "+# vehicles. Unlike the one that `init` creates, it reads the points of the shared"
-                " lidar driver.",
+                "+# vehicles. Unlike the one that `init` creates, it reads the points of the "
+                "shared lidar driver.",
                 *("+uses:", "+  lidar-driver: {packets: point_cloud}", "+"),
                 *("+    each: cloud", "+    inputs: {cloud: lidar-driver.points}"),
             ],
