@@ -190,31 +190,6 @@ def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
     assert ends[0] == ends[1]
 
 
-@pytest.mark.parametrize(
-    ("topics", "replicas"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3), (6, 3), (7, 3), (20, 3)]
-)
-def test_replicas_follow_the_topics_within_bounds(
-    books: MemoryRepo, topics: int, replicas: int
-) -> None:
-    clouds = [(f"/points_{number}", "vehicle00") for number in range(topics)]
-    books.send(goal([record(clouds=clouds)]))
-    (values,) = (
-        release["spec"]["values"]
-        for name, release in books.objects("HelmRelease").items()
-        if name.startswith("rec-")
-    )
-    assert values["replicas"] == replicas
-    assert len(values["topics"]) == topics
-
-
-def test_replicas_go_down_again_when_topics_are_released(books: MemoryRepo) -> None:
-    clouds = [(f"/points_{number}", "vehicle00") for number in range(5)]
-    books.send(goal([record(clouds=clouds)]))
-    decision = books.send(goal([record(clouds=clouds[1:])], shutdown=True))
-    (change,) = (release for release in decision.releases if release.name.startswith("rec-"))
-    assert change.details[-2:] == ("- replicas 3", "+ replicas 1")
-
-
 def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: MemoryRepo) -> None:
     assert books.faults(goal([record(ego=[("/ego", "vehicle00")])])) == [
         f"{BODY}.ego_data_topics: recorder has no such input; known: point_cloud"

@@ -38,6 +38,7 @@ CASES = (
     *FOLLOWING,
     "argocd-charts-from-registries",
     "overrides",
+    "scaling",
 )
 START = "0-start"
 DELETED = "DELETED"

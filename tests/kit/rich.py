@@ -184,6 +184,7 @@ inputs:
   point_cloud: {description: Lidar points, type: sensor_msgs/msg/PointCloud2}
 parameters:
   rate: {description: Highest rate in Hz, default: 10, merge: max}
+  size: {description: How many there are, default: small, merge: union}
 deploymentRequest:
   type: 1
   inputs: {ego_data_topics: ego_data, pointcloud_topics: point_cloud}
@@ -196,6 +197,7 @@ services:
     each: point_cloud
     outputs: {object_list: "/{instance}_objects"}
     placement: application
+    scaling: {max: 3, autoscaler: {cpu: 70, memory: 80}, dividesWork: true}
     chart: object-detection
     images: [object-detection]
     values: values/object-detection.yaml.j2
@@ -206,7 +208,19 @@ services:
       raw_objects: "/{instance}_raw"
       fused_objects: "/{instance}_fused"
       fused_trajectories: "/{instance}_trajectories"
-    scaling: {min: 1, max: 4, topicsPerReplica: 2}
+    scaling:
+      {min: 1, max: 4, per: {requesters: 2}, mayDependOnRequesters: true, dividesWork: true}
+    chart: object-fusion
+    images: [object-fusion, k8s-configmap-watcher]
+    values: values/object-fusion.yaml.j2
+  object-tracking:
+    prefix: ot
+    inputs: {ego_data: ego_data, object_list: object-detection.object_list}
+    outputs:
+      raw_objects: "/{instance}_untracked"
+      fused_objects: "/{instance}_tracked"
+      fused_trajectories: "/{instance}_tracks"
+    scaling: {sizes: {parameter: size, replicas: {none: 0, small: 1}}}
     chart: object-fusion
     images: [object-fusion, k8s-configmap-watcher]
     values: values/object-fusion.yaml.j2
@@ -225,7 +239,7 @@ placement: source
 outputs: {points: "/{instance}_points"}
 parameters:
   rate: {description: Highest rate in Hz, default: 10, merge: max}
-scaling: {min: 1, max: 4, topicsPerReplica: 2}
+scaling: {min: 1, max: 4, per: {topics: 2}, dividesWork: true}
 chart: by-oci
 images: [object-detection]
 values: values/lidar-driver.yaml.j2

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
 
+from demandops import strict_yaml
 from demandops.config.base_model import (
     Approval,
     CamelModel,
@@ -41,6 +42,18 @@ VersionPolicy = Literal["refuse", "update", "upgrade"]
 needs a person's approval. ``upgrade``: the newest version runs.
 """
 
+Count = Annotated[int, Field(ge=0, le=1000)]
+"""A number of replicas."""
+
+Percent = Annotated[int, Field(ge=1, le=1000)]
+"""A share of what a pod requests; it may use more than that."""
+
+Measure = Literal["topics", "sources", "claims", "requesters"]
+"""What the number of replicas may follow."""
+
+Resource = Literal["cpu", "memory"]
+"""What an autoscaler measures."""
+
 
 class Input(CamelModel):
     """A role of demanded topics, for example ``point_cloud``."""
@@ -57,18 +70,81 @@ class Parameter(CamelModel):
     merge: Literal["union", "max", "min", "latest"] | None = None
 
 
-class Scaling(CamelModel):
-    """The number of replicas: one for every ``topics_per_replica`` inputs, ``min`` to ``max``."""
+class Sizes(CamelModel):
+    """The replicas of each size; a parameter of the demands names the size."""
 
-    min: Annotated[int, Field(ge=0, le=1000)] = 1
-    max: Annotated[int, Field(ge=1, le=1000)] = 1
-    topics_per_replica: Positive | None = None
+    parameter: Word
+    replicas: Annotated[dict[Word, Count], Field(min_length=1)]
+
+    def replicas_for(self, value: object) -> int | None:
+        """Return the replicas for a parameter's value; of a list, for the largest size.
+
+        ``None`` means that the value is not a size.
+        """
+        names = value if isinstance(value, list) else [value]
+        known = [self.replicas[name] for name in names if name in [*self.replicas]]
+        return max(known) if known and len(known) == len(names) else None
+
+
+class Scaling(CamelModel):
+    """How many replicas a service has: ``min``, if nothing else decides.
+
+    ``per`` gives one replica for that many topics, sources, claims or requesters, ``sizes`` as many
+    as a parameter's value stands for. ``autoscaler`` has the targets of a HorizontalPodAutoscaler,
+    in percent of what the pods request. ``divides_work`` says that replicas publish nothing twice.
+    """
+
+    min: Count = 1
+    max: Annotated[Count, Field(ge=1)] = 1
+    per: Annotated[dict[Measure, Positive], Field(min_length=1)] | None = None
+    sizes: Sizes | None = None
+    autoscaler: Annotated[dict[Resource, Percent], Field(min_length=1)] | None = None
+    may_depend_on_requesters: bool = False
+    divides_work: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, data: object) -> object:
+        if isinstance(data, dict) and "topicsPerReplica" in data:
+            per = strict_yaml.short_repr(data["topicsPerReplica"])
+            raise ValueError(f"topicsPerReplica has a new name; write per: {{topics: {per}}}")
+        return data
 
     @model_validator(mode="after")
-    def _ordered(self) -> Scaling:
-        if self.min > self.max:
-            raise ValueError(f"min {self.min} is above max {self.max}; lower min or raise max")
+    def _consistent(self) -> Scaling:
+        if problems := [*self._problems()]:
+            raise ValueError("; ".join(problems))
         return self
+
+    def _problems(self) -> Iterator[str]:
+        if self.min > self.max:
+            yield f"min {self.min} is above max {self.max}; lower min or raise max"
+        deciding = [f"per: {measure}" for measure in self.per or ()]
+        deciding += [name for name in ("sizes", "autoscaler") if getattr(self, name)]
+        if len(deciding) > 1:
+            yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
+        for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
+            yield f"sizes list every number of replicas, so {name} does nothing; remove it"
+        for name in ("per", "autoscaler"):
+            if getattr(self, name) and self.min == self.max:
+                yield f"{name} has no choice between min {self.min} and max {self.max}; raise max"
+        if self.autoscaler and self.min == 0:
+            yield "an autoscaler keeps at least one replica; raise min to 1"
+        by_requesters = "requesters" in (self.per or {})
+        if by_requesters and not self.may_depend_on_requesters:
+            yield (
+                "per: requesters shows in the rendered files how many requesters there are; allow "
+                "it with mayDependOnRequesters: true"
+            )
+        if self.may_depend_on_requesters and not by_requesters:
+            yield "mayDependOnRequesters does nothing without per: requesters; remove it"
+
+    @property
+    def most(self) -> int:
+        """The highest number of replicas that it may give."""
+        if self.sizes:
+            return max(self.sizes.replicas.values())
+        return self.max if self.per or self.autoscaler else self.min
 
 
 Scope = Literal["application", "topic", "node"]
@@ -90,6 +166,15 @@ class Deployed(CamelModel):
     chart: DnsLabel
     images: Items[DnsLabel] = ()
     values: Annotated[str, StringConstraints(pattern=r"^values/[A-Za-z0-9_.-]+$")]
+
+    @model_validator(mode="after")
+    def _published_once(self) -> Deployed:
+        if self.outputs and self.scaling.most > 1 and not self.scaling.divides_work:
+            raise ValueError(
+                f"scaling: gives up to {self.scaling.most} replicas, each of which would publish "
+                "every output; keep one, or say dividesWork: true if the program divides its work"
+            )
+        return self
 
 
 class OwnService(Deployed):
@@ -125,6 +210,8 @@ class ServiceDefinition(Deployed, FileModel):
             raise ValueError(f"each: '{self.each}' is not an input{known}")
         if self.placement == "source" and self.scope == "application":
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
+        if problems := [*_size_problems(self.scaling, self.parameters)]:
+            raise ValueError("; ".join(problems))
         return self
 
 
@@ -200,11 +287,37 @@ class ApplicationDefinition(FileModel):
             for name in self.uses
             if name in self.services
         ]
+        problems += [
+            f"services.{name}.{problem}"
+            for name, service in self.services.items()
+            for problem in _size_problems(service.scaling, self.parameters)
+        ]
         if not self.services and not self.uses:
             problems.append("services: is empty; list at least one, or use one")
         if problems:
             raise ValueError("; ".join(problems))
         return self
+
+
+def _size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iterator[str]:
+    """Yield what is wrong with the parameter that names a service's size."""
+    sizes = scaling.sizes
+    if sizes is None:
+        return
+    place, name = "scaling.sizes.parameter", sizes.parameter
+    parameter = parameters.get(name)
+    if parameter is None:
+        yield f"{place}: '{name}' is not a parameter{suggestion(name, parameters)}"
+        return
+    if parameter.merge in ("max", "min"):
+        yield (
+            f"{place}: '{name}' has merge: {parameter.merge}, which is for numbers; with union, "
+            "the largest size counts"
+        )
+    if sizes.replicas_for(parameter.default) is None:
+        default = strict_yaml.short_repr(parameter.default)
+        known = suggestion(str(parameter.default), sizes.replicas)
+        yield f"{place}: '{name}' has the default {default}, which is not a size{known}"
 
 
 Problem: TypeAlias = "tuple[str, str]"

@@ -126,6 +126,11 @@ class Config:
                 return appdef
         return None
 
+    @property
+    def autoscales(self) -> bool:
+        """Whether a service has an autoscaler."""
+        return any(s.scaling.autoscaler for of in self.services.values() for s in of.values())
+
     def versions_of(self, appdef: str) -> list[str]:
         """Return the channels and versions that a demand for this appdef may request."""
         return sorted(self.application_versions[appdef].keys() - {""})

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from demandops import naming
-from demandops.config.appdef import Parameter, Scaling, Service
+from demandops.config.appdef import Parameter, Service
 from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.connections import route as routes
@@ -29,6 +29,7 @@ from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, claims_needing, services_of
+from demandops.plan.replicas import replicas_of
 from demandops.plan.running_version import version_of_service
 from demandops.subject import TopicKey
 
@@ -68,6 +69,9 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     node, domain = config.node_and_domain(key.node)
     parts = list(_parts(world, service, key, apps))
     inputs = {role: _inputs(config, key, role, parts) for role in sorted(service.inputs)}
+    topics = [one for read in inputs.values() for one in read]
+    parameters = _merged_parameters(service.parameters, claims)
+    requesters = _requesters(claims, service, key)
     further = service.root is not None and parts[0].inputs[service.root][0].further
     applications = tuple(dict.fromkeys(app.id for app in apps))
     version = version_of_service(world, service, applications)
@@ -81,10 +85,10 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         chart=version.charts[service.chart],
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
-        parameters=MappingProxyType(_merged_parameters(service.parameters, claims)),
-        replicas=_replicas(service.scaling, sum(map(len, inputs.values()))),
+        parameters=MappingProxyType(parameters),
+        replicas=replicas_of(service.scaling, parameters, topics, claims, requesters),
         applications=applications,
-        requesters=_requesters(claims, service, key),
+        requesters=requesters,
     )
 
 
@@ -185,14 +189,6 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     if topic == usual_topic(config, source, service.root):
         return naming.object_name(service.prefix, key.node, source)
     return naming.object_name(service.prefix, key.node, source, topic)
-
-
-def _replicas(scaling: Scaling, topics: int) -> int:
-    """Return the replicas for ``topics`` inputs, within the appdef's bounds."""
-    if scaling.topics_per_replica is None:
-        return scaling.min
-    needed = -(-topics // scaling.topics_per_replica)
-    return max(scaling.min, min(scaling.max, needed))
 
 
 def _merged_parameters(

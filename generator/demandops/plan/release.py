@@ -15,6 +15,7 @@ from demandops.connections.connection_type import Client
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
 from demandops.ledger.ledger import Ledger
+from demandops.plan.replicas import Autoscaler
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,10 +58,15 @@ class ServiceRelease:
     inputs: Mapping[str, tuple[InputTopic, ...]]
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]
-    replicas: int
+    replicas: int | Autoscaler
     applications: tuple[str, ...]
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
+
+    @property
+    def autoscaler(self) -> Autoscaler | None:
+        """The autoscaler that chooses the number of replicas, if one does."""
+        return self.replicas if isinstance(self.replicas, Autoscaler) else None
 
     @property
     def images(self) -> tuple[str, ...]:

@@ -127,7 +127,7 @@ def affected_keys(
     before, after = without_suspended(before), without_suspended(after)
     keys: dict[ReleaseKey, None] = {}
     for change in changes:
-        subject, claims = change.key.subject, _differing(change)
+        subject, claims = change.key.subject, _differing(change, after)
         for world, claim in zip((before, after), claims, strict=True):
             own = [claim] if claim and world.ledger.get(claim.key) else []
             if not _decided_alike(before, after, subject):
@@ -136,18 +136,32 @@ def affected_keys(
     return tuple(keys)
 
 
-def _differing(change: ClaimChange) -> tuple[Claim | None, Claim | None]:
-    """Return a claim before and after a change; if only inputs differ, with only these inputs."""
+def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
+    """Return a claim before and after a change; if only inputs differ, with only these inputs.
+
+    Who requests it counts only where a definition or an override looks at requesters.
+    """
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
     old, new = before.application, after.application
-    same = replace(new, inputs=old.inputs) == old and before.requesters == after.requesters
+    same = replace(new, inputs=old.inputs) == old
     if not same or old.parameters:  # the latest booking decides some of them
+        return before, after
+    others = (before.requesters, before.partial) != (after.requesters, after.partial)
+    if others and _looks_at_requesters(new.appdef, world):
         return before, after
     return (
         replace(before, held=_with_inputs_not_in(old, new)),
         replace(after, held=_with_inputs_not_in(new, old)),
+    )
+
+
+def _looks_at_requesters(appdef: str, world: World) -> bool:
+    selectors = (selector for override in world.overrides for selector in override.select)
+    services = world.config.services.get(appdef, {}).values()
+    return any(selector.requesters for selector in selectors) or any(
+        service.scaling.may_depend_on_requesters for service in services
     )
 
 

@@ -23,10 +23,14 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
     """Return the Helm values of a service, with the patches of overrides merged in.
 
     Raises:
-        InvalidInput: if the template fails, or the values do not match the chart's schema; it
-            names the template or the override.
+        InvalidInput: if the template fails, the values do not match the chart's schema, or an
+            override stops an autoscaler; it names the template or the override.
     """
     template = config.values_template(release.service)
+    if release.autoscaler and release.autoscaler.max == 0:
+        by = [each.path for each, effects in release.shaping.by if "replicas" in effects]
+        message = "is 0, but an autoscaler keeps at least one replica; deny the service instead"
+        raise InvalidInput.at("replicas", message, file=by[-1])
     try:
         values = engine.data(template, **_context(release, config))
         check_values(values, release.chart, config, template)
@@ -62,8 +66,11 @@ def _context(release: ServiceRelease, config: Config) -> dict[str, object]:
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
         "images": {name: release.image(name, config).parts() for name in release.service.images},
-        "replicas": release.replicas,
     }
+    if release.autoscaler:
+        context["autoscaler"] = release.autoscaler.values()
+    else:
+        context["replicas"] = release.replicas
     if release.key.application is not None:
         return context | {"application": release.key.application}
     if release.key.source is not None:

@@ -6,13 +6,16 @@ A test module imports those that it runs; its `world` fixture decides the contro
 from __future__ import annotations
 
 import copy
+import re
 from typing import Any
 
 import pytest
+import yaml
 
 from tests.e2e.rig.cluster import PARTS, Rig
 from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.tools import Report
+from tests.kit.config import override
 
 from . import expected
 from .expected import (
@@ -27,10 +30,15 @@ from .expected import (
 from .golden import golden
 from .manual import change_image, overwrite, pod_template, requested_by, wait_restored
 from .namespace import Namespace
-from .running import NAMESPACE
+from .running import CLUSTER, NAMESPACE
 from .staterepo import StateRepo, demandops
 from .timing import Table
 
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+CHART = "appdefs/object-detection-fusion/charts/object-fusion"
+SCALING = "{min: 2, max: 4, autoscaler: {cpu: 70}, dividesWork: true}"
+MANY = "overrides/many.yaml"
+SCALED = {"services": ["object-detection"]}
 World = StateRepo[Any]
 PLAIN, OTHER = source_end("vehicle00"), target_end("station00")
 
@@ -120,6 +128,84 @@ def test_plain_manifests_and_releases_are_restored(world: World) -> None:
     domain.restore()
     domain.wait_lines(expected.after(1))
     wait_restored(domain, template, topics, PLAIN, PLAIN)
+
+
+def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
+    """The cluster has no metrics, so its own autoscaler only keeps the bounds, every 15 seconds.
+
+    The fusion's chart is one that names a number in its Deployment, as another's chart may.
+    """
+    domain, name = world.domain, DETECTION["vehicle00"]
+
+    def replicas(of: str = name) -> int | None:
+        found = domain.kube.get("Deployment", of, domain.namespace)
+        return int(found["spec"]["replicas"]) if found else None
+
+    def bounds() -> tuple[int, int] | None:
+        found = domain.kube.get("HorizontalPodAutoscaler", name, domain.namespace)
+        return (found["spec"]["minReplicas"], found["spec"]["maxReplicas"]) if found else None
+
+    def merge(files: dict[str, str | None]) -> None:
+        """Merge files, which the next demand has rendered, and wait until they are applied."""
+        world.push(files)
+        world.demand(expected.demand(1))
+        domain.wake()
+        domain.wait_applied(world.tip())
+
+    def scale_and_change_image(to: int, *names: str) -> None:
+        """Have replicas set as by an autoscaler, and something set that must be set back."""
+        for each in names:
+            template = pod_template(domain, each)
+            domain.kube.scale(each, to, domain.namespace)
+            change_image(domain, each)
+            domain.restore(each)
+            domain.kube.wait("the image", lambda e=each, t=template: pod_template(domain, e) == t)
+
+    original = world.file(APPDEF)
+    merge(_autoscaled(world))
+    domain.kube.apply(world.file(f"bootstrap/{CLUSTER}.yaml"))  # the account may have autoscalers
+    domain.restore(*DETECTION.values(), FUSION)  # which failed without this right
+    domain.kube.wait("an autoscaler", lambda: bounds() == (2, 4))
+    domain.kube.wait("two replicas", lambda: (replicas(), replicas(FUSION)) == (2, 2))
+    domain.wait_releases()
+    scale_and_change_image(3, name, FUSION)
+    assert (replicas(), replicas(FUSION)) == (3, 3)
+
+    template = pod_template(domain, name)
+    merge({MANY: override(SCALED, values={"podLabels": {"team": "perception"}})})
+    domain.kube.wait("an upgrade", lambda: pod_template(domain, name) != template)
+    domain.wait_releases()
+    assert replicas() == 3
+    merge({MANY: override(SCALED, replicas=4)})
+    domain.kube.wait("both bounds", lambda: (bounds(), replicas()) == ((4, 4), 4))
+    merge({MANY: None})
+    domain.kube.wait("the former bounds", lambda: (bounds(), replicas()) == ((2, 4), 4))
+    merge({APPDEF: original})
+    domain.kube.wait("no autoscaler", lambda: (bounds(), replicas()) == (None, 1))
+    scale_and_change_image(3, name)
+    domain.kube.wait("the number of the definition", lambda: replicas() == 1)
+
+
+def _autoscaled(world: World) -> dict[str, str | None]:
+    """Return the application with autoscalers; the fusion's chart names a number all the same."""
+    chart, registry = f"{CHART}/Chart.yaml", "registry/charts.yaml"
+    deployment = f"{CHART}/templates/deployment.yaml"
+    named = re.sub(
+        r"  \{\{- if not \.Values\.autoscaler \}\}\n(.*\n)  \{\{- end \}\}\n",
+        r"\1",
+        world.file(deployment),
+    )
+    assert named != world.file(deployment)
+    charts = yaml.safe_load(world.file(registry))
+    charts["charts"]["object-fusion"]["version"] = "99.0.0"
+    return {
+        APPDEF: re.sub(
+            r"(    prefix: o[df]\n)", rf"\1    scaling: {SCALING}\n", world.file(APPDEF)
+        ),
+        registry: yaml.safe_dump(charts),
+        chart: world.file(chart).replace("version: 0.1.0", "version: 99.0.0"),
+        deployment: named,
+    }
 
 
 def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World) -> None:

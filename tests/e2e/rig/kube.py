@@ -38,6 +38,7 @@ _VERSIONS = {
     "Kustomization": "kustomize.toolkit.fluxcd.io/v1",
     "CustomResourceDefinition": "apiextensions.k8s.io/v1",
     "Deployment": "apps/v1",
+    "HorizontalPodAutoscaler": "autoscaling/v2",
     "Lease": "coordination.k8s.io/v1",
     "ReplicaSet": "apps/v1",
     "Job": "batch/v1",
@@ -113,6 +114,15 @@ class Kube:
             name=name,
             namespace=namespace or None,
             body=body,
+            content_type="application/merge-patch+json",
+        )
+
+    def scale(self, name: str, replicas: int, namespace: str = "") -> None:
+        """Set a Deployment's replicas through the scale subresource, as an autoscaler does."""
+        self._resource("Deployment").scale.patch(
+            name=name,
+            namespace=namespace or None,
+            body={"spec": {"replicas": replicas}},
             content_type="application/merge-patch+json",
         )
 

@@ -218,9 +218,6 @@ _EDITS: dict[str, tuple[str, str, str]] = {
         APPDEF, "values/object-detection.yaml.j2", "values/object-detektion.yaml.j2",
     ),
     "a template outside": (APPDEF, "values/object-detection.yaml.j2", "../x"),
-    "bounds the wrong way round": (
-        APPDEF, "prefix: of\n", "prefix: of\n    scaling: {min: 3, max: 2}\n",
-    ),
     "a node in two access domains": (
         DOMAINS,
         "domains:\n",
@@ -250,8 +247,40 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     ),
 }  # fmt: skip
 
+_SCALING: dict[str, str] = {
+    "bounds the wrong way round": "{min: 3, max: 2}",
+    "replicas by the former name": "{min: 1, max: 4, topicsPerReplica: 8}",
+    "replicas by an unknown measure": "{max: 4, per: {topic: 8}}",
+    "replicas by two measures": "{max: 4, per: {topics: 8, sources: 2}}",
+    "replicas without a choice": "{per: {topics: 8}}",
+    "replicas by requesters that are not to be seen": "{max: 4, per: {requesters: 8}}",
+    "requesters that nothing depends on": "{mayDependOnRequesters: true}",
+    "two that decide the replicas": "{max: 4, per: {topics: 8}, autoscaler: {cpu: 70}}",
+    "a size by a parameter that does not exist": "{sizes: {parameter: sise, replicas: {s: 1}}}",
+    "sizes with bounds": "{max: 4, sizes: {parameter: size, replicas: {s: 1}}}",
+    "a size that the default is not": "{sizes: {parameter: size, replicas: {small: 1, l: 0}}}",
+    "the largest of words": "{sizes: {parameter: rate, replicas: {s: 1}}}",
+    "an autoscaler without a target": "{max: 4, autoscaler: {}}",
+    "an autoscaler of none": "{min: 0, max: 4, autoscaler: {cpu: 70}}",
+    "replicas that publish twice": "{min: 2, max: 2}",
+    "an autoscaler of what publishes": "{max: 4, autoscaler: {cpu: 70}}",
+}
+"""Scalings that a service which publishes cannot have."""
+
+
+def scaled(scaling: str) -> Mapping[str, str | None]:
+    """Return the application definition with two parameters, and this scaling of the fusion."""
+    parameters = "parameters: {size: {default: s}, rate: {default: s, merge: max}}\nservices:\n"
+    text = edited(APPDEF, "services:\n", parameters)[APPDEF]
+    return {APPDEF: text.replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")}
+
+
 MISTAKES: dict[str, Mapping[str, str | None]] = {
     **{name: edited(*edit) for name, edit in _EDITS.items()},
+    **{name: scaled(scaling) for name, scaling in _SCALING.items()},
+    "a size of a shared service by a parameter that does not exist": shared(
+        ("scope", "scaling: {sizes: {parameter: size, replicas: {s: 1}}}\nscope")
+    ),
     # several places or files
     "a chart without metadata": {f"{CHART}/Chart.yaml": "version: [\n"},
     "every node of an unknown cluster": {

@@ -14,6 +14,7 @@ from demandops.demand.claim import Claim, requesters_of
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import Traits, denied_by, selects
 from demandops.plan.release import Release, ServiceRelease, claims_of
+from demandops.plan.replicas import overridden
 
 
 def apply_overrides(release: Release, world: World) -> Release | None:
@@ -56,12 +57,13 @@ def apply_effects(
     release = replace(release, shaping=Shaping(by))
     if not isinstance(release, ServiceRelease):
         return release
+    planned = release.replicas
     for override, effects in by:
         if "version" in effects:
             chart = config.charts[release.service.chart].at(str(override.version))
             release = replace(release, chart=chart or release.chart)
         if "replicas" in effects and override.replicas is not None:
-            release = replace(release, replicas=override.replicas)
+            release = replace(release, replicas=overridden(planned, override.replicas))
         if "node" in effects:
             node, domain = config.node_and_domain(str(override.node))
             release = replace(release, node=node, domain=domain)

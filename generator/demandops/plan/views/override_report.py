@@ -14,7 +14,7 @@ from demandops.ledger.world import World
 from demandops.plan.overrides import claim_overrides
 from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.plan.planner import denied_release, plan
-from demandops.plan.release import Release
+from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import all_keys
 
 State = Literal["in force", "expired", "matches nothing"]
@@ -46,7 +46,7 @@ def override_report(world: World, now: datetime) -> list[Entry]:
 
 
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Yield (file, warning) for each override that does nothing."""
+    """Yield (file, warning) for each override that does nothing, or makes topics appear twice."""
     for entry in entries:
         override = entry.override
         if entry.state == "expired" and override.end:
@@ -57,6 +57,22 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             )
         elif entry.state == "matches nothing":
             yield override.path, "matches nothing now; if it should, correct select"
+        elif doubled := sorted({*_doubled(entry)}):
+            yield (
+                override.path,
+                f"runs {override.replicas} replicas of {' and '.join(doubled)}, each of which "
+                "publishes every output; keep one, or say dividesWork: true in the application "
+                "definition if the program divides its work",
+            )
+
+
+def _doubled(entry: Entry) -> Iterator[str]:
+    """Yield the services that publish everything more than once by an override."""
+    for release in entry.releases if (entry.override.replicas or 0) > 1 else ():
+        if isinstance(release, ServiceRelease):
+            service = release.service
+            if service.outputs and not service.scaling.divides_work:
+                yield release.key.service
 
 
 def _releases(world: World) -> dict[str, list[Release]]:

@@ -66,6 +66,7 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
         "argocd/bootstrap.yaml.j2",
         cluster=cluster,
         domains=domains,
+        autoscales=config.autoscales,
         folders={domain.name: domain_folder(cluster, domain) for domain in domains},
         projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
         urls=_sources(config),

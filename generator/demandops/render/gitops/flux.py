@@ -70,6 +70,7 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
         "flux/bootstrap.yaml.j2",
         cluster=cluster,
         domains=domains,
+        autoscales=config.autoscales,
         folders={domain.name: domain_folder(cluster, domain) for domain in domains},
         charts=sorted(
             {

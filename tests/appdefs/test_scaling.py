@@ -1,0 +1,315 @@
+"""Replicas as docs/appdef.md says: by what is demanded, by a size, or by an autoscaler."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import yaml
+from demandops.config.appdef import Scaling
+from demandops.decision import rendered_files
+from demandops.demand.application import InputTopic
+from demandops.errors import InvalidInput
+from demandops.plan.release import ServiceKey
+from demandops.plan.release_keys import affected_keys
+from demandops.plan.replicas import replicas_of
+from demandops.plan.views.override_report import override_report, warnings
+from demandops.render.trial_render import render_trial_demands
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.appdefs.test_recorder import ADDITIONS
+from tests.kit.chance import examples
+from tests.kit.config import override, skeleton
+from tests.kit.goals import CLOUD, STATION_CLOUD, application, goal
+from tests.kit.memory import NOW, MemoryRepo
+from tests.unit.overrides.test_in_force import demands
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "appdef.md").read_text()
+APPDEF = "appdefs/recorder/appdef.yaml"
+DRIVER = "appdefs/driver/service.yaml"
+TEMPLATE = "appdefs/recorder/values/recorder.yaml.j2"
+AUTOSCALED = "{min: 2, max: 5, autoscaler: {cpu: 70}}"
+BY_REQUESTERS = "{max: 4, per: {requesters: 3}, mayDependOnRequesters: true}"
+ROWS = [
+    (scaling, int(count or 1), what, size, replicas)
+    for scaling, count, what, size, replicas in re.findall(
+        r"^\| `(\{.*\})` \| (?:(\d+) )?(\w+)(?: (\w+))? \| (.*) \|$", PAGE, re.MULTILINE
+    )
+]
+
+
+def books(scaling: str, *, gitops: Literal["flux", "argocd"] = "flux", **files: str) -> MemoryRepo:
+    """Return a state repo whose recorder has this scaling."""
+    text = ADDITIONS[APPDEF].replace("{min: 1, max: 3, per: {topics: 2}}", scaling)
+    text = text.replace("parameters:\n", "parameters:\n  size: {default: small, merge: union}\n")
+    assert scaling in text
+    root = {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    return MemoryRepo({**ADDITIONS, **root, APPDEF: text, **files})
+
+
+def demand(
+    name: str = "d", *, topics: int = 1, sources: int = 1, requesters: int = 1, **parameters: object
+) -> dict[str, Any]:
+    nodes = ["vehicle00", "vehicle01", "station00"]
+    clouds = [
+        {"topic": f"/points_{number}", "source": nodes[number % sources]}
+        for number in range(max(topics, sources))
+    ]
+    app = {"id": "edge/record", "type": "recorder", "node": "edge", "parameters": parameters}
+    who = [f"{name}-{number}" for number in range(requesters)]
+    app |= {"inputs": {"point_cloud": clouds}, "connect": "none"}
+    return {"kind": "Demand", "demand": name, "requesters": who, "applications": [app]}
+
+
+def release(repo: MemoryRepo) -> dict[str, Any]:
+    """Return the recorder's HelmRelease or Application."""
+    (path,) = (path for path in repo.rendered() if "/rec-" in path)
+    found: dict[str, Any] = yaml.safe_load(repo.files[path])
+    return found
+
+
+def fact(repo: MemoryRepo) -> str:
+    """Return what a commit message would say of the recorder's replicas."""
+    (found,) = (plan for plan in repo.state.plans.values() if plan.name.startswith("rec-"))
+    (told,) = (line for line in found.facts() if line.startswith("replicas "))
+    return told.removeprefix("replicas ")
+
+
+def replicas_by_overrides(*replicas: int) -> dict[str, str]:
+    """Return overrides of the recorder's replicas, of which the last one wins."""
+    return {
+        f"overrides/o{rank}.yaml": override(
+            {"services": ["recorder"]}, priority=rank, replicas=number
+        )
+        for rank, number in enumerate(replicas)
+    }
+
+
+def test_the_page_has_a_row_for_each_way() -> None:
+    assert {key for row in ROWS for key in yaml.safe_load(row[0]).get("per", {})} == {
+        *("topics", "sources", "claims", "requesters")
+    }
+    assert any("sizes" in row[0] for row in ROWS)
+    assert any("autoscaler" in row[0] for row in ROWS)
+
+
+@pytest.mark.parametrize(("scaling", "count", "what", "size", "replicas"), ROWS)
+def test_a_demand_gets_the_replicas_of_the_page(
+    scaling: str, count: int, what: str, size: str, replicas: str
+) -> None:
+    repo = books(scaling)
+    if what == "claims":
+        for number in range(count):
+            repo.send(demand(f"d{number}"))
+    else:
+        repo.send(demand(**{what: size} if size else {what: count}))
+    assert fact(repo) == replicas
+
+
+def test_the_page_shows_the_template_that_serves_both() -> None:
+    start = "{% if autoscaler is defined %}"
+    shown = PAGE[PAGE.index(start) : PAGE.index("{% endif %}", PAGE.index(start))]
+    text = re.sub("^    ", "", shown, flags=re.MULTILINE)
+    for path in (ROOT / "appdefs" / "object-detection-fusion" / "values").iterdir():
+        assert text in path.read_text(), path.name
+
+
+COUNTS = st.integers(0, 60)
+SCALINGS = st.builds(
+    lambda low, more, measure, share: Scaling.model_validate(
+        {"min": low, "max": low + more, "per": {measure: share}}
+        | ({"mayDependOnRequesters": True} if measure == "requesters" else {})
+    ),
+    st.integers(0, 5),
+    st.integers(1, 9),
+    st.sampled_from(["topics", "sources", "claims", "requesters"]),
+    st.integers(1, 9),
+)
+
+
+@given(SCALINGS, st.lists(COUNTS, min_size=4, max_size=4), st.lists(COUNTS, min_size=4, max_size=4))
+@examples(200)
+def test_more_of_anything_never_gives_fewer_and_bounds_hold(
+    scaling: Scaling, counts: list[int], more: list[int]
+) -> None:
+    def replicas(topics: int, sources: int, claims: int, requesters: int) -> int:
+        listed = [InputTopic(f"/{one}", str(one % (sources + 1))) for one in range(topics)]
+        many: Any = range(claims), range(requesters)
+        found = replicas_of(scaling, {}, listed, *many)
+        assert isinstance(found, int)
+        return found
+
+    few = replicas(*counts)
+    many = replicas(*(one + other for one, other in zip(counts, more, strict=True)))
+    assert scaling.min <= few <= many <= scaling.max
+
+
+def test_the_largest_size_counts_and_what_is_none_is_refused() -> None:
+    repo = books("{sizes: {parameter: size, replicas: {small: 1, medium: 2, large: 4}}}")
+    for name, size, replicas in (("a", "medium", 2), ("b", "large", 4), ("c", ["small"], 4)):
+        repo.send(demand(name, size=size))
+        assert release(repo)["spec"]["values"]["replicas"] == replicas
+    assert repo.faults(demand("b", size="lage")) == [
+        "parameters.size: ['lage', 'medium', 'small'] is not a size; known: large, medium, small"
+    ]
+    repo.send(demand("b") | {"operation": "release", "applications": []})
+    assert release(repo)["spec"]["values"]["replicas"] == 2
+
+
+SHIPPED = "appdefs/object-detection-fusion/appdef.yaml"
+BY_WHO = "{min: 0, max: 9, per: {requesters: 1}, mayDependOnRequesters: true, dividesWork: true}"
+BY_CLAIMS = "{min: 0, max: 9, per: {claims: 1}, dividesWork: true}"
+FOLLOWING = {
+    SHIPPED: skeleton()[SHIPPED]
+    .replace("prefix: od\n", f"prefix: od\n    scaling: {BY_WHO}\n")
+    .replace("prefix: of\n", f"prefix: of\n    scaling: {BY_CLAIMS}\n")
+}
+"""Detections for each requester, fusions for each claim."""
+
+
+@given(st.lists(demands(), max_size=14))
+@examples(40)
+def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
+    repo = MemoryRepo(FOLLOWING)
+    for made in sent:
+        repo.take(made)
+        again = rendered_files(repo.state)
+        kept = {path: text for path, text in repo.files.items() if path.startswith("clusters/")}
+        assert {path: text for path, text in again.items() if path in kept} == kept
+
+
+class TestRequesters:
+    """A change of requesters alone is planned where a definition or an override looks at them."""
+
+    @staticmethod
+    def changed(repo: MemoryRepo, requesters: int) -> tuple[list[str], set[str]]:
+        """Return the generated files that a second join changes, and the services planned anew."""
+        before = repo.state
+        decision = repo.send(demand(topics=3, requesters=requesters))
+        keys = affected_keys(before, decision.state, decision.changes.claims)
+        again = rendered_files(decision.state)
+        assert {path: repo.files[path] for path in again} == again
+        generated = [path for path in decision.files if path.startswith("clusters/")]
+        return generated, {key.service for key in keys if isinstance(key, ServiceKey)}
+
+    def test_they_scale_where_the_definition_allows_it(self) -> None:
+        repo = books(BY_REQUESTERS)
+        repo.send(demand(topics=3, requesters=3))
+        (path,) = (path for path in repo.rendered() if "/rec-" in path)
+        for requesters, replicas in ((4, "2"), (3, "1")):
+            assert self.changed(repo, requesters) == ([path], {"recorder", "driver"})
+            assert fact(repo) == replicas
+
+    def test_an_override_that_selects_them_is_looked_at(self) -> None:
+        selected = override({"requesters": ["d-1"], "services": ["driver"]}, replicas=0)
+        repo = books("{min: 1}", **{"overrides/tested.yaml": selected})
+        repo.send(demand(topics=3))
+        assert len(self.changed(repo, 2)[0]) == 3
+
+    def test_who_gives_up_one_topic_of_two_counts_for_the_other(self) -> None:
+        repo, clouds = MemoryRepo(FOLLOWING), [CLOUD, STATION_CLOUD]
+        repo.send(goal([application(who=["a", "b"], clouds=clouds)]))
+        repo.send(goal([application(who=["a"], clouds=[CLOUD])], shutdown=True))
+        found = repo.objects("HelmRelease")
+        replicas = {name: one["spec"]["values"]["replicas"] for name, one in found.items()}
+        assert (replicas["od-edge-vehicle00"], replicas["od-edge-station00"]) == (1, 2)
+
+    def test_else_they_change_no_file(self) -> None:
+        repo = books("{max: 4, per: {topics: 2}}")
+        repo.send(demand(topics=3))
+        assert self.changed(repo, 9) == ([], {"recorder"})
+
+
+class TestAutoscaler:
+    """A HorizontalPodAutoscaler owns the number: no controller sets it, and overrides bound it."""
+
+    def test_flux_leaves_the_number_alone(self) -> None:
+        repo = books(AUTOSCALED)
+        repo.send(demand())
+        spec = release(repo)["spec"]
+        assert spec["driftDetection"] == {
+            "mode": "enabled",
+            "ignore": [{"paths": ["/spec/replicas"], "target": {"kind": "Deployment"}}],
+        }
+        assert spec["values"]["autoscaler"] == {"min": 2, "max": 5, "cpu": 70}
+        assert "replicas" not in spec["values"]
+
+    def test_argo_cd_leaves_the_number_alone(self) -> None:
+        repo = books(AUTOSCALED, gitops="argocd")
+        repo.send(demand())
+        spec = release(repo)["spec"]
+        assert spec["ignoreDifferences"] == [
+            {"group": "apps", "kind": "Deployment", "jsonPointers": ["/spec/replicas"]}
+        ]
+        assert spec["syncPolicy"]["syncOptions"] == [
+            "ApplyOutOfSyncOnly=true",
+            "RespectIgnoreDifferences=true",
+        ]
+
+    @pytest.mark.parametrize("gitops", ["flux", "argocd"])
+    def test_the_domain_may_have_autoscalers_only_where_a_definition_has_one(
+        self, gitops: Literal["flux", "argocd"]
+    ) -> None:
+        kinds = {"flux": ["horizontalpodautoscalers"], "argocd": ["HorizontalPodAutoscaler"]}
+        for scaling, allowed in ((AUTOSCALED, True), ("{min: 2, max: 2}", False)):
+            bootstrap = books(scaling, gitops=gitops).files["bootstrap/c-its.yaml"]
+            for word in (*kinds["flux"], *kinds[gitops]):
+                assert (word in bootstrap) is allowed
+
+    def test_a_service_without_one_is_watched_as_before(self) -> None:
+        repo = books(AUTOSCALED)
+        repo.send(demand())
+        (name,) = (name for name in repo.objects("HelmRelease") if name.startswith("drv-"))
+        driver = repo.objects("HelmRelease")[name]["spec"]
+        assert driver["driftDetection"] == {"mode": "enabled"}
+        assert driver["values"]["replicas"] == 1
+
+    def test_the_last_override_sets_both_bounds(self) -> None:
+        repo = books(AUTOSCALED, **replicas_by_overrides(0, 3))
+        repo.send(demand())
+        spec = release(repo)["spec"]
+        assert spec["values"]["autoscaler"] == {"min": 3, "max": 3, "cpu": 70}
+        assert "ignore" in spec["driftDetection"]
+
+    def test_an_override_that_stops_it_is_a_fault(self) -> None:
+        repo = books(AUTOSCALED, **replicas_by_overrides(3, 0))
+        with pytest.raises(InvalidInput) as invalid:
+            repo.send(demand())
+        told = "is 0, but an autoscaler keeps at least one replica; deny the service instead"
+        assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
+        with pytest.raises(InvalidInput) as invalid:
+            render_trial_demands(repo.state, repo.state.engine)
+        assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
+
+    def test_a_template_that_knows_only_replicas_is_a_fault(self) -> None:
+        text = ADDITIONS["appdefs/driver/values/driver.yaml.j2"]
+        repo = books(AUTOSCALED, **{TEMPLATE: text})
+        with pytest.raises(InvalidInput) as invalid:
+            render_trial_demands(repo.state, repo.state.engine)
+        assert (
+            str(invalid.value) == f"{TEMPLATE}: line 1: 'replicas' is undefined; fix the template"
+        )
+
+
+@pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
+def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: bool) -> None:
+    """The driver publishes; the recorder does not."""
+    driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
+    doubled = override({"services": ["*"]}, replicas=2)
+    repo = MemoryRepo({**ADDITIONS, DRIVER: driver, "overrides/two.yaml": doubled})
+    repo.send(demand())
+    assert (
+        list(warnings(override_report(repo.state, NOW)))
+        == [
+            (
+                "overrides/two.yaml",
+                "runs 2 replicas of driver, each of which publishes every output; keep one, or say "
+                "dividesWork: true in the application definition if the program divides its work",
+            )
+        ]
+        * told
+    )

@@ -1,0 +1,5 @@
+"""An autoscaler sets the number of replicas, and nothing sets it back."""
+
+from tests.e2e.common.steps import test_an_autoscaler_owns_the_number_of_replicas
+
+__all__ = ["test_an_autoscaler_owns_the_number_of_replicas"]
