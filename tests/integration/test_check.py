@@ -98,7 +98,7 @@ def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -
     assert code == 1
     assert errors == (
         "error: bootstrap/c-its.yaml: is generated, so a manual edit is lost; revert it, and "
-        "change demandops.yaml, inventory/ or policy/access-domains.yaml instead\n"
+        "change demandops.yaml, inventory/ or policy/ instead\n"
     )
 
 

@@ -196,21 +196,21 @@ class Broker(CamelModel):
 
 
 class ClustersFile(FileModel):
-    """``inventory/clusters.yaml``."""
+    """``inventory/clusters.yaml``, and files of ``inventory/clusters/``."""
 
     kind: Literal["Clusters"]
     clusters: Items[Cluster]
 
 
 class NodesFile(FileModel):
-    """``inventory/nodes.yaml``."""
+    """``inventory/nodes.yaml``, and files of ``inventory/nodes/``."""
 
     kind: Literal["Nodes"]
     nodes: Items[Node]
 
 
 class BrokersFile(FileModel):
-    """``inventory/brokers.yaml``."""
+    """``inventory/brokers.yaml``, and files of ``inventory/brokers/``."""
 
     kind: Literal["Brokers"]
     brokers: Items[Broker]

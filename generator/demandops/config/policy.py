@@ -133,7 +133,7 @@ class AccessDomain(CamelModel):
 
 
 class AccessDomainsFile(FileModel):
-    """``policy/access-domains.yaml``."""
+    """``policy/access-domains.yaml``, and files of ``policy/access-domains/``."""
 
     kind: Literal["AccessDomains"]
     domains: Items[AccessDomain]

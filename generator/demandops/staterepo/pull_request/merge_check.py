@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 
 from demandops import strict_yaml
-from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
@@ -205,8 +205,8 @@ class _Edit:
                 yield fault(
                     "version",
                     f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; "
-                    f"raise it here and at charts.{name} in registry/charts.yaml, or no cluster "
-                    "applies it",
+                    f"raise it here and at charts.{name} in {config.file_of(CHARTS_FILE, name)}, "
+                    "or no cluster applies it",
                 ).within(metadata)
 
 
