@@ -117,6 +117,11 @@ domains:
     leases: {default: 1h, longest: 2h, slack: 20s, deploymentRequests: true}
     network: namespace
     approval: none
+    kinds:
+      - ConfigMap
+      - Deployment
+      - Secret
+      - {kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}
   - {name: backend, namespace: backend, nodes: [cloud]}
 """
 _CHARTS = f"""

@@ -96,9 +96,9 @@ REFUSED = {
         binding("RoleBinding", "perception"),
         "attempting to grant RBAC permissions not currently held",
     ),
-    "a kind that no release contains": (
-        build_manifest("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
-        "resource :Service is not permitted in project",
+    "a kind that the domain may not have": (
+        build_manifest("apps/v1", "DaemonSet", "foreign", "perception", spec={}),
+        "resource apps:DaemonSet is not permitted in project",
     ),
     "a project": (
         build_manifest("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
