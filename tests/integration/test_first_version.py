@@ -81,7 +81,11 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
         path for path in manifests if path.rpartition("/")[2].startswith("of-")
     }
     before = dict(documents(manifests))
-    assert run("upgrade").code == 0
+    assert run("upgrade").out.endswith(
+        "after it, on the clusters:\n"
+        "- c-its: apply its bootstrap file again, because that changed\n"
+        f"      git show main:{BOOTSTRAP} | kubectl apply -f -\n"
+    )
     new = state.files()
     assert run("bookkeeping", "--output", "json").json() == books | {"commit": state.tip}
     for path, file in ledger(state).items():

@@ -117,6 +117,7 @@ domains:
     leases: {default: 1h, longest: 2h, slack: 20s, deploymentRequests: true}
     network: namespace
     approval: none
+    podSecurity: privileged
     kinds:
       - ConfigMap
       - Deployment

@@ -12,6 +12,7 @@ from demandops.config.appdef import Deployed, ServiceDefinition
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
+    CLIENTS_FILE,
     CLUSTERS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
@@ -32,6 +33,7 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
     for check in (
         _check_inventory,
         _check_namespaces,
+        _check_host_network,
         _check_charts,
         _check_services,
         _check_uses,
@@ -79,6 +81,26 @@ def _check_namespaces(config: Config, reader: ConfigReader) -> None:
                 f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
                 "all that Argo CD may; choose another",
             )
+
+
+def _check_host_network(config: Config, reader: ConfigReader) -> None:
+    for node in config.nodes.values():
+        domain = config.domain_of.get(node.id)
+        if domain and domain.pod_security == "baseline" and node.host_network:
+            file, place = reader.place_of(NODES_FILE, node.id)
+            message = (
+                f"is true (the default), and podSecurity of access domain '{domain.name}' is "
+                "baseline, which forbids it; set hostNetwork: false, or podSecurity: host-network"
+            )
+            reader.add_fault(file, f"{place}.hostNetwork", message)
+    for word, file in config.entry_files[CLIENTS_FILE].items():
+        closed = [one.name for one in config.domains.values() if one.pod_security == "baseline"]
+        if closed and config.clients.of(word).host_network:
+            message = (
+                f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
+                "forbids it; leave it out, then each client does as its node"
+            )
+            reader.add_fault(file, f"{word}.hostNetwork", message)
 
 
 def _check_charts(config: Config, reader: ConfigReader) -> None:

@@ -96,6 +96,9 @@ NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
 MessageType = Annotated[str, without(message_type_problem)]
 
+NODE_LABEL = "node_id"
+"""The label that selects a node by its id, as in the reference."""
+
 LabelKey = Annotated[
     str,
     StringConstraints(pattern=r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$"),
@@ -175,7 +178,7 @@ class Node(CamelModel):
 
     def labels(self) -> dict[str, str]:
         """Return the node selector."""
-        return dict(self.selector) if self.selector is not None else {"node_id": self.id}
+        return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
 
 class Broker(CamelModel):

@@ -170,7 +170,9 @@ class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
     Without ``rules``, all requesters may demand anything on its nodes. ``kinds`` are the kinds that
-    its charts may have (:attr:`allowed_kinds`).
+    its charts may have (:attr:`allowed_kinds`). ``pod_security`` is what its pods may not do:
+    ``baseline`` is that of Kubernetes' Pod Security Standards, ``host-network`` permits the host's
+    network, ``privileged`` everything.
     """
 
     name: DnsLabel
@@ -183,6 +185,7 @@ class AccessDomain(CamelModel):
     network: Literal["open", "namespace"] = "open"
     approval: Approval = "none"
     kinds: Items[KindByWord] | None = None
+    pod_security: Literal["baseline", "host-network", "privileged"] = "host-network"
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:
