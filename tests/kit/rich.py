@@ -118,6 +118,9 @@ domains:
     network: namespace
     approval: none
     podSecurity: privileged
+    ros: {domainId: 7}
+    brokerCredentials:
+      edge: {secret: of-domain, userKey: u, passwordKey: p}
     kinds:
       - ConfigMap
       - Deployment

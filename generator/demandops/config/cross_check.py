@@ -32,7 +32,7 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
     """Add every fault across files or entries to the reader."""
     for check in (
         _check_inventory,
-        _check_namespaces,
+        _check_domains,
         _check_host_network,
         _check_charts,
         _check_services,
@@ -62,11 +62,14 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
         reader.check_reference(file, f"{place}.node", broker.node, NODES_FILE)
 
 
-def _check_namespaces(config: Config, reader: ConfigReader) -> None:
+def _check_domains(config: Config, reader: ConfigReader) -> None:
     argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     seen: dict[str, str] = {}
     for domain in config.domains.values():
         file, place = reader.place_of(DOMAINS_FILE, domain.name)
+        for broker in domain.broker_credentials:
+            field = f"{place}.brokerCredentials.{broker}"
+            reader.check_reference(file, field, broker, BROKERS_FILE)
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
             reader.add_fault(

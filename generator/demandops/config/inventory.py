@@ -135,10 +135,13 @@ Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_z
 """A middleware of ROS; ``image`` for the one that each image has."""
 
 
+RosDomainId = Annotated[int, Field(ge=0, le=232)]
+
+
 class Ros(CamelModel):
     """The settings that a container needs to join the node's ROS graph."""
 
-    domain_id: Annotated[int, Field(ge=0, le=232)] = 0
+    domain_id: RosDomainId = 0
     rmw: Rmw = "rmw_cyclonedds_cpp"
 
 
@@ -146,6 +149,7 @@ class Node(CamelModel):
     """A C-ITS entity that runs services.
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
+    The access domain's ROS domain replaces that of ``ros``, if it has one.
     ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
     contain only the node for a usual topic, and the topic as well for any other.
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the

@@ -93,10 +93,11 @@ def load(files: Mapping[str, str]) -> Config:
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     services = {name: _resolve(appdef, definitions, reader) for name, appdef in appdefs.items()}
     clients, client_files = _read_clients(reader)
+    domain_of = _domains_of_nodes(reader, nodes, domains)
     config = Config(
         repo_settings=repository or _ANY,
         clusters=reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
-        nodes=nodes,
+        nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in nodes.items()},
         brokers=reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
         domains=domains,
         charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
@@ -106,7 +107,7 @@ def load(files: Mapping[str, str]) -> Config:
         appdefs=appdefs,
         definitions=definitions,
         services=MappingProxyType(services),
-        domain_of=_domains_of_nodes(reader, nodes, domains),
+        domain_of=domain_of,
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reader),
         entry_files={**reader.entry_files(), CLIENTS_FILE: client_files},
@@ -217,6 +218,14 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
         if file is not None:
             overrides[stem] = Override.from_file(stem, file)
     return MappingProxyType(overrides)
+
+
+def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:
+    """Return the node in the ROS domain of its access domain, if that has one."""
+    if domain is None or domain.ros is None:
+        return node
+    ros = node.ros.model_copy(update={"domain_id": domain.ros.domain_id})
+    return node.model_copy(update={"ros": ros})
 
 
 def _domains_of_nodes(

@@ -23,6 +23,7 @@ from demandops.config.base_model import (
     Text,
     readable_by,
 )
+from demandops.config.inventory import Credentials, NodeId, RosDomainId
 from demandops.errors import suggestion
 from demandops.quoting import quoted
 
@@ -166,6 +167,12 @@ _WORDS: Any = Literal.__getitem__(tuple(KINDS))
 KindByWord = Annotated[Kind, BeforeValidator(_by_word, json_schema_input_type=_WORDS | Kind)]
 
 
+class DomainRos(CamelModel):
+    """The ROS domain of all nodes of an access domain."""
+
+    domain_id: RosDomainId
+
+
 class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
@@ -173,6 +180,9 @@ class AccessDomain(CamelModel):
     its charts may have (:attr:`allowed_kinds`). ``pod_security`` is what its pods may not do:
     ``baseline`` is that of Kubernetes' Pod Security Standards, ``host-network`` permits the host's
     network, ``privileged`` everything.
+
+    ``ros`` replaces the ROS domain of its nodes. ``broker_credentials`` replaces the credentials of
+    brokers, by node, for its ends of connections.
     """
 
     name: DnsLabel
@@ -186,6 +196,8 @@ class AccessDomain(CamelModel):
     approval: Approval = "none"
     kinds: Items[KindByWord] | None = None
     pod_security: Literal["baseline", "host-network", "privileged"] = "host-network"
+    ros: DomainRos | None = None
+    broker_credentials: dict[NodeId, Credentials] = Field(default_factory=dict)
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:

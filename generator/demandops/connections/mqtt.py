@@ -118,7 +118,9 @@ class Mqtt(ConnectionType):
         channel = naming.object_name(self.word, key.id)
         if broker.topic_prefix:
             channel = f"{broker.topic_prefix}/{channel}"
-        return make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
+        end = make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
+        own = end.domain.broker_credentials.get(broker.node, broker.credentials)
+        return replace(end, broker=broker.model_copy(update={"credentials": own}))
 
 
 MQTT = Mqtt()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from itertools import groupby
 
 from demandops import strict_yaml
 from demandops.config.config import DOMAINS_FILE, Config
@@ -18,12 +19,50 @@ from demandops.quoting import quoted
 _KIND = re.compile(r"^kind:[ \t]*(?P<kind>[^#\n]*)", re.MULTILINE)
 _PLAIN = re.compile(r"\"?([A-Z][A-Za-z0-9]*)\"?")
 _TEMPLATE = re.compile(r"(.*/)?templates/(?!tests/).*\.(ya?ml|tpl)")
+_MOST_NODES = 3
 _CRDS = re.compile(r"(.*/)?crds/.*")
 
 
 def warnings(config: Config) -> Iterator[Fault]:
     """Yield every warning, by file."""
     yield from _charts(config)
+    yield from _open_by_host_network(config)
+
+
+def _open_by_host_network(config: Config) -> Iterator[Fault]:
+    """Yield what is open between access domains because pods use the host's network."""
+    nodes = [
+        (config.domain_of[node.id].name, node)
+        for node in config.nodes.values()
+        if node.host_network and node.id in config.domain_of
+    ]
+    nodes.sort(key=lambda one: (one[0], one[1].id))
+    for name, group in groupby(nodes, key=lambda one: one[0]):
+        if config.domains[name].network == "namespace":
+            ids = [node.id for _, node in group]
+            message = (
+                f"network: namespace of access domain '{name}' does not hold for pods with the "
+                f"host's network, as on {_some(ids)}; set hostNetwork: false for these nodes, or "
+                "separate their network yourself"
+            )
+            yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
+    graphs: dict[tuple[str, int], dict[str, None]] = {}
+    for name, node in nodes:
+        graphs.setdefault((node.cluster, node.ros.domain_id), {})[name] = None
+    for (cluster, number), names in sorted(graphs.items()):
+        if len(names) > 1:
+            listed = " and ".join(f"'{one}'" for one in names)
+            message = (
+                f"access domains {listed} share ROS domain {number} on the host's network of "
+                f"cluster '{cluster}', where each may read and write the other's topics; give "
+                "each its own ros.domainId"
+            )
+            yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
+
+
+def _some(ids: list[str]) -> str:
+    shown = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
+    return shown if len(ids) <= _MOST_NODES else f"{shown} and {len(ids) - _MOST_NODES} more"
 
 
 def _charts(config: Config) -> Iterator[Fault]:
