@@ -112,6 +112,7 @@ domains:
         applications: ["*"]
         nodes: ["*"]
         brokers: ["*"]
+        peers: [back*]
         approval: none
     quotas: {claimsPerRequester: 50, servicesPerNode: 60, demandsPerMinute: 70}
     leases: {default: 1h, longest: 2h, slack: 20s, deploymentRequests: true}
@@ -126,7 +127,7 @@ domains:
       - Deployment
       - Secret
       - {kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}
-  - {name: backend, namespace: backend, nodes: [cloud]}
+  - {name: backend, namespace: backend, nodes: [cloud], rules: [{name: all, peers: ["*"]}]}
 """
 _CHARTS = f"""
 apiVersion: demandops/v1

@@ -60,7 +60,8 @@ class Rule(CamelModel):
     """The demands that some requesters may make; each requester of a demand needs such a rule.
 
     ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
-    brokers. ``approval`` defaults to the access domain's.
+    brokers, ``peers`` the other access domains that connections may come from and go to.
+    ``approval`` defaults to the access domain's.
     """
 
     name: DnsLabel
@@ -68,6 +69,7 @@ class Rule(CamelModel):
     applications: Patterns = ("*",)
     nodes: Patterns = ("*",)
     brokers: Patterns = ("*",)
+    peers: Items[Text] = ()
     approval: Approval | None = None
 
 
@@ -176,7 +178,8 @@ class DomainRos(CamelModel):
 class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
-    Without ``rules``, all requesters may demand anything on its nodes. ``kinds`` are the kinds that
+    Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves it.
+    ``kinds`` are the kinds that
     its charts may have (:attr:`allowed_kinds`). ``pod_security`` is what its pods may not do:
     ``baseline`` is that of Kubernetes' Pod Security Standards, ``host-network`` permits the host's
     network, ``privileged`` everything.

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.config.load import load
+from demandops.decision import State
 from demandops.errors import InvalidInput
 from demandops.plan.views import policy_warnings
 
@@ -19,6 +20,7 @@ DOMAINS, NODES, BROKERS = (
     *("policy/access-domains.yaml", "inventory/nodes.yaml", "inventory/brokers.yaml"),
 )
 PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+BOTH = 'rules: [{name: all, peers: ["*"]}]'
 CONNECTION = {
     "kind": "Demand",
     "demand": "d",
@@ -36,8 +38,8 @@ def domains(fleet: str = "", city: str = "") -> dict[str, str]:
 apiVersion: demandops/v1
 kind: AccessDomains
 domains:
-  - {{name: fleet, namespace: fleet, nodes: ["vehicle*"], {fleet}}}
-  - {{name: city, namespace: city, nodes: [station00, edge, cloud], {city}}}
+  - {{name: fleet, namespace: fleet, nodes: ["vehicle*"], {fleet or BOTH}}}
+  - {{name: city, namespace: city, nodes: [station00, edge, cloud], {city or BOTH}}}
 """
     }
 
@@ -54,7 +56,7 @@ def test_each_end_of_a_connection_is_in_the_ros_domain_of_its_access_domain() ->
     own = skeleton()[NODES].replace("ros: {rmw: image}", "ros: {rmw: image, domainId: 3}", 1)
     found = {
         node: {one["name"]: one["value"] for one in pod["containers"][0]["env"]}["ROS_DOMAIN_ID"]
-        for node, pod in clients(domains("ros: {domainId: 41}") | {NODES: own}).items()
+        for node, pod in clients(domains(f"{BOTH}, ros: {{domainId: 41}}") | {NODES: own}).items()
     }
     assert found == {"vehicle00": "41", "edge": "0"}
     config = load(configuration(domains(city="ros: {domainId: 42}") | {NODES: own}))
@@ -77,7 +79,7 @@ def secrets(files: dict[str, str]) -> dict[str, list[tuple[str, list[str]]]]:
 
 
 def test_each_end_of_a_connection_has_the_credentials_of_its_access_domain() -> None:
-    own = "brokerCredentials: {edge: {secret: of-fleet, passwordKey: pw}}"
+    own = f"{BOTH}, brokerCredentials: {{edge: {{secret: of-fleet, passwordKey: pw}}}}"
     assert secrets(domains(own)) == {"vehicle00": [("of-fleet", ["username", "pw"])], "edge": []}
     shared = skeleton()[BROKERS].replace("port: 1993", "port: 1993\n    credentials: {secret: all}")
     assert secrets(domains(own) | {BROKERS: shared}) == {
@@ -96,7 +98,7 @@ def test_credentials_name_a_broker() -> None:
 
 
 def warned(files: dict[str, str]) -> list[str]:
-    return [str(found) for found in policy_warnings.warnings(load(configuration(files)))]
+    return [str(found) for found in policy_warnings.warnings(MemoryRepo(files).state)]
 
 
 SHARED = (
@@ -109,6 +111,18 @@ CLOSED = (
     "host's network, as on 'vehicle00', 'vehicle01', 'vehicle02' and 1 more; set hostNetwork: "
     "false for these nodes, or separate their network yourself"
 )
+
+
+def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
+    books = MemoryRepo(domains("ros: {domainId: 1}, " + BOTH))
+    books.send(CONNECTION)
+    assert list(policy_warnings.warnings(books.state)) == []
+    config = load(configuration(domains("ros: {domainId: 1}")))
+    told = policy_warnings.warnings(State.of(config, books.state.ledger))
+    assert list(map(str, told)) == [
+        f"{DOMAINS}: no rule of access domain 'fleet' has 'city' in its peers; connections "
+        "between them stay (1), but cannot be demanded again"
+    ]
 
 
 def test_what_the_hosts_network_leaves_open_is_told() -> None:

@@ -136,7 +136,7 @@ def test_the_schema_takes_a_word_or_a_kind() -> None:
 
 
 def warned(files: Mapping[str, str | None]) -> list[str]:
-    return [str(found) for found in policy_warnings.warnings(load(configuration(files)))]
+    return [str(found) for found in policy_warnings.warnings(MemoryRepo(files).state)]
 
 
 def test_the_charts_that_come_with_it_need_no_more() -> None:

@@ -7,13 +7,17 @@ values, which only Helm knows.
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import groupby
 
 from demandops import strict_yaml
 from demandops.config.config import DOMAINS_FILE, Config
 from demandops.config.policy import AccessDomain, matches
+from demandops.connections.connection import Connection
+from demandops.demand.permission import PEERS, needed_access
 from demandops.errors import Fault, InvalidInput, fault
+from demandops.ledger.world import World
 from demandops.quoting import quoted
 
 _KIND = re.compile(r"^kind:[ \t]*(?P<kind>[^#\n]*)", re.MULTILINE)
@@ -23,10 +27,32 @@ _MOST_NODES = 3
 _CRDS = re.compile(r"(.*/)?crds/.*")
 
 
-def warnings(config: Config) -> Iterator[Fault]:
-    """Yield every warning, by file."""
+def warnings(world: World) -> Iterator[Fault]:
+    """Yield every warning."""
+    config = world.config
     yield from _charts(config)
     yield from _open_by_host_network(config)
+    yield from _connections_of_before(world)
+
+
+def _connections_of_before(world: World) -> Iterator[Fault]:
+    """Yield a warning for connections between domains that no rule allows any longer."""
+    counts: Counter[tuple[str, str]] = Counter()
+    for claim in world.ledger:
+        if isinstance(claim.held, Connection):
+            for domain, access in needed_access(claim.held, world.config):
+                others = (value for kind, value in access if kind == PEERS)
+                counts.update(
+                    (domain.name, other)
+                    for other in others
+                    if not any(matches(other, rule.peers) for rule in domain.rules)
+                )
+    for (name, other), count in sorted(counts.items()):
+        message = (
+            f"no rule of access domain '{name}' has '{other}' in its peers; connections between "
+            f"them stay ({count}), but cannot be demanded again"
+        )
+        yield fault("", message).within(world.config.file_of(DOMAINS_FILE, name))
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:

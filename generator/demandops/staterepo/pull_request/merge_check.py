@@ -99,7 +99,7 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
             bookkeeping=_bookkeeping_changes(start, state),
             warnings=(
                 *(fault("", text).within(path) for path, text in idle),
-                *policy_warnings.warnings(config),
+                *policy_warnings.warnings(state),
                 *edit.changed_bootstraps(wanted),
             ),
         )
