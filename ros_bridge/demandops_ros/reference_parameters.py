@@ -62,15 +62,16 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     if values.get("namespace") not in (None, *namespaces):
         yield (
             f"parameter namespace of the reference is not used: {quoted(values['namespace'])} is "
-            f"not a namespace in {DOMAINS_FILE}; services run in that of their access domain"
+            f"not a namespace in {config.place_of(DOMAINS_FILE)}; services run in that of their "
+            "access domain"
         )
     registry = values.get("k3d_image_registry")
     images = config.images.values()
     if registry and not all(image.repository.startswith(f"{registry}/") for image in images):
         yield (
             "parameter k3d_image_registry of the reference is not used: set registry: "
-            f"{registry} in {IMAGES_FILE}, with the names that its images have there "
-            "(docs/migration.md)"
+            f"{registry} in {config.place_of(IMAGES_FILE)}, with the names that its images have "
+            "there (docs/migration.md)"
         )
     yield from _brokers(values, config)
     topics = values.get("connections.init_comm_topics") or ()
@@ -80,7 +81,7 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     if missing := [topic for topic in topics if topic not in known]:
         yield (
             "parameter connections.init_comm_topics of the reference is not used: add "
-            f"{', '.join(missing)} to bridged of the source's node in {NODES_FILE}"
+            f"{', '.join(missing)} to bridged of the source's node in {config.place_of(NODES_FILE)}"
         )
 
 
@@ -95,5 +96,5 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             place = f"of node {quoted(node)} " if node else ""
             yield (
                 f"parameter {name} of the reference is not used: the broker {place}at "
-                f"{host}:{port} is not in {BROKERS_FILE}; add it there"
+                f"{host}:{port} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )

@@ -98,7 +98,7 @@ def test_a_generated_file_edited_by_hand_is_told(checkout: Path, check: Check) -
     assert code == 1
     assert errors == (
         "error: bootstrap/c-its.yaml: is generated, so a manual edit is lost; revert it, and "
-        "change demandops.yaml, inventory/ or policy/access-domains.yaml instead\n"
+        "change demandops.yaml, inventory/ or policy/ instead\n"
     )
 
 
@@ -164,3 +164,21 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
     code, _, err = check()
     assert code == 1
     assert "'object-detection-fusion' is in use, but appdefs/object-detection-fusion is gone" in err
+
+
+def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check: Check) -> None:
+    policy = checkout / "policy" / "access-domains.yaml"
+    policy.write_text(policy.read_text() + "    kinds: [ConfigMap, Deployment, Secret]\n")
+    code, _, errors = check()
+    assert code == 0
+    charts = "appdefs/object-detection-fusion/charts"
+    assert [line.split(": ")[1] for line in errors.splitlines()] == [
+        f"{charts}/object-detection/templates/serviceaccount.yaml",
+        *[f"{charts}/object-fusion/templates/serviceaccount.yaml"],
+        *[f"{charts}/object-fusion/templates/watcher-rbac.yaml"] * 2,
+        "bootstrap/c-its.yaml",
+    ]
+    assert errors.splitlines()[-1] == (
+        "warning: bootstrap/c-its.yaml: changes with the merge, and no controller applies it; "
+        "apply it to the cluster again: kubectl apply -f bootstrap/c-its.yaml"
+    )

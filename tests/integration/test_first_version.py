@@ -15,6 +15,7 @@ from tests.kit.cli import Ran, Run
 from tests.kit.repo import GitRepo, first_version, git
 
 EXPERIMENT = Path(__file__).parents[2] / "examples" / "experiment"
+BOOTSTRAP = "bootstrap/c-its.yaml"
 
 
 @pytest.fixture
@@ -80,7 +81,11 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
         path for path in manifests if path.rpartition("/")[2].startswith("of-")
     }
     before = dict(documents(manifests))
-    assert run("upgrade").code == 0
+    assert run("upgrade").out.endswith(
+        "after it, on the clusters:\n"
+        "- c-its: apply its bootstrap file again, because that changed\n"
+        f"      git show main:{BOOTSTRAP} | kubectl apply -f -\n"
+    )
     new = state.files()
     assert run("bookkeeping", "--output", "json").json() == books | {"commit": state.tip}
     for path, file in ledger(state).items():
@@ -94,7 +99,7 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
     for name, document in after.items():
         labels = before[name]["metadata"].get("labels", {})
         assert labels.items() <= document["metadata"].get("labels", {}).items()
-    assert {p for p in new if p.startswith("bootstrap/") and new[p] != old[p]} == set()
+    assert {p for p in new if p.startswith("bootstrap/") and new[p] != old[p]} == {BOOTSTRAP}
     assert "nothing to do" in run("upgrade").out
     skipped = [row["skipped"] for row in run("verify", "HEAD", "--output", "json").json()]
     assert skipped == [None]

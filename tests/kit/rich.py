@@ -112,12 +112,22 @@ domains:
         applications: ["*"]
         nodes: ["*"]
         brokers: ["*"]
+        peers: [back*]
         approval: none
     quotas: {claimsPerRequester: 50, servicesPerNode: 60, demandsPerMinute: 70}
     leases: {default: 1h, longest: 2h, slack: 20s, deploymentRequests: true}
     network: namespace
     approval: none
-  - {name: backend, namespace: backend, nodes: [cloud]}
+    podSecurity: privileged
+    ros: {domainId: 7}
+    brokerCredentials:
+      edge: {secret: of-domain, userKey: u, passwordKey: p}
+    kinds:
+      - ConfigMap
+      - Deployment
+      - Secret
+      - {kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}
+  - {name: backend, namespace: backend, nodes: [cloud], rules: [{name: all, peers: ["*"]}]}
 """
 _CHARTS = f"""
 apiVersion: demandops/v1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from demandops import naming
@@ -32,8 +32,38 @@ IMAGES_FILE = "registry/images.yaml"
 CLIENTS_FILE = "registry/clients.yaml"
 VERSIONS_FILE = "registry/versions.yaml"
 
+COLLECTIONS = (
+    CLUSTERS_FILE,
+    NODES_FILE,
+    BROKERS_FILE,
+    DOMAINS_FILE,
+    CHARTS_FILE,
+    IMAGES_FILE,
+    CLIENTS_FILE,
+    VERSIONS_FILE,
+)
+"""Files with many entries, which files of a folder may share (:func:`collection_of`)."""
+
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
 """The top-level entries of a state repo that hold the configuration; people own them."""
+
+
+def collection_of(path: str) -> str | None:
+    """Return the collection that a file has entries of: itself, or that of its folder.
+
+    ``inventory/nodes/berlin.yaml`` has entries of ``inventory/nodes.yaml``.
+    """
+    folder, _, name = path.rpartition("/")
+    if name.startswith(".") or not name.endswith(".yaml"):
+        return None
+    return next((one for one in (path, f"{folder}.yaml") if one in COLLECTIONS), None)
+
+
+def place_of_collection(collection: str, files: Iterable[str]) -> str:
+    """Return for messages where the entries of a collection are, which is in ``files``."""
+    used = {*files} or {collection}
+    folder = [collection.replace(".yaml", "/")] if used - {collection} else []
+    return " or ".join([collection] * (collection in used) + folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +72,8 @@ class Config:
 
     ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
     ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
-    override; :class:`demandops.ledger.world.World` knows which of them have ended.
+    override; :class:`demandops.ledger.world.World` knows which of them have ended. ``entry_files``
+    maps each collection's entries to the files that they are in.
     """
 
     repo_settings: RepoSettings
@@ -60,6 +91,9 @@ class Config:
     overrides: Mapping[str, Override] = field(default_factory=dict)
     clients: ClientsFile = DEFAULT_SETTINGS
     versions: Mapping[str, VersionList] = field(default_factory=dict)
+    entry_files: Mapping[str, Mapping[str, str]] = field(
+        default_factory=dict, compare=False, repr=False
+    )
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
@@ -102,6 +136,14 @@ class Config:
         named = {"": listed.default, **listed.channels}
         return known | {word: known[version] for word, version in named.items()}
 
+    def file_of(self, collection: str, name: str) -> str:
+        """Return the file that has an entry, or the collection's usual file."""
+        return self.entry_files.get(collection, {}).get(name, collection)
+
+    def place_of(self, collection: str) -> str:
+        """Return for messages where the entries of a collection are."""
+        return place_of_collection(collection, self.entry_files.get(collection, {}).values())
+
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         """Return a node and its access domain.
 
@@ -110,7 +152,7 @@ class Config:
         """
         node, domain = self.nodes.get(id), self.domain_of.get(id)
         if node is None or domain is None:
-            missing = NODES_FILE if node is None else "any access domain"
+            missing = self.place_of(NODES_FILE) if node is None else "any access domain"
             message = (
                 f"'{id}' is in use, but not in {missing}; restore it, or release what it holds: "
                 f"demandops decommission {shlex.quote(id)}"
@@ -126,18 +168,15 @@ class Config:
                 return appdef
         return None
 
-    @property
-    def autoscales(self) -> bool:
-        """Whether a service has an autoscaler."""
-        return any(s.scaling.autoscaler for of in self.services.values() for s in of.values())
-
     def versions_of(self, appdef: str) -> list[str]:
         """Return the channels and versions that a demand for this appdef may request."""
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return the file that has the versions of an appdef."""
-        return VERSIONS_FILE if appdef in self.versions else CHARTS_FILE
+        """Return for messages where the versions of an appdef are."""
+        if appdef in self.versions:
+            return self.file_of(VERSIONS_FILE, appdef)
+        return self.place_of(CHARTS_FILE)
 
     def parameters_of(self, appdef: str) -> set[str]:
         """Return the parameters that a demand for this appdef may set."""

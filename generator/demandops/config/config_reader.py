@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -9,6 +10,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops import strict_yaml
 from demandops.config.base_model import DnsLabel, faults_of, field_path, parse, parse_file
+from demandops.config.config import collection_of, place_of_collection
 from demandops.errors import Fault, InvalidInput, fault, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -23,7 +25,10 @@ class ConfigReader:
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
         self.faults: list[Fault] = []
-        self._positions: dict[str, dict[str, str]] = {}
+        self._by_collection = defaultdict[str | None, list[str]](list)
+        for path in sorted(files):
+            self._by_collection[collection_of(path)].append(path)
+        self._places: dict[str, dict[str, tuple[str, str]]] = {}
         self._incomplete: set[str] = set()
         self._heads: dict[str, BaseModel] = {}
 
@@ -43,59 +48,87 @@ class ConfigReader:
             self.faults += error.faults
             return None
 
+    def files_of(self, collection: str) -> list[str]:
+        """Return the files with entries of a collection, its usual file first."""
+        return self._by_collection[collection]
+
     def read_items(
-        self, file: str, whole: type[BaseModel], field: str, item: type[Model], key: str = ""
+        self, collection: str, whole: type[BaseModel], field: str, item: type[Model], key: str = ""
     ) -> dict[str, Model]:
-        """Return the valid items of a file, by name; add the faults of invalid ones.
+        """Return the valid items of a collection, by name; add the faults of invalid ones.
 
         Args:
-            file: the file.
-            whole: its model.
-            field: its field that has the items, a list or a mapping.
+            collection: one of :data:`demandops.config.config.COLLECTIONS`.
+            whole: the model of its files.
+            field: their field that has the items, a list or a mapping.
             item: the model of an item.
             key: the field with an item's name; empty if ``field`` is a mapping.
         """
         items: dict[str, Model] = {}
-        positions = self._positions[file] = {}
-        raw = self._collection(file, whole, field, list if key else dict)
-        if raw is None:
-            self._incomplete.add(file)
-            return items
-        for place, entry in enumerate(raw) if key else raw.items():
-            name: Any = place
-            if key:
-                name = entry.get(key) if isinstance(entry, dict) else None
-                if isinstance(name, str) and name in positions:
-                    where = field_path((field, place, key))
-                    self.add_fault(file, where, f"'{name}' appears twice; remove one")
+        places = self._places[collection] = {}
+        for file in self.files_of(collection) or [collection]:
+            raw = self._items(file, whole, field, list if key else dict)
+            if raw is None:
+                self._incomplete.add(collection)
+                continue
+            for place, entry in enumerate(raw) if key else raw.items():
+                name: Any = place
+                if key:
+                    name = entry.get(key) if isinstance(entry, dict) else None
+                at = (field, place)
+                if isinstance(name, str) and name in places:
+                    self.add_twice(name, places[name], (file, field_path(at)), key)
                     continue
-            at = (field, place)
-            parsed = self._valid(item.model_validate, entry, item, file, at)
-            label = key or self._valid(_NAME.validate_python, name, item, file, at)
-            if parsed is None or label is None:
-                self._incomplete.add(file)
-            else:
-                items[name], positions[name] = parsed, field_path(at)
+                parsed = self._valid(item.model_validate, entry, item, file, at)
+                label = key or self._valid(_NAME.validate_python, name, item, file, at)
+                if parsed is None or label is None:
+                    self._incomplete.add(collection)
+                else:
+                    items[name], places[name] = parsed, (file, field_path(at))
         return items
+
+    def add_twice(
+        self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
+    ) -> None:
+        """Add the faults of an entry that is at two places, as (file, field).
+
+        Each file is at fault, so that the one that a person changed is held back.
+        """
+        dot_key = f".{key}" if key else ""
+        if first[0] == second[0]:
+            self.add_fault(
+                second[0], f"{second[1]}{dot_key}", f"'{name}' appears twice; remove one"
+            )
+            return
+        for (file, field), (other, _) in ((first, second), (second, first)):
+            self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
+
+    def entry_files(self) -> dict[str, dict[str, str]]:
+        """Return the files of the entries of each collection that :meth:`read_items` read."""
+        return {
+            collection: {name: file for name, (file, _) in places.items()}
+            for collection, places in self._places.items()
+        }
 
     def head(self, file: str, model: type[Model]) -> Model | None:
         """Return a file that :meth:`read_items` read, without its items, if its rest is valid."""
         head = self._heads.get(file)
         return head if isinstance(head, model) else None
 
-    def place_of(self, file: str, name: str) -> str:
-        """Return the field of an item in its file: ``nodes[3]``."""
-        return self._positions[file][name]
+    def place_of(self, collection: str, name: str) -> tuple[str, str]:
+        """Return the file that has an item, and the field in it: ``nodes[3]``."""
+        return self._places[collection][name]
 
-    def is_missing(self, file: str, name: str) -> bool:
-        """Return whether a file lacks an item; False if any of its items is invalid."""
-        return file not in self._incomplete and name not in self._positions[file]
+    def is_missing(self, collection: str, name: str) -> bool:
+        """Return whether a collection lacks an item; False if any of its items is invalid."""
+        return collection not in self._incomplete and name not in self._places[collection]
 
     def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
-        """Add a fault if :meth:`is_missing` holds for ``name`` in the file ``known_in``."""
+        """Add a fault if :meth:`is_missing` holds for ``name`` in the collection ``known_in``."""
         if self.is_missing(known_in, name):
-            where = known_in.removeprefix("inventory/")
-            known = suggestion(name, self._positions[known_in])
+            where = place_of_collection(known_in, self.files_of(known_in))
+            where = where.replace("inventory/", "")
+            known = suggestion(name, self._places[known_in])
             self.add_fault(file, field, f"'{name}' is not in {where}{known}")
 
     def _valid(
@@ -112,7 +145,7 @@ class ConfigReader:
             self.faults += faults_of(error, model, file, place)
             return None
 
-    def _collection(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
+    def _items(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
         """Return the raw value of ``field``; add the faults of the file's other fields."""
         raw = None
         try:

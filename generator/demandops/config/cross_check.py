@@ -12,6 +12,7 @@ from demandops.config.appdef import Deployed, ServiceDefinition
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
+    CLIENTS_FILE,
     CLUSTERS_FILE,
     DOMAINS_FILE,
     IMAGES_FILE,
@@ -31,7 +32,8 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
     """Add every fault across files or entries to the reader."""
     for check in (
         _check_inventory,
-        _check_namespaces,
+        _check_domains,
+        _check_host_network,
         _check_charts,
         _check_services,
         _check_uses,
@@ -47,55 +49,81 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
 def _check_inventory(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
     for node in config.nodes.values():
-        place = reader.place_of(NODES_FILE, node.id)
-        reader.check_reference(NODES_FILE, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
+        file, place = reader.place_of(NODES_FILE, node.id)
+        reader.check_reference(file, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
         for peer in node.bridged:
-            reader.check_reference(NODES_FILE, f"{place}.bridged.{peer}", peer, NODES_FILE)
+            reader.check_reference(file, f"{place}.bridged.{peer}", peer, NODES_FILE)
         for role in node.topics:
             if roles and role not in roles:
                 message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
-                reader.add_fault(NODES_FILE, f"{place}.topics.{role}", message)
+                reader.add_fault(file, f"{place}.topics.{role}", message)
     for broker in config.brokers.values():
-        place = reader.place_of(BROKERS_FILE, broker.node)
-        reader.check_reference(BROKERS_FILE, f"{place}.node", broker.node, NODES_FILE)
+        file, place = reader.place_of(BROKERS_FILE, broker.node)
+        reader.check_reference(file, f"{place}.node", broker.node, NODES_FILE)
 
 
-def _check_namespaces(config: Config, reader: ConfigReader) -> None:
+def _check_domains(config: Config, reader: ConfigReader) -> None:
     argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     seen: dict[str, str] = {}
     for domain in config.domains.values():
-        place = f"{reader.place_of(DOMAINS_FILE, domain.name)}.namespace"
+        file, place = reader.place_of(DOMAINS_FILE, domain.name)
+        for broker in domain.broker_credentials:
+            field = f"{place}.brokerCredentials.{broker}"
+            reader.check_reference(file, field, broker, BROKERS_FILE)
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
             reader.add_fault(
-                DOMAINS_FILE,
-                place,
+                file,
+                f"{place}.namespace",
                 f"'{domain.namespace}' is already the namespace of '{other}'; give each its own",
             )
         if argocd and domain.namespace == argocd.namespace:
             reader.add_fault(
-                DOMAINS_FILE,
-                place,
+                file,
+                f"{place}.namespace",
                 f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
                 "all that Argo CD may; choose another",
             )
 
 
+def _check_host_network(config: Config, reader: ConfigReader) -> None:
+    for node in config.nodes.values():
+        domain = config.domain_of.get(node.id)
+        if domain and domain.pod_security == "baseline" and node.host_network:
+            file, place = reader.place_of(NODES_FILE, node.id)
+            message = (
+                f"is true (the default), and podSecurity of access domain '{domain.name}' is "
+                "baseline, which forbids it; set hostNetwork: false, or podSecurity: host-network"
+            )
+            reader.add_fault(file, f"{place}.hostNetwork", message)
+    for word, file in config.entry_files[CLIENTS_FILE].items():
+        closed = [one.name for one in config.domains.values() if one.pod_security == "baseline"]
+        if closed and config.clients.of(word).host_network:
+            message = (
+                f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
+                "forbids it; leave it out, then each client does as its node"
+            )
+            reader.add_fault(file, f"{word}.hostNetwork", message)
+
+
 def _check_charts(config: Config, reader: ConfigReader) -> None:
     for name, chart in config.charts.items():
-        _check_chart(f"charts.{name}", chart, config, reader)
+        file, place = reader.place_of(CHARTS_FILE, name)
+        _check_chart(file, place, chart, config, reader)
         for channel, source in chart.channels.items():
-            _check_chart(f"charts.{name}.channels.{channel}", source, config, reader)
+            _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
 
 
-def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigReader) -> None:
+def _check_chart(
+    file: str, where: str, chart: ChartSource, config: Config, reader: ConfigReader
+) -> None:
     if not chart.folder:
         return
     path = f"{chart.folder}/Chart.yaml"
     text = config.files.get(path)
     if text is None:
         message = f"'{path}' does not exist; correct the folder"
-        reader.add_fault(CHARTS_FILE, f"{where}.folder", message)
+        reader.add_fault(file, f"{where}.folder", message)
         return
     try:
         metadata = strict_yaml.load(text, path)
@@ -105,7 +133,7 @@ def _check_chart(where: str, chart: ChartSource, config: Config, reader: ConfigR
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != chart.version:
         reader.add_fault(
-            CHARTS_FILE,
+            file,
             f"{where}.version",
             f"is {chart.version}, but {path} says {version}; make them equal",
         )
@@ -176,15 +204,16 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 f"appdefs/{name}/appdef.yaml",
                 "versions",
-                f"is {appdef.versions}, but {VERSIONS_FILE} does not list the versions of '{name}' "
-                "and their order; add them, or remove this",
+                f"is {appdef.versions}, but {config.place_of(VERSIONS_FILE)} does not list the "
+                f"versions of '{name}' and their order; add them, or remove this",
             )
     for name, listed in config.versions.items():
+        file, place = reader.place_of(VERSIONS_FILE, name)
         if name not in config.appdefs:
             if f"appdefs/{name}/appdef.yaml" not in reader.files:  # else it has faults of its own
                 known = suggestion(name, config.appdefs)
                 message = f"'{name}' is not an application definition{known}"
-                reader.add_fault(VERSIONS_FILE, f"applications.{name}", message)
+                reader.add_fault(file, place, message)
             continue
         services = config.services.get(name, {}).values()
         if not services:  # the definition has faults of its own
@@ -192,27 +221,30 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
         charts = {service.chart for service in services}
         images = {image for service in services for image in service.images}
         for version, contents in listed.versions.items():
-            where = f"applications.{name}.versions.{version}"
+            where = f"{place}.versions.{version}"
             for chart, wanted in contents.charts.items():
-                _check_used(f"{where}.charts.{chart}", chart, charts, name, reader)
+                _check_used(file, f"{where}.charts.{chart}", chart, charts, name, reader)
                 found = config.charts.get(chart) if chart in charts else None
                 if found is not None and found.at(wanted) is None:
                     known = suggestion(wanted, [source.version for source in found.sources()])
-                    message = f"'{wanted}' is not a version of {chart} in {CHARTS_FILE}{known}"
-                    reader.add_fault(VERSIONS_FILE, f"{where}.charts.{chart}", message)
+                    registry = config.file_of(CHARTS_FILE, chart)
+                    message = f"'{wanted}' is not a version of {chart} in {registry}{known}"
+                    reader.add_fault(file, f"{where}.charts.{chart}", message)
             for image in contents.images:
-                _check_used(f"{where}.images.{image}", image, images, name, reader)
+                _check_used(file, f"{where}.images.{image}", image, images, name, reader)
 
 
 def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
     """Return whether no list of versions is of an appdef, not even an invalid one."""
-    return VERSIONS_FILE not in reader.files or reader.is_missing(VERSIONS_FILE, appdef)
+    return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
 
 
-def _check_used(where: str, name: str, used: set[str], appdef: str, reader: ConfigReader) -> None:
+def _check_used(
+    file: str, where: str, name: str, used: set[str], appdef: str, reader: ConfigReader
+) -> None:
     if name not in used:
         message = f"no service of {appdef} uses '{name}'{suggestion(name, used)}"
-        reader.add_fault(VERSIONS_FILE, where, message)
+        reader.add_fault(file, where, message)
 
 
 def _check_connection_types(config: Config, reader: ConfigReader) -> None:
@@ -253,14 +285,16 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 override.path,
                 "version",
-                f"'{override.version}' is not a version or channel in {CHARTS_FILE} of a "
-                f"selected chart{suggestion(override.version, versions)}",
+                f"'{override.version}' is not a version or channel in "
+                f"{config.place_of(CHARTS_FILE)} of a selected chart"
+                f"{suggestion(override.version, versions)}",
             )
 
 
 def _check_moved_to(node: str, override: Override, config: Config, reader: ConfigReader) -> None:
     if node in config.nodes and node not in config.domain_of and config.domains:
-        message = f"'{node}' is not in any access domain; add it to one in {DOMAINS_FILE}"
+        message = f"'{node}' is not in any access domain; add it to one in "
+        message += config.place_of(DOMAINS_FILE)
         reader.add_fault(override.path, "node", message)
 
 

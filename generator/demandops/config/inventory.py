@@ -96,6 +96,9 @@ NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
 MessageType = Annotated[str, without(message_type_problem)]
 
+NODE_LABEL = "node_id"
+"""The label that selects a node by its id, as in the reference."""
+
 LabelKey = Annotated[
     str,
     StringConstraints(pattern=r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$"),
@@ -132,10 +135,13 @@ Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_z
 """A middleware of ROS; ``image`` for the one that each image has."""
 
 
+RosDomainId = Annotated[int, Field(ge=0, le=232)]
+
+
 class Ros(CamelModel):
     """The settings that a container needs to join the node's ROS graph."""
 
-    domain_id: Annotated[int, Field(ge=0, le=232)] = 0
+    domain_id: RosDomainId = 0
     rmw: Rmw = "rmw_cyclonedds_cpp"
 
 
@@ -143,6 +149,7 @@ class Node(CamelModel):
     """A C-ITS entity that runs services.
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
+    The access domain's ROS domain replaces that of ``ros``, if it has one.
     ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
     contain only the node for a usual topic, and the topic as well for any other.
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
@@ -175,7 +182,7 @@ class Node(CamelModel):
 
     def labels(self) -> dict[str, str]:
         """Return the node selector."""
-        return dict(self.selector) if self.selector is not None else {"node_id": self.id}
+        return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
 
 class Broker(CamelModel):
@@ -196,21 +203,21 @@ class Broker(CamelModel):
 
 
 class ClustersFile(FileModel):
-    """``inventory/clusters.yaml``."""
+    """``inventory/clusters.yaml``, and files of ``inventory/clusters/``."""
 
     kind: Literal["Clusters"]
     clusters: Items[Cluster]
 
 
 class NodesFile(FileModel):
-    """``inventory/nodes.yaml``."""
+    """``inventory/nodes.yaml``, and files of ``inventory/nodes/``."""
 
     kind: Literal["Nodes"]
     nodes: Items[Node]
 
 
 class BrokersFile(FileModel):
-    """``inventory/brokers.yaml``."""
+    """``inventory/brokers.yaml``, and files of ``inventory/brokers/``."""
 
     kind: Literal["Brokers"]
     brokers: Items[Broker]

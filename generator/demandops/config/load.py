@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -21,11 +22,13 @@ from demandops.config.config import (
     CHARTS_FILE,
     CLIENTS_FILE,
     CLUSTERS_FILE,
+    COLLECTIONS,
     DOMAINS_FILE,
     IMAGES_FILE,
     NODES_FILE,
     VERSIONS_FILE,
     Config,
+    collection_of,
 )
 from demandops.config.config_reader import ConfigReader
 from demandops.config.cross_check import cross_check
@@ -83,27 +86,31 @@ def load(files: Mapping[str, str]) -> Config:
             f"is missing, but gitops is {repository.gitops}; add it with the url that the "
             "clusters fetch this repo from",
         )
+    _refuse_unread(reader)
     nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
     domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     services = {name: _resolve(appdef, definitions, reader) for name, appdef in appdefs.items()}
+    clients, client_files = _read_clients(reader)
+    domain_of = _domains_of_nodes(reader, nodes, domains)
     config = Config(
         repo_settings=repository or _ANY,
         clusters=reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
-        nodes=nodes,
+        nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in nodes.items()},
         brokers=reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
         domains=domains,
         charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
         images=_read_images(reader),
-        clients=_read_clients(reader),
+        clients=clients,
         versions=_read_versions(reader),
         appdefs=appdefs,
         definitions=definitions,
         services=MappingProxyType(services),
-        domain_of=_domains_of_nodes(reader, nodes, domains),
+        domain_of=domain_of,
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reader),
+        entry_files={**reader.entry_files(), CLIENTS_FILE: client_files},
     )
     cross_check(config, reader)
     if reader.faults:
@@ -113,19 +120,45 @@ def load(files: Mapping[str, str]) -> Config:
 
 def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
     images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
-    head = reader.head(IMAGES_FILE, ImagesFile)
-    if head is None or head.registry is None:
-        return images
-    return {name: image.pulled_from(head.registry) for name, image in images.items()}
+    for name, image in images.items():
+        head = reader.head(reader.place_of(IMAGES_FILE, name)[0], ImagesFile)
+        if head is not None and head.registry is not None:
+            images[name] = image.pulled_from(head.registry)
+    return images
 
 
-def _read_clients(reader: ConfigReader) -> ClientsFile:
-    found = reader.read_file(CLIENTS_FILE, ClientsFile) if CLIENTS_FILE in reader.files else None
-    return found or DEFAULT_SETTINGS
+def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
+    """Return the settings of all files, and the file of each connection type's."""
+    found, files = DEFAULT_SETTINGS, dict[str, str]()
+    for file in reader.files_of(CLIENTS_FILE):
+        part = reader.read_file(file, ClientsFile)
+        for word in part.connection_types if part else ():
+            first = files.setdefault(word, file)
+            if first != file:
+                reader.add_twice(word, (first, word), (file, word))
+            found = found.model_copy(update={word: getattr(part, word)})
+    return found, files
+
+
+def _refuse_unread(reader: ConfigReader) -> None:
+    """Add a fault for each file that looks like configuration and is none."""
+    folders = {collection.partition("/")[0] for collection in COLLECTIONS}
+    for path in sorted(reader.files):
+        folder, *rest = path.split("/")
+        if folder not in folders or not path.endswith((".yaml", ".yml")):
+            continue
+        if collection_of(path) is None and not any(part.startswith(".") for part in rest):
+            known = [PurePosixPath(one).stem for one in COLLECTIONS if one.startswith(folder)]
+            reader.add_fault(
+                path,
+                "",
+                f"is not read; {folder}/ has {', '.join(sorted(known))}, each as <name>.yaml, as "
+                "files <name>/*.yaml or as both; rename it, or remove it",
+            )
 
 
 def _read_versions(reader: ConfigReader) -> Mapping[str, VersionList]:
-    if VERSIONS_FILE not in reader.files:
+    if not reader.files_of(VERSIONS_FILE):
         return {}
     return reader.read_items(VERSIONS_FILE, VersionsFile, "applications", VersionList)
 
@@ -187,6 +220,14 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
     return MappingProxyType(overrides)
 
 
+def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:
+    """Return the node in the ROS domain of its access domain, if that has one."""
+    if domain is None or domain.ros is None:
+        return node
+    ros = node.ros.model_copy(update={"domain_id": domain.ros.domain_id})
+    return node.model_copy(update={"ros": ros})
+
+
 def _domains_of_nodes(
     reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
 ) -> Mapping[str, AccessDomain]:
@@ -195,9 +236,10 @@ def _domains_of_nodes(
         matching = [d for d in domains.values() if matches(node, d.nodes)]
         if len(matching) > 1:
             names = " and ".join(f"'{domain.name}'" for domain in matching)
+            file, place = reader.place_of(NODES_FILE, node)
             reader.add_fault(
-                NODES_FILE,
-                f"{reader.place_of(NODES_FILE, node)}.id",
+                file,
+                f"{place}.id",
                 f"'{node}' is in the access domains {names}; narrow their patterns so that it is "
                 "in one",
             )

@@ -8,20 +8,23 @@ from __future__ import annotations
 
 import re
 from fnmatch import fnmatchcase
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from demandops.config.base_model import (
     Approval,
     CamelModel,
     DnsLabel,
     FileModel,
+    FrozenModel,
     Items,
     Positive,
     Text,
     readable_by,
 )
+from demandops.config.inventory import Credentials, NodeId, RosDomainId
+from demandops.errors import suggestion
 from demandops.quoting import quoted
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
@@ -57,7 +60,8 @@ class Rule(CamelModel):
     """The demands that some requesters may make; each requester of a demand needs such a rule.
 
     ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
-    brokers. ``approval`` defaults to the access domain's.
+    brokers, ``peers`` the other access domains that connections may come from and go to.
+    ``approval`` defaults to the access domain's.
     """
 
     name: DnsLabel
@@ -65,6 +69,7 @@ class Rule(CamelModel):
     applications: Patterns = ("*",)
     nodes: Patterns = ("*",)
     brokers: Patterns = ("*",)
+    peers: Items[Text] = ()
     approval: Approval | None = None
 
 
@@ -107,10 +112,80 @@ class LeasePolicy(CamelModel):
         return self
 
 
+class Kind(FrozenModel):
+    """A kind of Kubernetes object, with its API group and the resource that a Role names."""
+
+    kind: Annotated[str, StringConstraints(pattern=r"^[A-Z][A-Za-z0-9]*$")]
+    group: Annotated[str, StringConstraints(pattern=r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$")]
+    resource: DnsLabel
+
+
+KINDS = {
+    kind: Kind(kind=kind, group=group, resource=resource)
+    for group, kinds in {
+        "": {
+            "ConfigMap": "configmaps",
+            "PersistentVolumeClaim": "persistentvolumeclaims",
+            "Secret": "secrets",
+            "Service": "services",
+            "ServiceAccount": "serviceaccounts",
+        },
+        "apps": {
+            "DaemonSet": "daemonsets",
+            "Deployment": "deployments",
+            "StatefulSet": "statefulsets",
+        },
+        "autoscaling": {"HorizontalPodAutoscaler": "horizontalpodautoscalers"},
+        "batch": {"CronJob": "cronjobs", "Job": "jobs"},
+        "networking.k8s.io": {"Ingress": "ingresses", "NetworkPolicy": "networkpolicies"},
+        "policy": {"PodDisruptionBudget": "poddisruptionbudgets"},
+        "rbac.authorization.k8s.io": {"Role": "roles", "RoleBinding": "rolebindings"},
+    }.items()
+    for kind, resource in kinds.items()
+}
+"""The kinds that a policy may name by one word."""
+
+NOT_BY_DEFAULT = ("DaemonSet",)
+"""A service runs on the node that its demand names, and a DaemonSet on all that it selects."""
+
+NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
+"""The kinds of connections' clients, and Secrets, in which Helm keeps its releases."""
+
+_NETWORK_POLICY = "NetworkPolicy"
+
+
+def _by_word(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    if value not in KINDS:
+        raise ValueError(
+            f"{quoted(value)} is not a kind that its name alone tells; give kind, group and "
+            f"resource{suggestion(value, KINDS)}"
+        )
+    return KINDS[value]
+
+
+_WORDS: Any = Literal.__getitem__(tuple(KINDS))
+KindByWord = Annotated[Kind, BeforeValidator(_by_word, json_schema_input_type=_WORDS | Kind)]
+
+
+class DomainRos(CamelModel):
+    """The ROS domain of all nodes of an access domain."""
+
+    domain_id: RosDomainId
+
+
 class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
-    Without ``rules``, all requesters may demand anything on its nodes.
+    Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves it.
+    ``kinds`` are the kinds that
+    its charts may have (:attr:`allowed_kinds`). ``pod_security`` is what its pods may not do:
+    ``baseline`` is that of Kubernetes' Pod Security Standards, ``host-network`` permits the host's
+    network, ``privileged`` everything.
+
+    ``ros`` replaces the ROS domain of its nodes. ``broker_credentials`` replaces the credentials of
+    brokers, by node, for its ends of connections.
     """
 
     name: DnsLabel
@@ -122,6 +197,46 @@ class AccessDomain(CamelModel):
     leases: LeasePolicy = LeasePolicy()
     network: Literal["open", "namespace"] = "open"
     approval: Approval = "none"
+    kinds: Items[KindByWord] | None = None
+    pod_security: Literal["baseline", "host-network", "privileged"] = "host-network"
+    ros: DomainRos | None = None
+    broker_credentials: dict[NodeId, Credentials] = Field(default_factory=dict)
+
+    @property
+    def allowed_kinds(self) -> tuple[Kind, ...]:
+        """The kinds of objects that its charts may have, which the cluster enforces.
+
+        By default those of ordinary charts. ``network: namespace`` leaves out NetworkPolicy, with
+        which a chart could open what is closed.
+        """
+        if self.kinds is not None:
+            return self.kinds
+        without = {*NOT_BY_DEFAULT, *([_NETWORK_POLICY] if self.network == "namespace" else [])}
+        return tuple(kind for name, kind in KINDS.items() if name not in without)
+
+    @property
+    def allowed_resources(self) -> dict[str, list[str]]:
+        """The resources of :attr:`allowed_kinds`, by API group."""
+        found: dict[str, list[str]] = {}
+        for kind in self.allowed_kinds:
+            found.setdefault(kind.group, []).append(kind.resource)
+        return found
+
+    @model_validator(mode="after")
+    def _kinds_fit(self) -> AccessDomain:
+        if self.kinds is None:
+            return self
+        missing = [name for name in NEEDED_KINDS if KINDS[name] not in self.kinds]
+        if missing:
+            raise ValueError(
+                f"kinds: needs {' and '.join(missing)} for connections and Helm's releases; add it"
+            )
+        if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
+            raise ValueError(
+                "kinds: with NetworkPolicy a chart could open what network: namespace closes; "
+                "remove one of them"
+            )
+        return self
 
     @model_validator(mode="after")
     def _named_once(self) -> AccessDomain:
@@ -133,7 +248,7 @@ class AccessDomain(CamelModel):
 
 
 class AccessDomainsFile(FileModel):
-    """``policy/access-domains.yaml``."""
+    """``policy/access-domains.yaml``, and files of ``policy/access-domains/``."""
 
     kind: Literal["AccessDomains"]
     domains: Items[AccessDomain]

@@ -132,14 +132,17 @@ class Image(FrozenModel):
 
 
 class ChartsFile(FileModel):
-    """``registry/charts.yaml``."""
+    """``registry/charts.yaml``, and files of ``registry/charts/``."""
 
     kind: Literal["Charts"]
     charts: dict[DnsLabel, Chart]
 
 
 class ImagesFile(FileModel):
-    """``registry/images.yaml``; all images are pulled from ``registry`` if it is given."""
+    """``registry/images.yaml``, and files of ``registry/images/``.
+
+    All images of a file are pulled from its ``registry`` if it is given.
+    """
 
     kind: Literal["Images"]
     registry: Repository | None = None
@@ -200,7 +203,7 @@ class VersionList(CamelModel):
 
 
 class VersionsFile(FileModel):
-    """``registry/versions.yaml``, which a state repo may leave out.
+    """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
 
     A definition without an entry has the versions of its charts.
     """
@@ -256,7 +259,9 @@ _OF_NODES = ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION")
 def _free(env: dict[str, str]) -> dict[str, str]:
     for name in _OF_NODES:
         if name in env:
-            raise ValueError(f"{name} follows from ros of the node; set it in inventory/nodes.yaml")
+            raise ValueError(
+                f"{name} follows from ros of the node; set it at the node in the inventory"
+            )
     return env
 
 
@@ -296,12 +301,17 @@ class MqttClientSettings(ClientSettings):
 
 
 class ClientsFile(FileModel):
-    """``registry/clients.yaml``, which a state repo may leave out."""
+    """``registry/clients.yaml``, and files of ``registry/clients/``; a state repo may have none."""
 
     kind: Literal["Clients"]
     mqtt: MqttClientSettings = MqttClientSettings()
     zenoh: ClientSettings = ClientSettings()
     ros: ClientSettings = ClientSettings()
+
+    @property
+    def connection_types(self) -> tuple[str, ...]:
+        """The words of the connection types that the file has settings of."""
+        return tuple(sorted(self.model_fields_set - {"apiVersion", "kind"}))
 
     def of(self, connection_type: str) -> ClientSettings:
         """Return the settings of a connection type, by its word in files."""

@@ -20,7 +20,7 @@ from demandops.config.config_reader import ConfigReader
 from demandops.config.inventory import Node
 from demandops.config.override import UNSHAPED, Shaping, patched_settings
 from demandops.config.policy import AccessDomain
-from demandops.config.registry import DEFAULT_SETTINGS, ClientSettings
+from demandops.config.registry import ClientSettings
 from demandops.connections.connection import Connection
 from demandops.connections.route import Route
 from demandops.errors import Fault
@@ -96,8 +96,9 @@ class Client(ABC):
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Return (file, entry, effect) for each configuration entry that shapes the client."""
-        if config.clients is not DEFAULT_SETTINGS:
-            yield CLIENTS_FILE, self.type.word, "how its container runs"
+        file = config.entry_files.get(CLIENTS_FILE, {}).get(self.type.word)
+        if file is not None:
+            yield file, self.type.word, "how its container runs"
 
 
 @dataclass(frozen=True, slots=True)

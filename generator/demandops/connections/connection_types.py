@@ -86,7 +86,8 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:
-        message = f"{kind.label} needs an image '{kind.image}'; add it to {IMAGES_FILE}"
+        message = f"{kind.label} needs an image '{kind.image}'; add it to "
+        message += config.place_of(IMAGES_FILE)
         yield fault("type", message, code=UNSUPPORTED)
     if connection.broker and not kind.takes_broker:
         able = " or ".join(known.name for known in CONNECTION_TYPES if known.takes_broker)
@@ -98,7 +99,7 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
                 yield fault(
                     end,
                     f"'{node}' runs rmw_zenoh_cpp, and {kind.name} clients speak DDS; use type "
-                    f"{able}, or another rmw in {NODES_FILE}",
+                    f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}",
                     code=UNSUPPORTED,
                 )
     yield from kind.link_faults(connection, config)

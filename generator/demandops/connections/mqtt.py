@@ -62,7 +62,11 @@ class Mqtt(ConnectionType):
         if choose_broker(connection, config) is not None:
             return
         known = ", ".join(sorted(config.brokers))
-        remedy = f"name one of: {known}" if known else f"{BROKERS_FILE} has none; add one there"
+        remedy = (
+            f"name one of: {known}"
+            if known
+            else f"{config.place_of(BROKERS_FILE)} has none; add one there"
+        )
         message = f"no broker runs on '{connection.target}' or '{connection.source}'"
         if connection.broker:
             message = f"no broker runs on {quoted(connection.broker)}, and {message}"
@@ -80,8 +84,8 @@ class Mqtt(ConnectionType):
             yield fault(
                 f"{where}.type",
                 f"'{route.source}' carries messages of {package}, and mqtt.messages in "
-                f"{CLIENTS_FILE} has only {', '.join(carried)}; use an image that has the package, "
-                "and add it there",
+                f"{config.file_of(CLIENTS_FILE, self.word)} has only {', '.join(carried)}; use an "
+                "image that has the package, and add it there",
                 code=UNSUPPORTED,
             )
 
@@ -91,8 +95,8 @@ class Mqtt(ConnectionType):
         if not connection.broker or broker is None or broker.node == connection.broker:
             return connection, ""
         note = (
-            f"uses the broker on '{broker.node}', because {BROKERS_FILE} has none on "
-            f"{quoted(connection.broker)}"
+            f"uses the broker on '{broker.node}', because {config.place_of(BROKERS_FILE)} has "
+            f"none on {quoted(connection.broker)}"
         )
         return replace(connection, broker=broker.node), note
 
@@ -108,12 +112,15 @@ class Mqtt(ConnectionType):
             return None
         broker = choose_broker(connection, config)
         if broker is None:
-            message = f"connection '{key.id}' has no broker; add one to {BROKERS_FILE}"
+            message = f"connection '{key.id}' has no broker; add one to "
+            message += config.place_of(BROKERS_FILE)
             raise Refused.at("broker", message, code=_NO_BROKER)
         channel = naming.object_name(self.word, key.id)
         if broker.topic_prefix:
             channel = f"{broker.topic_prefix}/{channel}"
-        return make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
+        end = make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
+        own = end.domain.broker_credentials.get(broker.node, broker.credentials)
+        return replace(end, broker=broker.model_copy(update={"credentials": own}))
 
 
 MQTT = Mqtt()
@@ -148,7 +155,11 @@ class MqttEnd(End):
         """Return the entries of the clients' settings and of the broker."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
-        yield BROKERS_FILE, broker.node, f"broker at {broker.host}:{broker.port}"
+        yield (
+            config.file_of(BROKERS_FILE, broker.node),
+            broker.node,
+            f"broker at {broker.host}:{broker.port}",
+        )
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
         """Return the ROS domain, and the middleware if the image does not choose it."""

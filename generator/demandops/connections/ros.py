@@ -47,7 +47,7 @@ class Ros(ConnectionType):
             yield fault(
                 "type",
                 f"{self.label} needs an end with a reachable address; add wan: {{host: …}} to "
-                f"'{connection.source}' or '{connection.target}' in {NODES_FILE}",
+                f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}",
                 code=UNSUPPORTED,
             )
 
@@ -60,7 +60,7 @@ class Ros(ConnectionType):
                 f"{where}.type",
                 f"the message type of '{route.source}' is not known, and ROS needs it; give it in "
                 "the request if it has a field for it, or add it to types of "
-                f"'{sender}' in {NODES_FILE}",
+                f"'{sender}' in {config.file_of(NODES_FILE, sender)}",
             )
         if route.durability and not route.reliability:
             yield fault(

@@ -42,11 +42,12 @@ class Zenoh(ConnectionType):
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
             if node.zenoh and (other := hosts.setdefault(host, node.id)) != node.id:
+                file, place = reader.place_of(NODES_FILE, node.id)
                 yield fault(
-                    f"{reader.place_of(NODES_FILE, node.id)}.zenoh",
+                    f"{place}.zenoh",
                     f"'{other}' already runs a bridge on the same host and ROS domain; remove one "
                     "of them",
-                ).within(NODES_FILE)
+                ).within(file)
 
     def shares_clients(self, config: Config) -> bool:
         """Return whether any node has a bridge."""
@@ -62,7 +63,8 @@ class Zenoh(ConnectionType):
                 yield fault(
                     end,
                     f"'{node.id}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to it in "
-                    f"{NODES_FILE}, or zenoh: {{}} if it can reach others",
+                    f"{config.file_of(NODES_FILE, node.id)}, or zenoh: {{}} if it can reach "
+                    "others",
                     code=UNSUPPORTED,
                 )
         if source.zenoh is None or target.zenoh is None or source.id == target.id:
@@ -72,8 +74,8 @@ class Zenoh(ConnectionType):
             yield fault(
                 "type",
                 f"{self.label} finds no route between '{source.id}' and '{target.id}'; give one "
-                f"of them an endpoint under zenoh in {NODES_FILE}, or add the same router to "
-                "connect of both",
+                f"of them an endpoint under zenoh in {config.place_of(NODES_FILE)}, or add the "
+                "same router to connect of both",
                 code=UNSUPPORTED,
             )
 
@@ -134,8 +136,8 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
     """
     if node.zenoh is None:
         message = (
-            f"'{node.id}' carries Zenoh connections, but has no zenoh in {NODES_FILE} any longer; "
-            "restore it"
+            f"'{node.id}' carries Zenoh connections, but has no zenoh in "
+            f"{config.file_of(NODES_FILE, node.id)} any longer; restore it"
         )
         raise Refused.at("node", message, code=UNSUPPORTED)
     endpoints = set(node.zenoh.connect)

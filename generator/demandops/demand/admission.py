@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from demandops.config.appdef import ApplicationDefinition, Services
-from demandops.config.config import Config
+from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.config.repo_settings import ROOT_FILE, Limits
 from demandops.connections import connection_types
 from demandops.connections import route as routes
@@ -213,14 +213,15 @@ def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
     if node not in config.nodes:
         yield fault(
             where,
-            f"{quoted(node)} is not in inventory/nodes.yaml" + suggestion(node, config.nodes),
+            f"{quoted(node)} is not in {config.place_of(NODES_FILE)}"
+            + suggestion(node, config.nodes),
             code="unknown-node",
         )
     elif node not in config.domain_of:
         yield fault(
             where,
             f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
-            "policy/access-domains.yaml",
+            f"{config.place_of(DOMAINS_FILE)}",
             code="no-access-domain",
         )
 

@@ -1,7 +1,8 @@
 """Permission: the check that requesters may demand this, on these nodes, for this long.
 
-The access domains of the nodes decide. Every refusal names the rule. A domain, one of its rules or
-an application definition can also require a person's approval of claims before they are booked.
+The access domains of the nodes decide. Every refusal names the rule. A connection between two
+domains needs a rule of each that names the other. A domain, one of its rules or an application
+definition can also require a person's approval of claims before they are booked.
 """
 
 from __future__ import annotations
@@ -20,6 +21,11 @@ from demandops.errors import Fault, fault
 
 Access = list[tuple[str, str]]
 """Fields of a rule (``nodes``, ``applications``) and the values that a demand needs in them."""
+
+PEERS = "peers"
+"""The field of a rule with the access domains at the other ends of connections."""
+_NO_RULES = (Rule(name="everything"),)
+"""What a domain without rules lets everybody do."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -47,10 +53,13 @@ def needed_access(
     else:
         nodes, first = held.nodes, []
         more = held.type.access(held, config) if held.type else []
-    for node in dict.fromkeys(nodes):
-        domain = config.domain_of.get(node)
-        if domain is not None:
-            yield domain, [*first, ("nodes", node), *more]
+    domains = {node: config.domain_of[node] for node in nodes if node in config.domain_of}
+    for node, domain in domains.items():
+        access = [*first, ("nodes", node), *more]
+        if isinstance(held, Connection):
+            others = {other.name for other in domains.values()} - {domain.name}
+            access += [(PEERS, other) for other in others]
+        yield domain, access
 
 
 def _service_nodes(app: Application, config: Config) -> Iterable[str]:
@@ -62,25 +71,37 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
 
 def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
     """Yield a fault for each requester to whom no rule of the domain grants the access."""
-    for index, requester in enumerate(one.requesters if domain.rules else ()):
-        own = [rule for rule in domain.rules if matches(requester, rule.requesters)]
+    rules = domain.rules or _NO_RULES
+    for index, requester in enumerate(one.requesters):
+        own = [rule for rule in rules if matches(requester, rule.requesters)]
         misses = [first_uncovered(rule, access) for rule in own]
         if own and None in misses:
             continue
         if not own:
-            rules = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
+            known = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
-                f"no rule of access domain '{domain.name}' is for '{requester}', only {rules}; "
+                f"no rule of access domain '{domain.name}' is for '{requester}', only {known}; "
                 "ask for a change of policy/"
             )
         else:
             reasons = "; ".join(
-                f"rule '{rule.name}' of access domain '{domain.name}' lets '{requester}' have "
-                f"{kind} {' '.join(getattr(rule, kind))}, not '{value}'"
-                for rule, (kind, value) in zip(own, filter(None, misses), strict=True)
+                _reason(domain, rule, requester, *miss)
+                for rule, miss in zip(own, filter(None, misses), strict=True)
             )
             message = f"{reasons}; request what is allowed, or ask for a change of policy/"
         yield one.fault(f"requesters[{index}]", message, code="not-allowed")
+
+
+def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
+    """Return what a rule does not let a requester have."""
+    where = f"access domain '{domain.name}'"
+    if kind == PEERS:
+        whose = f"rule '{rule.name}' of {where}" if domain.rules else where
+        return f"{whose} lets '{requester}' connect its nodes with no node of '{value}' (peers)"
+    return (
+        f"rule '{rule.name}' of {where} lets '{requester}' have {kind} "
+        f"{' '.join(getattr(rule, kind))}, not '{value}'"
+    )
 
 
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:

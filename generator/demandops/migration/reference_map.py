@@ -119,6 +119,7 @@ class _Inventory:
         self._detections = files.specs_of(ObjectDetection).values()
         self._fusions = files.specs_of(ObjectFusion)
         self._nodes, self._brokers = config.nodes.values(), config.brokers.values()
+        self._broker_files = config.place_of(BROKERS_FILE)
         self.warnings: list[str] = []
 
     def application(self, name: str, joins: list[Join]) -> dict[str, Any]:
@@ -184,7 +185,7 @@ class _Inventory:
             if is_host(broker, spec.host, spec.port):
                 return broker.node
         self.warnings.append(
-            f"{name}: its broker {spec.host}:{spec.port} is not in {BROKERS_FILE}; add it there, "
-            "or leave it to the program to choose one"
+            f"{name}: its broker {spec.host}:{spec.port} is not in {self._broker_files}; add it "
+            "there, or leave it to the program to choose one"
         )
         return ""

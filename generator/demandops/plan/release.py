@@ -106,10 +106,11 @@ class ServiceRelease:
         yield config.values_template(self.service), "", "its Helm values"
         if self.version.name:
             entry = f"applications.{self.version.appdef}.versions.{self.version.name}"
-            yield VERSIONS_FILE, entry, "its version"
+            yield config.file_of(VERSIONS_FILE, self.version.appdef), entry, "its version"
         chart, name = self.chart, self.service.chart
         where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
-        yield CHARTS_FILE, f"charts.{name}", f"version {chart.version} from {where}"
+        file = config.file_of(CHARTS_FILE, name)
+        yield file, f"charts.{name}", f"version {chart.version} from {where}"
 
 
 Release = ServiceRelease | Client

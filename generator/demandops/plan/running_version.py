@@ -58,10 +58,11 @@ def version_of_service(
     for other in versions:
         its, own = contents(other, service), contents(best, service)
         if its[0] == own[0] and its != own:
+            file = world.config.file_of(CHARTS_FILE, service.chart)
             message = (
                 f"application definitions '{best.appdef}' and '{other.appdef}' share "
                 f"{service.chart} {own[0]}, but pin different images; pin the same, or give each "
-                f"another version of the chart in {CHARTS_FILE}"
+                f"another version of the chart in {file}"
             )
             raise Refused.at("version", message, code="conflict")
     return best

@@ -32,7 +32,9 @@ def render(client: Client, config: Config, engine: Engine) -> str:
     """
     kind, node = client.type, client.node
     if kind.image not in config.images:
-        message = f"'{kind.image}' is in use, but not in {IMAGES_FILE}; add it there"
+        message = (
+            f"'{kind.image}' is in use, but not in {config.place_of(IMAGES_FILE)}; add it there"
+        )
         raise Refused.at("images", message, code=UNSUPPORTED)
     configuration, settings = client.configuration(), client.settings(config)
     check_configuration(kind.word, configuration, client.name)

@@ -30,7 +30,15 @@ KUBERNETES_VERSION = "1.36.0"
 
 OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 
-_BUILT_IN = frozenset({"v1", "apps/v1", "networking.k8s.io/v1", "rbac.authorization.k8s.io/v1"})
+_BUILT_IN = frozenset(
+    {
+        "v1",
+        "admissionregistration.k8s.io/v1",
+        "apps/v1",
+        "networking.k8s.io/v1",
+        "rbac.authorization.k8s.io/v1",
+    }
+)
 _API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
 
 

@@ -68,7 +68,7 @@ class Upgrade:
     @property
     def handover(self) -> SwitchSteps:
         """The steps on the clusters before and after."""
-        return switch_steps(self.old, self.new)
+        return switch_steps(self.old, self.new, self.files)
 
 
 @dataclass(frozen=True, slots=True)

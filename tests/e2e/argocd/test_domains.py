@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from tests.e2e.common import expected
-from tests.e2e.common.intrusion import FILE, NEIGHBOUR, binding
+from tests.e2e.common.intrusion import FILE, FORBIDDEN, NEIGHBOUR, binding, makers
 from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
@@ -96,10 +96,11 @@ REFUSED = {
         binding("RoleBinding", "perception"),
         "attempting to grant RBAC permissions not currently held",
     ),
-    "a kind that no release contains": (
-        build_manifest("v1", "Service", "foreign", "perception", spec={"ports": [{"port": 80}]}),
-        "resource :Service is not permitted in project",
+    "a kind that the domain may not have": (
+        build_manifest("apps/v1", "DaemonSet", "foreign", "perception", spec={}),
+        "resource apps:DaemonSet is not permitted in project",
     ),
+    "a privileged pod": (list(makers(FORBIDDEN["privileged"][0]))[1], FORBIDDEN["privileged"][1]),
     "a project": (
         build_manifest("argoproj.io/v1alpha1", "AppProject", "foreign", "perception", spec={}),
         "AppProject is not permitted in project",

@@ -66,6 +66,7 @@ def test_every_pod_stays_there_and_back(
             world.step(step, expected.after(step))
     finally:
         world.generator.stop()
+        world.remove_wide()
 
 
 def from_flux(domain: flux_view.Domain) -> None:
@@ -90,7 +91,7 @@ def to_argocd(world: FluxWorld) -> Domain:
     """Render everything for Argo CD, let it follow, and demand the next step."""
     upgraded = upgrade(world, "argocd")
     manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
-    world.rig.kube.apply(*manifests)
+    world.apply(world.rig.kube, manifests)
     folder = manifests[-1]
     destination = folder["spec"]["destination"]["namespace"]
     domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])

@@ -24,7 +24,7 @@ class World(StateRepo[Domain]):
         namespace = folder["spec"]["destination"]["namespace"]
         assert project["spec"]["sourceNamespaces"] == [namespace]
         domain = self.domains[cluster] = Domain(rig.kube, namespace, folder["metadata"]["name"])
-        rig.kube.apply(*manifests)
+        self.apply(rig.kube, manifests)
         domain.wait_applied(self.tip())
         return domain
 
@@ -34,3 +34,4 @@ class World(StateRepo[Domain]):
             domain.kube.delete("Application", domain.name, NAMESPACE)
             domain.kube.wait_gone("Application", domain.name, NAMESPACE)
             domain.kube.delete("AppProject", domain.name, NAMESPACE)
+        self.remove_wide()

@@ -19,6 +19,7 @@ from tests.e2e.rig import launch
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.errors import RigError
+from tests.e2e.rig.kube import Kube, Manifest
 from tests.kit.repo import git
 from tests.kit.ros import Sent
 
@@ -101,10 +102,26 @@ class StateRepo(Generic[Domain]):
         self.person = Clone(self.push_url, folder / "person")
         self.generator = Generator(self.push_url, folder, ros_domain, client)
         self.domains: dict[str, Domain] = {}
+        self._wide: list[tuple[Kube, Manifest]] = []
 
     def bootstrap(self, cluster: str, rig: Rig) -> Domain:
         """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until it follows."""
         raise NotImplementedError
+
+    def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
+        """Apply a bootstrap file; :meth:`remove_wide` removes what is not in a namespace."""
+        kube.apply(*manifests)
+        self._wide += [
+            (kube, item)
+            for item in manifests
+            if "namespace" not in item["metadata"] and item["kind"] != "Namespace"
+        ]
+
+    def remove_wide(self) -> None:
+        """Remove what :meth:`apply` put into no namespace."""
+        for kube, item in self._wide:
+            kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
+        self._wide.clear()
 
     def remove(self) -> None:
         """Remove the state repo from its clusters. The namespace stays."""

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.intrusion import FILE, NEIGHBOUR, binding
+from tests.e2e.common.intrusion import ALLOWED, FILE, FORBIDDEN, NEIGHBOUR, binding, makers, pod
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import build_manifest
@@ -21,6 +22,7 @@ from tests.e2e.rig.kube import build_manifest
 from .view import Domain
 from .world import World
 
+NODES, POLICY = "inventory/nodes.yaml", "policy/access-domains.yaml"
 BASE = "clusters/c-its/perception/foreign/kustomization.yaml"
 
 
@@ -153,6 +155,50 @@ def test_a_base_is_not_fetched_from_elsewhere(
     slip_in({"resources": [f"{rig.git_url(name)}?ref=main"]}, file=BASE)
     wait_refused(domain, "fs-security-constraint")
     assert domain.inventory() == here
+
+
+def test_the_cluster_refuses_pods_that_the_domain_may_not_have(world: World) -> None:
+    """Whoever makes them, and whatever object they come from."""
+    kube = world.domain.kube
+    told = {
+        (name, maker["kind"]): kube.refusal(maker)
+        for name, (spec, _) in FORBIDDEN.items()
+        for maker in makers(spec)
+    }
+    assert {key: text for key, text in told.items() if FORBIDDEN[key[0]][1] not in text} == {}
+    taken = {name: [kube.refusal(one) for one in makers(spec)] for name, spec in ALLOWED.items()}
+    assert {name: told for name, told in taken.items() if any(told)} == {}
+
+
+def test_what_the_cluster_refuses_of_a_commit_is_reported(world: World, slip_in: SlipIn) -> None:
+    spec, reason = FORBIDDEN["privileged"]
+    (deployment,) = (maker for maker in makers(spec) if maker["kind"] == "Deployment")
+    slip_in(deployment)
+    wait_refused(world.domain, reason)
+    remove_committed(world)
+    assert world.domain.kube.get("Deployment", "foreign", world.domain.namespace) is None
+
+
+def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
+    """The policy changes, the generator writes another bootstrap file, and someone applies it."""
+    domain = world.domain
+    nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
+    policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")
+    world.push({NODES: nodes, POLICY: policy})
+    sent = world.demand(expected.demand(2))  # whether or not it is booked, the generator follows
+    bootstrap = world.file("bootstrap/c-its.yaml")
+    assert "podSecurity: baseline" in bootstrap
+    world.apply(domain.kube, list(yaml.safe_load_all(bootstrap)))
+    alone, *others = makers(pod(hostNetwork=True))
+    why = "hostNetwork is not possible with podSecurity: baseline of access domain 'perception'"
+    domain.kube.wait("the refusal", lambda: all(why in domain.kube.refusal(one) for one in others))
+    assert "violates PodSecurity" in domain.kube.refusal(alone)
+    assert [domain.kube.refusal(one) for one in makers(pod())] == [""] * (len(others) + 1)
+    domain.wake()
+    domain.wait_applied(sent.commit)
+    domain.wait_releases()
+    for deployment in domain.find("Deployment"):
+        assert "hostNetwork" not in deployment["spec"]["template"]["spec"]
 
 
 def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = None) -> None:

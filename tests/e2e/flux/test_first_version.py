@@ -38,6 +38,8 @@ def test_an_upgrade_from_the_first_version_restarts_the_fusion_alone(
     after = domain.pods()
     assert after.keys() == before.keys()
     assert {name for name in before if after[name] != before[name]} == {expected.FUSION}
+    world.bootstrap(CLUSTER, rig)  # as the upgrade says
+    assert domain.pods() == after
     (fusion,) = domain.find("HelmRelease", expected.FUSION)
     assert fusion["metadata"]["labels"]["app.kubernetes.io/part-of"] == "object-detection-fusion"
 

@@ -5,25 +5,18 @@ The clusters get only the manifests that `demandops init` wrote for them.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from tests.e2e.common.ros import Client
 from tests.e2e.common.staterepo import StateRepo
 from tests.e2e.rig.cluster import Rig
-from tests.e2e.rig.kube import Kube, Manifest
 
 from .view import SOURCE, Domain
 
 
 class World(StateRepo[Domain]):
     """A state repo that Flux follows."""
-
-    def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
-        super().__init__(rig, folder, ros_domain, client)
-        self._wide: list[tuple[Kube, Manifest]] = []
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
         """Do so; `source` changes fields of the GitRepository, as a person may with an overlay."""
@@ -34,12 +27,7 @@ class World(StateRepo[Domain]):
         metadata = follows["metadata"]
         domain = Domain(rig.kube, metadata["namespace"], metadata["name"])
         self.domains[cluster] = domain
-        rig.kube.apply(*manifests)
-        self._wide += [
-            (rig.kube, item)
-            for item in manifests
-            if "namespace" not in item["metadata"] and item["kind"] != "Namespace"
-        ]
+        self.apply(rig.kube, manifests)
         domain.wait_applied(self.tip())
         for chart in domain.find("HelmChart"):
             rig.kube.wait_ready("HelmChart", chart["metadata"]["name"], domain.namespace)
@@ -54,7 +42,5 @@ class World(StateRepo[Domain]):
                 kube.wait_gone(kind, name, namespace)
             for kind in ("HelmRelease", "HelmChart"):  # a late deletion would hit the next world's
                 kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
-        for kube, item in self._wide:
-            kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
+        self.remove_wide()
         self.domains.clear()
-        self._wide.clear()

@@ -82,6 +82,14 @@ class Kube:
                 dry_run="All" if dry_run else None,
             )
 
+    def refusal(self, manifest: Manifest) -> str:
+        """Return why the server would refuse a manifest, or an empty text if it would take it."""
+        try:
+            self.apply(manifest, dry_run=True)
+        except ApiException as error:
+            return str(error.body)
+        return ""
+
     def get(self, kind: str, name: str, namespace: str = "", version: str = "") -> Manifest | None:
         """Return an object, or None if it does not exist."""
         try:

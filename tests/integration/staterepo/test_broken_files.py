@@ -65,6 +65,38 @@ def test_another_file_is_taken_in_while_one_is_broken(bare: Path, person: Person
     rig.assert_sound(bare)
 
 
+def test_a_broken_file_of_a_folder_holds_back_none_of_the_others(
+    bare: Path, person: Person
+) -> None:
+    """Two vehicles of two pull requests; the first takes the id of the second, later also."""
+
+    def joining(id: str, **more: str) -> str:
+        node = {"id": id, "type": "vehicle", "cluster": "c-its", **more}
+        return yaml.safe_dump({"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": [node]})
+
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({"inventory/nodes/one.yaml": joining("one", clutser="x")})
+        person.change({"inventory/nodes/two.yaml": joining("two")})
+        rig.book(generator, goal(2))
+        assert "two" in generator.snapshot.state.config.nodes
+        assert "one" not in generator.snapshot.state.config.nodes
+        person.change({"inventory/nodes/one.yaml": joining("two")})
+        person.change({IMAGES: tagged(bare, "v2")})
+        rig.book(generator, goal(3))
+        assert tag(bare) == "v2"
+        assert [str(found) for found in generator.snapshot.problems] == [
+            "inventory/nodes/one.yaml: nodes[0].id: 'two' is in inventory/nodes/two.yaml too; "
+            "remove one",
+            "inventory/nodes/two.yaml: nodes[0].id: 'two' is in inventory/nodes/one.yaml too; "
+            "remove one",
+        ]
+        person.change({"inventory/nodes/one.yaml": joining("one")})
+        rig.book(generator, goal(4))
+        assert {"one", "two"} <= generator.snapshot.state.config.nodes.keys()
+    rig.assert_sound(bare)
+
+
 def test_what_came_with_a_broken_file_waits_with_it(bare: Path, person: Person) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))

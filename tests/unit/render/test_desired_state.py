@@ -55,7 +55,8 @@ def test_requesters_appear_nowhere_below_clusters() -> None:
 def test_each_access_domain_has_its_own_folder_namespace_and_account() -> None:
     text = "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
     for name in ("fleet", "city"):
-        text += f"  - {{name: {name}, namespace: ns-{name}, serviceAccount: sa-{name}, nodes: ["
+        text += f"  - {{name: {name}, namespace: ns-{name}, serviceAccount: sa-{name}, "
+        text += 'rules: [{name: all, peers: ["*"]}], nodes: ['
         text += '"vehicle*"]}\n' if name == "fleet" else "edge, cloud, station00]}\n"
     books = MemoryRepo({"policy/access-domains.yaml": text})
     books.send(perception())

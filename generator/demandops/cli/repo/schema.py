@@ -22,22 +22,25 @@ from demandops.demand.deployment_request_goal import WireGoal
 from demandops.migration.reference_map import ReferenceMap
 
 SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
-    "access-domains": (AccessDomainsFile, "policy/access-domains.yaml"),
+    "access-domains": (
+        AccessDomainsFile,
+        "policy/access-domains.yaml, policy/access-domains/*.yaml",
+    ),
     "cluster-access": (AccessFile, "the file of `demandops serve --clusters`"),
     "application": (ApplicationDefinition, "appdefs/<name>/appdef.yaml"),
-    "brokers": (BrokersFile, "inventory/brokers.yaml"),
-    "charts": (ChartsFile, "registry/charts.yaml"),
-    "clusters": (ClustersFile, "inventory/clusters.yaml"),
+    "brokers": (BrokersFile, "inventory/brokers.yaml, inventory/brokers/*.yaml"),
+    "charts": (ChartsFile, "registry/charts.yaml, registry/charts/*.yaml"),
+    "clusters": (ClustersFile, "inventory/clusters.yaml, inventory/clusters/*.yaml"),
     "demand": (DemandGoal, "a demand, for `demandops demand` and `demandops request`"),
     "deployment-request": (WireGoal, "a goal of DeploymentRequest, for `demandops request`"),
-    "images": (ImagesFile, "registry/images.yaml"),
-    "clients": (ClientsFile, "registry/clients.yaml"),
-    "nodes": (NodesFile, "inventory/nodes.yaml"),
+    "images": (ImagesFile, "registry/images.yaml, registry/images/*.yaml"),
+    "clients": (ClientsFile, "registry/clients.yaml, registry/clients/*.yaml"),
+    "nodes": (NodesFile, "inventory/nodes.yaml, inventory/nodes/*.yaml"),
     "override": (OverrideFile, "overrides/<name>.yaml"),
     "reference-map": (ReferenceMap, "the file of `demandops import --map`"),
     "service": (ServiceDefinition, "appdefs/<name>/service.yaml"),
     "state-repo": (RepoSettings, "demandops.yaml"),
-    "versions": (VersionsFile, "registry/versions.yaml"),
+    "versions": (VersionsFile, "registry/versions.yaml, registry/versions/*.yaml"),
 }
 
 

@@ -12,7 +12,7 @@ from itertools import islice
 
 from demandops import naming
 from demandops.config.appdef import Service
-from demandops.config.config import NODES_FILE
+from demandops.config.config import NODES_FILE, Config
 from demandops.connections.connection import Connection
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
@@ -85,9 +85,9 @@ def _clashes(
 ) -> Iterator[tuple[str, str]]:
     """Yield what else gives the node of ``key`` this topic, and the remedy."""
     for other in _publishers(world, key.node, topic, but=key):
-        yield f"{_words(other)} publishes on", _remedy(key, other, service)
+        yield f"{_words(other)} publishes on", _remedy(key, other, service, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
-        yield f"connection '{id}' brings to", _remedy(key, None, service)
+        yield f"connection '{id}' brings to", _remedy(key, None, service, world.config)
 
 
 def _of_connection(
@@ -201,19 +201,17 @@ def _words(key: ServiceKey) -> str:
     return f"{key.service} for {key.topic} of '{key.source}'"
 
 
-def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service) -> str:
+def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config: Config) -> str:
     if key.application is not None:
         return "use another application id"
     if other is None:
         return "let the connection give it another name there"
     if "node" in (key.scope, other.scope):
         return f"change this output in {service.file}"
+    file = config.file_of(NODES_FILE, str(key.source))
     if key.source == other.source:
-        return (
-            f"name the usual one of the two as topics.{service.root} of '{key.source}' in "
-            f"{NODES_FILE}"
-        )
-    return f"give '{key.source}' another id in {NODES_FILE}"
+        return f"name the usual one of the two as topics.{service.root} of '{key.source}' in {file}"
+    return f"give '{key.source}' another id in {file}"
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:

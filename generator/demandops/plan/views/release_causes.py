@@ -68,13 +68,16 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}
-    node, domain = release.node, release.domain
+    node, domain, file_of = release.node, release.domain, config.file_of
     return [
         (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
         *release.shaping_entries(config),
-        *((IMAGES_FILE, f"images.{name}", one.reference()) for name, one in images.items()),
-        (NODES_FILE, node.id, f"in cluster {node.cluster}"),
-        (DOMAINS_FILE, domain.name, f"namespace {domain.namespace}"),
+        *(
+            (file_of(IMAGES_FILE, name), f"images.{name}", one.reference())
+            for name, one in images.items()
+        ),
+        (file_of(NODES_FILE, node.id), node.id, f"in cluster {node.cluster}"),
+        (file_of(DOMAINS_FILE, domain.name), domain.name, f"namespace {domain.namespace}"),
     ]
 
 

@@ -15,6 +15,7 @@ from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
+from demandops.render.gitops.node_rule import node_rule
 from demandops.render.gitops.paths import (
     bootstrap_path,
     domain_folder,
@@ -66,7 +67,7 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
         "argocd/bootstrap.yaml.j2",
         cluster=cluster,
         domains=domains,
-        autoscales=config.autoscales,
+        node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
         folders={domain.name: domain_folder(cluster, domain) for domain in domains},
         projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
         urls=_sources(config),

@@ -1,4 +1,4 @@
-"""The steps on the clusters when a state repo switches between Flux and Argo CD.
+"""The steps on the clusters when a state repo is upgraded, or switches to Flux or Argo CD.
 
 Pure: returns instructions and commands for a person. The order matters. A running controller would
 remove the workloads when its releases leave the repo, so it is stopped first. Its objects are
@@ -7,7 +7,7 @@ deleted only after the other controller has taken over.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import Config
@@ -38,16 +38,18 @@ class SwitchSteps:
     after: tuple[Step, ...] = ()
 
 
-def switch_steps(old: Config, new: Config) -> SwitchSteps:
-    """Return the steps to switch the controller; none if it stays the same.
+def switch_steps(old: Config, new: Config, changed: Container[str]) -> SwitchSteps:
+    """Return the steps to switch the controller, else those for changed bootstrap files.
 
     No workload is deleted on the way (docs/argocd.md has the reasons).
 
     Args:
         old, new: the configuration before and after.
+        changed: the paths of the generated files that change.
     """
     if old.repo_settings.gitops == new.repo_settings.gitops:
-        return SwitchSteps()
+        clusters = [one for one in domains_by_cluster(new) if bootstrap_path(one) in changed]
+        return SwitchSteps(after=tuple(map(_bootstrap_again, clusters)))
     if new.repo_settings.gitops == "argocd":
         return SwitchSteps(tuple(_suspend_flux(new)), tuple(_finish_switch_to_argocd(new)))
     return SwitchSteps(tuple(_delete_applications(old)), tuple(_finish_switch_to_flux(new)))
@@ -128,8 +130,16 @@ def _finish_switch_to_flux(config: Config) -> Iterator[Step]:
 
 
 def _follow(cluster: str, then: str) -> Step:
-    show = f"git show main:{bootstrap_path(cluster)} | kubectl apply -f -"
-    return Step(cluster, f"make the cluster follow the repo again; {then}", (show,))
+    return Step(cluster, f"make the cluster follow the repo again; {then}", (_apply(cluster),))
+
+
+def _bootstrap_again(cluster: str) -> Step:
+    description = "apply its bootstrap file again, because that changed"
+    return Step(cluster, description, (_apply(cluster),))
+
+
+def _apply(cluster: str) -> str:
+    return f"git show main:{bootstrap_path(cluster)} | kubectl apply -f -"
 
 
 def _namespaces(domains: list[AccessDomain]) -> list[str]:

@@ -122,11 +122,11 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
 def _source_of(path: str) -> str:
     """Return the files to edit instead of a generated file that is not a release."""
     if path.startswith(f"{BOOTSTRAP_ROOT}/"):
-        return "demandops.yaml, inventory/ or policy/access-domains.yaml"
+        return "demandops.yaml, inventory/ or policy/"
     if "/_charts/" in path:
-        return "registry/charts.yaml"
+        return "registry/"
     if path.endswith("/_domain.yaml"):
-        return "policy/access-domains.yaml"
+        return "policy/"
     return "the configuration"
 
 

@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 
 from demandops import strict_yaml
-from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
@@ -23,10 +23,11 @@ from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.ledger import Ledger, changes_on
 from demandops.ledger.world import World
 from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
+from demandops.plan.views import override_report, policy_warnings
 from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
-from demandops.plan.views.override_report import override_report, warnings
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
+from demandops.render.gitops.paths import BOOTSTRAP_ROOT
 from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
@@ -89,14 +90,18 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
             path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
         ]
         new = merge_preview.planned_releases(state)
-        idle = warnings(override_report(state, edit.now))
+        idle = override_report.warnings(override_report.override_report(state, edit.now))
         result = replace(
             result,
             preview=merge_preview.preview(
                 new if start is None else start.releases(), new, edit.generated, wanted
             ),
             bookkeeping=_bookkeeping_changes(start, state),
-            warnings=tuple(fault("", text).within(path) for path, text in idle),
+            warnings=(
+                *(fault("", text).within(path) for path, text in idle),
+                *policy_warnings.warnings(state),
+                *edit.changed_bootstraps(wanted),
+            ),
         )
     if start is not None and edited:
         manual, suggestions = manual_edits.faults_and_suggestions(
@@ -187,6 +192,16 @@ class _Edit:
             found = merge_preview.render_faults(state, state.engine, self.changed)
             raise InvalidInput(found or error.faults) from None
 
+    def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
+        """Yield a warning for each bootstrap file that a person has to apply to its cluster."""
+        for path, text in sorted(self.generated.items()):
+            if path.startswith(f"{BOOTSTRAP_ROOT}/") and wanted.get(path, text) != text:
+                message = (
+                    "changes with the merge, and no controller applies it; apply it to the cluster "
+                    f"again: kubectl apply -f {path}"
+                )
+                yield fault("", message).within(path)
+
     def unversioned_charts(self, config: Config) -> Iterator[Fault]:
         """Yield a fault for each chart that changed without a new version."""
         sources = {
@@ -205,8 +220,8 @@ class _Edit:
                 yield fault(
                     "version",
                     f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; "
-                    f"raise it here and at charts.{name} in registry/charts.yaml, or no cluster "
-                    "applies it",
+                    f"raise it here and at charts.{name} in {config.file_of(CHARTS_FILE, name)}, "
+                    "or no cluster applies it",
                 ).within(metadata)
 
 

@@ -1,0 +1,59 @@
+"""The rule of a cluster that pods of an access domain run on nodes of the domain only.
+
+It is an expression of the Common Expression Language over ``variables.selector``, a pod's node
+selector. For nodes with the default selector it has the patterns of the policy, so that one more
+vehicle changes nothing that a person has to apply to the cluster.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+
+from demandops.config.config import Config
+from demandops.config.inventory import NODE_LABEL
+from demandops.config.policy import AccessDomain
+
+_SELECTOR = "variables.selector"
+
+
+def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
+    """Return the expression that is true for a selector of a node of the domain."""
+    by_label: dict[str, set[str]] = {}
+    selectors: set[tuple[tuple[str, str], ...]] = set()
+    for node in config.nodes.values():
+        if node.selector is None or node.cluster != cluster:
+            continue
+        if config.domain_of.get(node.id) is not domain:
+            continue
+        if len(node.selector) == 1:
+            ((label, value),) = node.selector.items()
+            by_label.setdefault(label, set()).add(value)
+        else:
+            selectors.add(tuple(sorted(node.selector.items())))
+    pattern = "|".join(map(expression_of, domain.nodes))
+    parts = [_has(NODE_LABEL, f".matches({_text(f'^({pattern})$')})")]
+    parts += [
+        _has(label, f" in [{', '.join(map(_text, sorted(values)))}]")
+        for label, values in sorted(by_label.items())
+    ]
+    parts += [
+        "("
+        + (" && ".join(_has(label, f" == {_text(value)}") for label, value in one) or "true")
+        + ")"
+        for one in sorted(selectors)
+    ]
+    return " || ".join(parts)
+
+
+def expression_of(pattern: str) -> str:
+    """Return a pattern of the policy, with ``*`` and ``?``, as a regular expression of RE2."""
+    return "".join({"*": ".*", "?": "."}.get(one, re.escape(one)) for one in pattern)
+
+
+def _has(label: str, test: str) -> str:
+    return f"({_text(label)} in {_SELECTOR} && {_SELECTOR}[{_text(label)}]{test})"
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False)  # a string of the language too

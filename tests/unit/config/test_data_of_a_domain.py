@@ -1,0 +1,154 @@
+"""What keeps the data of access domains apart: ROS domains, credentials of brokers, warnings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from demandops.config.load import load
+from demandops.decision import State
+from demandops.errors import InvalidInput
+from demandops.plan.views import policy_warnings
+
+from tests.kit.config import configuration, skeleton
+from tests.kit.memory import MemoryRepo
+
+DOMAINS, NODES, BROKERS = (
+    *("policy/access-domains.yaml", "inventory/nodes.yaml", "inventory/brokers.yaml"),
+)
+PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+BOTH = 'rules: [{name: all, peers: ["*"]}]'
+CONNECTION = {
+    "kind": "Demand",
+    "demand": "d",
+    "requesters": ["vehicle00"],
+    "connections": [
+        {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+    ],
+}
+
+
+def domains(fleet: str = "", city: str = "") -> dict[str, str]:
+    """Return a policy of two domains, each with further fields."""
+    return {
+        DOMAINS: f"""
+apiVersion: demandops/v1
+kind: AccessDomains
+domains:
+  - {{name: fleet, namespace: fleet, nodes: ["vehicle*"], {fleet or BOTH}}}
+  - {{name: city, namespace: city, nodes: [station00, edge, cloud], {city or BOTH}}}
+"""
+    }
+
+
+def clients(files: dict[str, str]) -> dict[str, Any]:
+    """Return the pod of each end of a connection between the two, by node."""
+    books = MemoryRepo(files)
+    books.send(CONNECTION)
+    pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]
+    return {pod["nodeSelector"]["node_id"]: pod for pod in pods}
+
+
+def test_each_end_of_a_connection_is_in_the_ros_domain_of_its_access_domain() -> None:
+    own = skeleton()[NODES].replace("ros: {rmw: image}", "ros: {rmw: image, domainId: 3}", 1)
+    found = {
+        node: {one["name"]: one["value"] for one in pod["containers"][0]["env"]}["ROS_DOMAIN_ID"]
+        for node, pod in clients(domains(f"{BOTH}, ros: {{domainId: 41}}") | {NODES: own}).items()
+    }
+    assert found == {"vehicle00": "41", "edge": "0"}
+    config = load(configuration(domains(city="ros: {domainId: 42}") | {NODES: own}))
+    assert {node.id: node.ros.domain_id for node in config.nodes.values()} == {
+        **dict.fromkeys(("vehicle01", "vehicle02", "vehicle03"), 0),
+        **dict.fromkeys(("station00", "edge", "cloud"), 42),
+        "vehicle00": 3,
+    }
+
+
+def secrets(files: dict[str, str]) -> dict[str, list[tuple[str, list[str]]]]:
+    return {
+        node: [
+            (one["secret"]["secretName"], [item["key"] for item in one["secret"]["items"]])
+            for one in pod["volumes"]
+            if "secret" in one
+        ]
+        for node, pod in clients(files).items()
+    }
+
+
+def test_each_end_of_a_connection_has_the_credentials_of_its_access_domain() -> None:
+    own = f"{BOTH}, brokerCredentials: {{edge: {{secret: of-fleet, passwordKey: pw}}}}"
+    assert secrets(domains(own)) == {"vehicle00": [("of-fleet", ["username", "pw"])], "edge": []}
+    shared = skeleton()[BROKERS].replace("port: 1993", "port: 1993\n    credentials: {secret: all}")
+    assert secrets(domains(own) | {BROKERS: shared}) == {
+        "vehicle00": [("of-fleet", ["username", "pw"])],
+        "edge": [("all", ["username", "password"])],
+    }
+
+
+def test_credentials_name_a_broker() -> None:
+    with pytest.raises(InvalidInput) as invalid:
+        load(configuration(domains("brokerCredentials: {egde: {secret: s}}")))
+    assert str(invalid.value) == (
+        f"{DOMAINS}: domains[0].brokerCredentials.egde: 'egde' is not in brokers.yaml; did you "
+        "mean 'edge'?"
+    )
+
+
+def warned(files: dict[str, str]) -> list[str]:
+    return [str(found) for found in policy_warnings.warnings(MemoryRepo(files).state)]
+
+
+SHARED = (
+    f"{DOMAINS}: access domains 'city' and 'fleet' share ROS domain 0 on the host's network of "
+    "cluster 'c-its', where each may read and write the other's topics; give each its own "
+    "ros.domainId"
+)
+CLOSED = (
+    f"{DOMAINS}: network: namespace of access domain 'fleet' does not hold for pods with the "
+    "host's network, as on 'vehicle00', 'vehicle01', 'vehicle02' and 1 more; set hostNetwork: "
+    "false for these nodes, or separate their network yourself"
+)
+
+
+def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
+    books = MemoryRepo(domains("ros: {domainId: 1}, " + BOTH))
+    books.send(CONNECTION)
+    assert list(policy_warnings.warnings(books.state)) == []
+    config = load(configuration(domains("ros: {domainId: 1}")))
+    told = policy_warnings.warnings(State.of(config, books.state.ledger))
+    assert list(map(str, told)) == [
+        f"{DOMAINS}: no rule of access domain 'fleet' has 'city' in its peers; connections "
+        "between them stay (1), but cannot be demanded again"
+    ]
+
+
+def test_what_the_hosts_network_leaves_open_is_told() -> None:
+    assert warned(domains()) == [SHARED]
+    assert warned(domains("ros: {domainId: 1}", "ros: {domainId: 2}")) == []
+    assert warned(domains("network: namespace, ros: {domainId: 1}")) == [CLOSED]
+
+
+def test_without_it_nothing_is_open() -> None:
+    text = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:")
+    assert warned(domains("network: namespace") | {NODES: text}) == []
+
+
+def test_clusters_have_networks_of_their_own() -> None:
+    clusters = skeleton()["inventory/clusters.yaml"] + "  - name: fleet\n"
+    nodes = re.sub(r"(?<=type: vehicle\n    cluster: )c-its", "fleet", skeleton()[NODES])
+    files = domains() | {NODES: nodes, "inventory/clusters.yaml": clusters}
+    assert warned(files) == []
+
+
+def test_the_example_of_the_documentation() -> None:
+    (example,) = re.findall(r"\n\n(    ros: .*\n(?:    .*\n)*)", PAGE)
+    config = load(configuration({DOMAINS: f"{skeleton()[DOMAINS]}{example}"}))
+    given = yaml.safe_load(example)
+    assert {node.ros.domain_id for node in config.nodes.values()} == {given["ros"]["domainId"]}
+    found = config.domains["perception"].broker_credentials
+    assert {node: {"secret": one.secret} for node, one in found.items()} == given[
+        "brokerCredentials"
+    ]

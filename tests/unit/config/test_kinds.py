@@ -1,0 +1,198 @@
+"""The kinds that an access domain's charts may have: one list for Role, AppProject and `check`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from demandops.config.load import load
+from demandops.config.policy import KINDS, AccessDomain
+from demandops.errors import InvalidInput
+from demandops.plan.views import policy_warnings
+
+from tests.kit.config import configuration, edited, skeleton
+from tests.kit.memory import MemoryRepo
+
+DOMAINS = "policy/access-domains.yaml"
+APPDEFS = "appdefs/object-detection-fusion"
+CHART = f"{APPDEFS}/charts/object-detection"
+MONITOR = "{kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}"
+REGISTERED = {
+    "": "ConfigMap PersistentVolumeClaim Secret Service ServiceAccount",
+    "apps": "Deployment StatefulSet",
+    "autoscaling": "HorizontalPodAutoscaler",
+    "batch": "CronJob Job",
+    "networking.k8s.io": "Ingress NetworkPolicy",
+    "policy": "PodDisruptionBudget",
+    "rbac.authorization.k8s.io": "Role RoleBinding",
+}
+
+
+PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+
+
+def domain(**fields: Any) -> dict[str, str]:
+    """Return the policy with fields of the access domain added."""
+    text = "".join(f"\n    {name}: {value}" for name, value in fields.items())
+    return edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]{text}')
+
+
+def bootstrap(files: Mapping[str, str]) -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all(MemoryRepo(files).files["bootstrap/c-its.yaml"]))
+
+
+def written(files: Mapping[str, str]) -> dict[str, set[str]]:
+    """Return API group → the resources that the domain's account may write."""
+    (role,) = (item for item in bootstrap(files) if item["kind"] == "Role")
+    found: dict[str, set[str]] = {}
+    for rule in role["rules"]:
+        if "create" in rule["verbs"] and "toolkit" not in rule["apiGroups"][0]:
+            found.setdefault(rule["apiGroups"][0], set()).update(rule["resources"])
+    return found
+
+
+def permitted(files: Mapping[str, str]) -> set[tuple[str, str]]:
+    """Return (group, kind) of what the domain's AppProject permits."""
+    argocd = {"demandops.yaml": skeleton("argocd")["demandops.yaml"]}
+    (project,) = (item for item in bootstrap(argocd | dict(files)) if item["kind"] == "AppProject")
+    return {
+        (item["group"], item["kind"])
+        for item in project["spec"]["namespaceResourceWhitelist"]
+        if item["group"] != "argoproj.io"
+    }
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {},
+        domain(network="namespace"),
+        domain(kinds=f"[ConfigMap, Secret, Deployment, DaemonSet, {MONITOR}]"),
+    ],
+)
+def test_account_and_project_have_the_kinds_of_the_domain(files: dict[str, str]) -> None:
+    kinds = load(configuration(files)).domains["perception"].allowed_kinds
+    assert permitted(files) == {(kind.group, kind.kind) for kind in kinds}
+    assert written(files) == {
+        group: {kind.resource for kind in kinds if kind.group == group}
+        for group in {kind.group for kind in kinds}
+    }
+
+
+def test_by_default_they_are_those_of_ordinary_charts() -> None:
+    by_default = {(group, kind) for group, kinds in REGISTERED.items() for kind in kinds.split()}
+    assert permitted({}) == by_default
+    closed = by_default - {("networking.k8s.io", "NetworkPolicy")}
+    assert permitted(domain(network="namespace")) == closed
+    for group, kinds in REGISTERED.items():
+        (row,) = (
+            line
+            for line in PAGE.splitlines()
+            if line.startswith(f"| {(group and f'`{group}`') or 'core'} |")
+        )
+        assert re.findall(r"[A-Z]\w+", row.split("|")[2]) == kinds.split()
+
+
+def test_the_list_of_the_documentation_is_taken() -> None:
+    listed = re.search(r"^    kinds:\n(?:      .*\n)+", PAGE, re.MULTILINE)
+    assert listed
+    files = edited(DOMAINS, '    nodes: ["*"]\n', f'    nodes: ["*"]\n{listed[0]}')
+    assert ("monitoring.coreos.com", "ServiceMonitor") in permitted(files)
+    assert len(permitted(files)) == 4
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        (
+            {"kinds": "[ConfigMap, Deployment, Secrets]"},
+            ".kinds[2]: 'Secrets' is not a kind that its name alone tells; give kind, group and "
+            "resource; did you mean 'Secret'?",
+        ),
+        (
+            {"kinds": "[ConfigMap]"},
+            ": kinds: needs Deployment and Secret for connections and Helm's releases; add it",
+        ),
+        (
+            {"kinds": f"[{', '.join(KINDS)}]", "network": "namespace"},
+            ": kinds: with NetworkPolicy a chart could open what network: namespace closes; "
+            "remove one of them",
+        ),
+    ],
+)
+def test_a_list_that_cannot_work_is_refused(fields: dict[str, str], told: str) -> None:
+    with pytest.raises(InvalidInput) as invalid:
+        load(configuration(domain(**fields)))
+    assert str(invalid.value) == f"{DOMAINS}: domains[0]{told}"
+
+
+def test_the_schema_takes_a_word_or_a_kind() -> None:
+    items = AccessDomain.model_json_schema()["properties"]["kinds"]["anyOf"][0]["items"]
+    assert items["anyOf"][0]["enum"] == list(KINDS)
+
+
+def warned(files: Mapping[str, str | None]) -> list[str]:
+    return [str(found) for found in policy_warnings.warnings(MemoryRepo(files).state)]
+
+
+def test_the_charts_that_come_with_it_need_no_more() -> None:
+    assert warned({}) == []
+
+
+def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
+    template = f"{CHART}/templates/agent.yaml"
+    text = (
+        "{{- if .Values.agent }}\napiVersion: apps/v1\nkind: DaemonSet # on each node\n{{- end }}\n"
+    )
+    assert warned({template: text}) == [
+        f"{template}: line 3: DaemonSet is not among the kinds of access domain 'perception', "
+        f"whose cluster refuses it if the chart renders it; add it to kinds in {DOMAINS}, or leave "
+        "it out"
+    ]
+    (told,) = warned({template: text})
+    assert told.replace(CHART, "appdefs/agent/charts/agent") in PAGE
+    used = "ConfigMap, Deployment, HorizontalPodAutoscaler, Role, RoleBinding, Secret"
+    kinds = f"[{used}, ServiceAccount, DaemonSet]"
+    assert warned({template: text, **domain(kinds=kinds)}) == []
+
+
+def test_a_domain_is_told_only_of_applications_that_its_rules_name() -> None:
+    agent = {f"{CHART}/templates/agent.yaml": "kind: DaemonSet\n"}
+    other = "[{name: all, applications: [other]}]"
+    assert warned({**agent, **domain(rules=other)}) == []
+    assert len(warned({**agent, **domain(rules='[{name: all, applications: ["object-*"]}]')})) == 1
+
+
+def test_only_what_is_rendered_counts() -> None:
+    quiet = {
+        f"{CHART}/templates/tests/connection.yaml": "kind: Pod\n",
+        f"{CHART}/templates/NOTES.txt": "kind: DaemonSet\n",
+        f"{CHART}/README.md": "kind: DaemonSet\n",
+        f"{CHART}/templates/service.yaml": "apiVersion: v1\nkind: Service\nspec:\n  kind: Pod\n",
+    }
+    assert warned(quiet) == []
+    below = {f"{CHART}/charts/sub/templates/a.yml": 'kind: "DaemonSet"\n'}
+    assert warned(below)[0].startswith(f"{CHART}/charts/sub/templates/a.yml: line 1: DaemonSet is")
+
+
+def test_what_cannot_be_known_is_said() -> None:
+    chart = skeleton()[f"{CHART}/Chart.yaml"]
+    files = {
+        f"{CHART}/templates/any.yaml": "kind: {{ .Values.kind }}\n",
+        f"{CHART}/crds/robot.yaml": "kind: CustomResourceDefinition\n",
+        f"{CHART}/Chart.yaml": f"{chart}dependencies: [{{name: redis}}, {{name: sub}}]\n",
+        f"{CHART}/charts/sub/Chart.yaml": "name: sub\nversion: 0.1.0\n",
+    }
+    assert warned(files) == [
+        f"{CHART}/Chart.yaml: dependencies[0]: 'redis' is not unpacked in charts/, so its kinds "
+        "are not known; see yourself that its access domain may have them",
+        f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among the kinds of access "
+        "domain 'perception', whose cluster refuses it if the chart renders it; add it to kinds "
+        f"in {DOMAINS}, or leave it out",
+        f"{CHART}/templates/any.yaml: line 1: kind '{{{{ .Values.kind }}}}' is computed; see "
+        "yourself that its access domain may have it",
+    ]

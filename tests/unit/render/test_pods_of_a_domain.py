@@ -1,0 +1,174 @@
+"""What the bootstrap files let pods of an access domain be.
+
+`tests/e2e` shows what a cluster refuses by them. Here the rule for node selectors is evaluated in
+Python, whose operators are others.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+import yaml
+from demandops.config.load import load
+from demandops.config.policy import matches
+from demandops.decision import rendered_files
+from demandops.errors import InvalidInput
+from demandops.render.gitops.node_rule import expression_of, node_rule
+from demandops.render.output_check import check_files
+
+from tests.kit.config import configuration, edited, skeleton
+from tests.kit.memory import MemoryRepo
+
+DOMAINS, NODES, CLIENTS = (
+    *("policy/access-domains.yaml", "inventory/nodes.yaml", "registry/clients.yaml"),
+)
+BOOTSTRAP = "bootstrap/c-its.yaml"
+PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+HEAD = "apiVersion: demandops/v1\nkind: {}\n"
+POLICY = f"""{HEAD.format("AccessDomains")}domains:
+  - {{name: fleet, namespace: ns-fleet, nodes: ["vehicle*", "car.[?]", own*]}}
+  - {{name: city, namespace: ns-city, nodes: [edge, cloud, station00]}}
+"""
+OWN = f"""{HEAD.format("Nodes")}nodes:
+  - {{id: "car.[1]", type: vehicle, cluster: c-its, selector: {{kubernetes.io/hostname: a}}}}
+  - {{id: own1, type: vehicle, cluster: c-its, selector: {{kubernetes.io/hostname: b}}}}
+  - {{id: own2, type: vehicle, cluster: c-its, selector: {{place: "x", rack: "1"}}}}
+"""
+FILES = {DOMAINS: POLICY, "inventory/nodes/own.yaml": OWN}
+
+
+def taken(rule: str, selector: Mapping[str, str]) -> bool:
+    """Evaluate a node rule for a pod's node selector."""
+    python = rule.replace("&&", "and").replace("||", "or").replace("variables.selector", "selector")
+    python = re.sub(r'(selector\["\w+"\])\.matches\(', r"search(\1, ", python)
+    scope = {
+        "selector": selector,
+        "true": True,
+        "search": lambda text, found: re.search(found, text),
+    }
+    return bool(eval(python, {}, scope))  # noqa: S307 - our own text
+
+
+def test_a_pod_selects_a_node_of_its_domain() -> None:
+    config = load(configuration(FILES))
+    for domain in config.domains.values():
+        rule = node_rule("c-its", domain, config)
+        for node in config.nodes.values():
+            own = config.domain_of[node.id] is domain
+            assert taken(rule, node.labels()) == own, (domain.name, node.id)
+            assert taken(rule, node.labels() | {"more": "narrower"}) == own
+        for selector in ({}, {"node_id": "other"}, {"place": "x"}, {"kubernetes.io/os": "linux"}):
+            assert not taken(rule, selector), selector
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_pattern_means_in_a_cluster_what_it_means_in_the_policy(seed: int) -> None:
+    random = Random(seed)
+    for _ in range(50):
+        name = "".join(random.choices("ab.-_[]", k=random.randint(1, 5)))
+        pattern = "".join(random.choice((one, one, "*", "?")) for one in name)
+        other = "".join(random.choices("ab.-_[]", k=len(name)))
+        for text in (name, other):
+            found = bool(re.search(f"^({expression_of(pattern)})$", text))
+            assert found == matches(text, (pattern,)), (pattern, text)
+
+
+def test_a_node_without_labels_to_select_is_any() -> None:
+    config = load(configuration(edited(NODES, "- id: cloud\n", "- id: cloud\n    selector: {}\n")))
+    assert taken(node_rule("c-its", config.domains["perception"], config), {})
+
+
+def bootstrap(files: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    text = rendered_files(MemoryRepo(files).state)[BOOTSTRAP].split("\n---\n", 1)[1]
+    check_files({BOOTSTRAP: text})  # against the schemas of Kubernetes
+    return {item["kind"]: item for item in yaml.safe_load_all(text)}
+
+
+@pytest.mark.parametrize("gitops", ["flux", "argocd"])
+def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> None:
+    root = {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    node = f"{HEAD.format('Nodes')}nodes: [{{id: vehicle9, type: vehicle, cluster: c-its}}]\n"
+    before = rendered_files(MemoryRepo(root | FILES).state)
+    after = rendered_files(MemoryRepo(root | FILES | {"inventory/nodes/new.yaml": node}).state)
+    assert before == after
+    own = node.replace("c-its}", "c-its, selector: {node_id: nine}}")
+    after = rendered_files(MemoryRepo(root | FILES | {"inventory/nodes/new.yaml": own}).state)
+    assert [path for path in after if after[path] != before[path]] == [BOOTSTRAP]
+
+
+LEVELS = {"baseline": 7, "host-network": 6, "privileged": 1}
+
+
+@pytest.mark.parametrize("gitops", ["flux", "argocd"])
+@pytest.mark.parametrize("level", LEVELS)
+def test_each_level_has_its_label_and_rules(level: str, gitops: str) -> None:
+    policy = edited(DOMAINS, "    podSecurity: host-network", f"    podSecurity: {level}")
+    nodes = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:")
+    files = policy | {NODES: nodes, "demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    made = bootstrap(files)
+    enforced = "baseline" if level == "baseline" else "privileged"
+    assert made["Namespace"]["metadata"]["labels"] == {
+        "demandops/pod-security": level,
+        "pod-security.kubernetes.io/enforce": enforced,
+    }
+    policy, binding = (made[f"ValidatingAdmissionPolicy{kind}"] for kind in ("", "Binding"))
+    rules = policy["spec"]["validations"]
+    assert len(rules) == LEVELS[level]
+    assert ("hostNetwork is not possible" in str(rules)) == (level == "baseline")
+    used = {name for rule in rules for name in re.findall(r"variables\.(\w+)", rule["expression"])}
+    assert used <= {variable["name"] for variable in policy["spec"]["variables"]}
+    assert binding["spec"]["policyName"] == policy["metadata"]["name"]
+    labels = binding["spec"]["matchResources"]["namespaceSelector"]["matchLabels"]
+    assert labels == {"kubernetes.io/metadata.name": "perception"}
+
+
+def test_the_example_of_the_documentation() -> None:
+    examples = re.findall(r"\n\n    domains:\n(?:      .*\n)+", PAGE)
+    (example,) = (found for found in examples if "podSecurity" in found)
+    policy = f"{HEAD.format('AccessDomains')}{textwrap.dedent(example).lstrip()}"
+    text = rendered_files(MemoryRepo({DOMAINS: policy}).state)[BOOTSTRAP]
+    rules = {
+        item["metadata"]["name"]: item["spec"]["validations"]
+        for item in yaml.safe_load_all(text)
+        if item["kind"] == "ValidatingAdmissionPolicy"
+    }
+    assert {name: len(found) for name, found in rules.items()} == {
+        "demandops-perception": LEVELS["host-network"],
+        "demandops-sensors": LEVELS["privileged"],
+    }
+    assert taken(rules["demandops-sensors"][0]["expression"], {"node_id": "station7"})
+    (refusal,) = re.findall(r"^    Valid.* denied request: (.*)$", PAGE, re.MULTILINE)
+    assert refusal in {rule["message"] for rule in rules["demandops-perception"]}
+
+
+def test_the_default_lets_nodes_have_the_hosts_network() -> None:
+    assert load(configuration()).domains["perception"].pod_security == "host-network"
+    bare = skeleton()[DOMAINS].replace("    podSecurity: host-network\n", "")
+    assert bare != skeleton()[DOMAINS]
+    assert bootstrap({DOMAINS: bare}) == bootstrap({})
+
+
+def test_a_node_may_not_have_what_its_domain_forbids() -> None:
+    policy = POLICY.replace("ns-fleet,", "ns-fleet, podSecurity: baseline,")
+    nodes = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:", 1)
+    own = OWN.replace("c-its, ", "c-its, hostNetwork: false, ")
+    clients = skeleton()[CLIENTS] + "  hostNetwork: true\n"
+    files = {DOMAINS: policy, NODES: nodes, "inventory/nodes/own.yaml": own, CLIENTS: clients}
+    with pytest.raises(InvalidInput) as invalid:
+        load(configuration(files))
+    assert str(invalid.value).splitlines() == [
+        *(
+            f"{NODES}: nodes[{place}].hostNetwork: is true (the default), and podSecurity of "
+            "access domain 'fleet' is baseline, which forbids it; set hostNetwork: false, or "
+            "podSecurity: host-network"
+            for place in (1, 2, 3)
+        ),
+        f"{CLIENTS}: mqtt.hostNetwork: is true, and podSecurity of access domain 'fleet' is "
+        "baseline, which forbids it; leave it out, then each client does as its node",
+    ]
