@@ -250,16 +250,6 @@ class TestAutoscaler:
             "RespectIgnoreDifferences=true",
         ]
 
-    @pytest.mark.parametrize("gitops", ["flux", "argocd"])
-    def test_the_domain_may_have_autoscalers_only_where_a_definition_has_one(
-        self, gitops: Literal["flux", "argocd"]
-    ) -> None:
-        kinds = {"flux": ["horizontalpodautoscalers"], "argocd": ["HorizontalPodAutoscaler"]}
-        for scaling, allowed in ((AUTOSCALED, True), ("{min: 2, max: 2}", False)):
-            bootstrap = books(scaling, gitops=gitops).files["bootstrap/c-its.yaml"]
-            for word in (*kinds["flux"], *kinds[gitops]):
-                assert (word in bootstrap) is allowed
-
     def test_a_service_without_one_is_watched_as_before(self) -> None:
         repo = books(AUTOSCALED)
         repo.send(demand())
