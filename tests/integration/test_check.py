@@ -168,7 +168,8 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
 
 def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check: Check) -> None:
     policy = checkout / "policy" / "access-domains.yaml"
-    policy.write_text(policy.read_text() + "    kinds: [ConfigMap, Deployment, Secret]\n")
+    kinds = "ConfigMap, Deployment, HorizontalPodAutoscaler, Secret"
+    policy.write_text(policy.read_text() + f"    kinds: [{kinds}]\n")
     code, _, errors = check()
     assert code == 0
     charts = "appdefs/object-detection-fusion/charts"
