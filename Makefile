@@ -10,6 +10,8 @@ GO     := 1.26
 GO_DIR := build/go-$(GO)
 # Slow, and seldom broken: they build the packages that users install.
 PACKAGE_TESTS := tests/packages
+# One more than there are cores: while a test waits for another process, a core is free.
+WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # Tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # Tests start many processes, and each would compile all modules anew.
@@ -49,8 +51,8 @@ demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eig
 	@$(PY) examples/experiment/demo.py
 
 test: system-test setup  ## Run all tests but the end-to-end ones and test-packages
-	@$(PY) -m pytest -n auto --dist worksteal tests \
-	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS))
+	@$(PY) -m pytest -n $(WORKERS) --dist worksteal tests \
+	  $(addprefix --ignore=,tests/e2e tests/benchmarks tests/simulation $(PACKAGE_TESTS))
 
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
@@ -113,7 +115,8 @@ fuzz: export FUZZ_S ?= 10
 fuzz: system-test setup  ## Try odd inputs at every parser and writer, FUZZ_S seconds for each (default 10)
 	@$(PY) -m tests.fuzz
 
-simulate: setup  ## Play histories of generators and people with faults, for SIMULATE_S=60 seconds from SEED
+simulate: setup  ## Find planted faults, then play histories of generators and people with faults, for SIMULATE_S=60 seconds from SEED
+	@$(PY) -m pytest -q -n auto tests/simulation
 	@$(PY) -m tests.simulation.run
 
 wheel: setup  ## Build the wheel into dist/
