@@ -8,8 +8,10 @@ SYSTEM := system-demo system-test system-faults system-e2e system-e2e-argocd
 # Distributions have too old a Go, so the end-to-end tests bring this one unless PATH has it.
 GO     := 1.26
 GO_DIR := build/go-$(GO)
-# Slow, and seldom broken: they build the packages that users install.
+# Slow, so other targets of the gate run them.
 PACKAGE_TESTS := tests/packages
+SIMULATION_TESTS := tests/simulation
+KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py
 # One more than there are cores: while a test waits for another process, a core is free.
 WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # Tests and the demo talk on this machine only.
@@ -50,9 +52,9 @@ $(GO_DIR):
 demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eight commits
 	@$(PY) examples/experiment/demo.py
 
-test: system-test setup  ## Run all tests but the end-to-end ones and test-packages
+test: system-test setup  ## Run all tests but the slow ones, which other targets run
 	@$(PY) -m pytest -n $(WORKERS) --dist worksteal tests \
-	  $(addprefix --ignore=,tests/e2e tests/benchmarks tests/simulation $(PACKAGE_TESTS))
+	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS) $(SIMULATION_TESTS) $(KILL_TESTS))
 
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
@@ -70,7 +72,8 @@ coverage: system-test setup  ## Report what the tests cover, then what the core'
 	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
 
 # The long form tries every call: make faults FAULTS=--long
-faults: system-faults setup  ## Fail, kill, fill and cut off at each system call of a demand; three minutes
+faults: system-faults setup  ## Kill generators; fail, kill, fill and cut off at each system call of a demand; four minutes
+	@$(PY) -m pytest -q -n auto $(KILL_TESTS)
 	@$(PY) -m tests.faults $(FAULTS)
 
 # On a cluster that is there (E2E_KUBECONFIG) the tests start no programs of their own.
@@ -116,7 +119,7 @@ fuzz: system-test setup  ## Try odd inputs at every parser and writer, FUZZ_S se
 	@$(PY) -m tests.fuzz
 
 simulate: setup  ## Find planted faults, then play histories of generators and people with faults, for SIMULATE_S=60 seconds from SEED
-	@$(PY) -m pytest -q -n auto tests/simulation
+	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
 
 wheel: setup  ## Build the wheel into dist/
