@@ -102,6 +102,20 @@ def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> N
     assert [path for path in after if after[path] != before[path]] == [BOOTSTRAP]
 
 
+def test_a_chart_in_a_new_folder_changes_nothing_that_someone_applied() -> None:
+    """Applied again after the commit, the file would have Flux read the chart at the next one."""
+    folder = "appdefs/new/charts/new"
+    charts = skeleton()["registry/charts.yaml"]
+    added = {
+        "registry/charts.yaml": f"{charts}  new: {{folder: {folder}, version: 1.0.0}}\n",
+        f"{folder}/Chart.yaml": "apiVersion: v2\nname: new\nversion: 1.0.0\n",
+    }
+    before = rendered_files(MemoryRepo(FILES).state)
+    after = rendered_files(MemoryRepo(FILES | added).state)
+    changed = {path.rpartition("/")[2] for path in after if before.get(path) != after[path]}
+    assert changed == {"new-1.0.0.yaml"}
+
+
 LEVELS = {"baseline": 7, "host-network": 6, "privileged": 1}
 
 

@@ -73,14 +73,6 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
         domains=domains,
         node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
         folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-        charts=sorted(
-            {
-                source.folder
-                for chart in config.charts.values()
-                for source in chart.sources()
-                if source.folder
-            }
-        ),
         repository=config.repo_settings,
         branch=MAIN_BRANCH,
     )
