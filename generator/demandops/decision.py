@@ -283,8 +283,8 @@ def changeset_of_edit(
 def faults_of_edit(before: World, after: World, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
     """Yield why claims that a person wrote are refused, each located in the claim's file.
 
-    A claim must be permitted, within the quotas and without a topic clash, as if a demand asked for
-    it. An edit that only takes requesters away is always allowed, like a release.
+    A claim must be valid, permitted, within the quotas and without a topic clash, as if a demand
+    asked for it. An edit that only takes requesters away is always allowed, like a release.
 
     Args:
         before, after: the world before and after the edit.
@@ -294,8 +294,12 @@ def faults_of_edit(before: World, after: World, changes: Iterable[ClaimChange]) 
         claim = change.after
         if claim is None or _only_reduces(change):
             continue
-        not_permitted = permission.faults(restoration.request_for(claim), after.config)
-        for each in chain(not_permitted, quota.faults(before, after, Changes((change,)))):
+        wanted, config = restoration.request_for(claim), after.config
+        malformed = list(admission.faults(wanted, config))
+        allowed = chain(
+            permission.faults(wanted, config), quota.faults(before, after, Changes((change,)))
+        )
+        for each in malformed or allowed:
             yield each.within(claim_file.path_of(claim.key))
         yield from topic_clash.faults_of_claim(claim, before, after)
 

@@ -7,6 +7,7 @@ faults that were found together, so that a person can fix a file or a request in
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -16,6 +17,7 @@ from demandops.quoting import clipped, one_line
 MOST_FAULTS = 100
 """How many faults of one file, or of a request, are listed; the others are counted."""
 _LONGEST_FIELD = 2_000
+_COMPARED = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +138,26 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     Return an empty string if no words are known.
     """
     names = sorted(known)
-    close = get_close_matches(word, names, n=1)
+    close = get_close_matches(word, _beside(word, names), n=1)
     if close:
         return f"; did you mean '{close[0]}'?"
     if not names:
         return ""
     listed = ", ".join(names[:most]) + (", …" if len(names) > most else "")
     return f"; known: {listed}"
+
+
+def _beside(word: str, names: list[str]) -> list[str]:
+    """Return the names beside a word in the alphabet, read from either end.
+
+    To compare a word with thousands of names takes long, and one file or goal may have thousands of
+    unknown words.
+    """
+    if len(names) <= _COMPARED:
+        return names
+    found = []
+    for order in (slice(None), slice(None, None, -1)):
+        ordered = sorted(name[order] for name in names)
+        at = bisect(ordered, word[order])
+        found += [name[order] for name in ordered[max(0, at - 3) : at + 3]]
+    return found

@@ -58,12 +58,16 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     version: str = ""
     deliver: tuple[Delivery, ...] = ()
+    _further: dict[tuple[str, str], list[InputTopic]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     def __eq__(self, other: object) -> bool:
         """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
         if not isinstance(other, Application):
             return NotImplemented
-        same = all(getattr(self, one.name) == getattr(other, one.name) for one in fields(self))
+        compared = (one.name for one in fields(self) if one.compare)
+        same = all(getattr(self, name) == getattr(other, name) for name in compared)
         return same and _exact(self.parameters) == _exact(other.parameters)
 
     @property
@@ -93,6 +97,17 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             lambda one: (one.topic, one.source) == (topic, source), islice(inputs, start, None)
         )
         return tuple(same)
+
+    def further_inputs(self, role: str, part: str) -> list[InputTopic]:
+        """Return the further topics in a role that are called ``part`` in names of topics.
+
+        The names are made once, because each service for a further topic asks for one.
+        """
+        if not self._further:
+            for known, topic in self.all_inputs():
+                if topic.further:
+                    self._further.setdefault((known, topic.part), []).append(topic)
+        return self._further.get((role, part), [])
 
     def needs(self, node: str) -> bool:
         """Return whether the application depends on a node."""

@@ -168,9 +168,7 @@ class Ledger:
     def further_topics(self, role: str, part: str) -> Iterator[InputTopic]:
         """Yield the further topics of sources that are called ``part`` in names of topics."""
         for claim in self._claims("further", part):
-            for topic in claim.application.inputs.get(role, ()):
-                if topic.further and topic.part == part:
-                    yield topic
+            yield from claim.application.further_inputs(role, part)
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
 import yaml
-from demandops.errors import Refused
+from demandops import naming
+from demandops.errors import Refused, suggestion
 
 from tests.kit.config import brokers, skeleton
 from tests.kit.goals import (
@@ -18,6 +20,7 @@ from tests.kit.goals import (
     connection,
     goal,
     perception,
+    put,
 )
 from tests.kit.memory import MemoryRepo
 
@@ -239,3 +242,24 @@ def test_of_many_faults_the_first_are_told_and_the_others_counted() -> None:
     assert found[-1] == ": has 200 more faults"
     (found, *_) = MemoryRepo().faults(goal([]) | {"x" * 10**6: 1})
     assert len(found) < 10_000
+
+
+def test_similar_names_are_found_soon_however_many_words_are_unknown() -> None:
+    names = [f"vehicle-{number:04}" for number in range(1000)]
+    before = time.thread_time()
+    found = {suggestion(f"vehicel-{number:04}", names) for number in range(0, 1000, 2)}
+    assert time.thread_time() - before < 5  # it was half a minute
+    assert len(found) > 100
+    for word in ("vehicle-0123x", "xehicle-0123", "vehicle-123"):
+        assert suggestion(word, names) == "; did you mean 'vehicle-0123'?"
+
+
+def test_names_are_made_once_for_each_of_many_topics() -> None:
+    count, repo = 300, MemoryRepo()
+    clouds = [{"topic": f"/c{number}", "source": "vehicle00"} for number in range(count)]
+    made = put("many")
+    made["applications"][0]["inputs"] = {"point_cloud": clouds}
+    before = naming.topic_part.cache_info()
+    assert repo.send(made).outcome == "booked"
+    after = naming.topic_part.cache_info()
+    assert after.hits + after.misses - before.hits - before.misses < 50 * count
