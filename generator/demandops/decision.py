@@ -28,7 +28,7 @@ from demandops.ledger.ledger import Changes, ClaimChange, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
-from demandops.plan import implied_connections, output_topics
+from demandops.plan import implied_connections, output_topics, placement
 from demandops.plan.checks import denial, quota, topic_clash, version_difference
 from demandops.plan.flows import flows
 from demandops.plan.overrides.claim_overrides import (
@@ -107,6 +107,12 @@ class Decision:
     approval: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped the rendered files."""
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """Where the generator placed applications whose node the demand does not name, and why."""
+        listed = self.request.demanded
+        return tuple(f"application '{one.held.id}' {one.placed}" for one in listed if one.placed)
 
     @property
     def lease_s(self) -> int | None:
@@ -228,9 +234,11 @@ def admit(
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
         _refuse_large(parsed, config)
-        request = permission.with_lease_terms(parsed, config)
+        request, not_placed = placement.with_chosen_nodes(parsed, ledger, config)
+        request = permission.with_lease_terms(request, config)
         request = output_topics.with_further_topics(request, ledger, config)
         request = implied_connections.with_implied_connections(request, ledger, config)
+        faults += not_placed
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:

@@ -23,10 +23,7 @@ ELSEWHERE = {
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
 """Where a fault may also be when the mistake is here."""
-NOT_SUPPORTED = (
-    *("DemandGoal.priority", "DemandGoal.positions", "GoalPosition."),
-    *("GoalApplication.place", "GoalPlace."),
-)
+NOT_SUPPORTED = ("DemandGoal.priority",)
 """Fields that no valid goal may set yet."""
 
 
