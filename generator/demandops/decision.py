@@ -229,6 +229,7 @@ def admit(
         Refused: with every fault, of form and of content.
     """
     config, ledger = state.config, state.ledger
+    not_placed: list[Fault] = []
     if isinstance(goal, dict) and Decommission.is_goal(goal):
         return Decommission.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
@@ -238,7 +239,6 @@ def admit(
         request = permission.with_lease_terms(request, config)
         request = output_topics.with_further_topics(request, ledger, config)
         request = implied_connections.with_implied_connections(request, ledger, config)
-        faults += not_placed
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
@@ -249,7 +249,7 @@ def admit(
     request = admission.with_chosen_types(request, config, ledger.connection)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
-    content = [*admission.faults(request, config), *permission.faults(request, config)]
+    content = [*not_placed, *admission.faults(request, config), *permission.faults(request, config)]
     # do not report as missing what could not be read
     unread = bool(malformed & {"apps", "applications", "connections"})
     faults += [

@@ -68,6 +68,27 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
     assert decision.warnings == ()
 
 
+def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
+    def said(start: str) -> str:
+        return block("placement.md", start).strip()
+
+    nodes = yaml.safe_load(configuration()["inventory/nodes.yaml"])
+    listed = yaml.safe_load(block("placement.md", "nodes:\n"))["nodes"]
+    new = {node["id"] for node in listed}
+    nodes["nodes"] = [one for one in nodes["nodes"] if one["id"] not in new] + listed
+    repo = MemoryRepo({"inventory/nodes.yaml": yaml.safe_dump(nodes)})
+    goal = yaml.safe_load(block("placement.md", "apiVersion: demandops/v1\nkind: Dem"))
+    start = "application 'object_detection_fusion' is placed on 'edge-north', "
+    assert repo.send(goal).placed == (said(start + "the nearest"),)
+    goal["positions"][0]["y"] = 0
+    again = repo.send(goal)
+    assert (again.outcome, again.placed) == ("unchanged", (said(start + "where"),))
+    goal["applications"][0]["place"]["capabilities"].append("fpga")
+    with pytest.raises(Refused) as refused:
+        repo.decide(goal)
+    assert refusal_text(refused.value) == said("no-node:")
+
+
 def test_the_deployment_request_of_the_documentation_runs() -> None:
     goal = yaml.safe_load(block("demand.md", "id: station00/collective-perception"))
     decision = decided(state(), goal)

@@ -141,7 +141,7 @@ _DEEPEST = 50
 """The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
 _LONGEST_KEY = 128
 """The longest key in a parameter's value: YAML reads 1024 characters, escapes included."""
-_LISTS_OF_TEXT = ("requesters",)
+_LISTS_OF_TEXT = ("requesters", "labels", "capabilities")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
@@ -210,17 +210,21 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
     """Return what a place requires; ``None`` if it is empty."""
-    labels = []
-    for index, label in enumerate(place.labels):
-        key, equals, value = label.partition("=")
-        if key and equals:
-            labels.append((key, value))
-        else:
-            message = f"{quoted(label)} is not a label; write it as key=value"
-            faults.append(fault(f"{where}.labels[{index}]", message))
     if place == GoalPlace():
         return None
-    return Requirement(place.role, tuple(labels), tuple(place.capabilities))
+    told = {found.field for found in faults}
+    labels = [tuple(label.split("=", 1)) for label in place.labels]
+    for index, label in enumerate(labels):
+        field = f"{where}.labels[{index}]"
+        if (len(label) < 2 or not label[0]) and field not in told:
+            message = f"{quoted(place.labels[index])} is not a label; write it as key=value"
+            faults.append(fault(field, message))
+    for index, capability in enumerate(place.capabilities):
+        field = f"{where}.capabilities[{index}]"
+        if not capability and field not in told:
+            faults.append(fault(field, "is empty; name a capability, or leave it out"))
+    pairs = tuple((label[0], label[1]) for label in labels if len(label) > 1)
+    return Requirement(place.role, pairs, tuple(place.capabilities))
 
 
 def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Position]:

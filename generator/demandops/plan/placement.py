@@ -165,7 +165,7 @@ class _Choice:
             message = f"no node has the role {quoted(role)}{suggestion(role, roles)}"
             return self.one.fault("place", message, code="no-node")
         misses: list[tuple[int, tuple[float, int, str], str]] = []
-        for node in self.config.nodes.values():
+        for node in self.config.nodes_by_role.get(role, ()):
             lacks = list(_lacks(node, self.requirement))
             reasons = [f"lacks {_joined(lacks)}"] if lacks else []
             reasons += filter(None, [self._closed(node)])
@@ -173,12 +173,13 @@ class _Choice:
                 domain = self.config.domain_of[node.id].name
                 reasons.append(f"is in access domain '{domain}', which does not permit it")
             text = f"'{node.id}' {_joined(reasons)}"
-            misses.append((len(lacks), self._rank(node, centre), text))
+            count = len(lacks) + len(reasons) - bool(lacks)
+            misses.append((count, self._rank(node, centre), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
         more = [f"{len(misses) - len(shown)} more do not"] if len(misses) > len(shown) else []
         message = (
-            f"no node fits: {'; '.join([*shown, *more])}; ask for less, or have {NODES_FILE} "
-            "changed"
+            f"no node fits: {'; '.join([*shown, *more]) or 'there is none'}; ask for less, or have "
+            f"{self.config.place_of(NODES_FILE)} changed"
         )
         return self.one.fault("place", message, code="no-node")
 
