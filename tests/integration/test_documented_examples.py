@@ -23,7 +23,7 @@ from demandops.render.output_check import check_files
 from demandops.staterepo import skeleton
 from demandops.staterepo.history import commit_message
 
-from tests.kit.config import configuration, edited
+from tests.kit.config import brokers, configuration, edited
 from tests.kit.memory import MemoryRepo
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -76,7 +76,7 @@ def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
     listed = yaml.safe_load(block("placement.md", "nodes:\n"))["nodes"]
     new = {node["id"] for node in listed}
     nodes["nodes"] = [one for one in nodes["nodes"] if one["id"] not in new] + listed
-    repo = MemoryRepo({"inventory/nodes.yaml": yaml.safe_dump(nodes)})
+    repo = MemoryRepo({"inventory/nodes.yaml": yaml.safe_dump(nodes)} | brokers(*sorted(new)))
     goal = yaml.safe_load(block("placement.md", "apiVersion: demandops/v1\nkind: Dem"))
     start = "application 'object_detection_fusion' is placed on 'edge-north', "
     assert repo.send(goal).placed == (said(start + "the nearest"),)
