@@ -83,6 +83,7 @@ def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
     goal["positions"][0]["y"] = 0
     again = repo.send(goal)
     assert (again.outcome, again.placed) == ("unchanged", (said(start + "where"),))
+    goal["positions"][0]["y"] = 1800
     goal["applications"][0]["place"]["capabilities"].append("fpga")
     with pytest.raises(Refused) as refused:
         repo.decide(goal)
