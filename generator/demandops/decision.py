@@ -28,7 +28,7 @@ from demandops.ledger.ledger import Changes, ClaimChange, Ledger, changes_on
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.world import World
-from demandops.plan import implied_connections, output_topics
+from demandops.plan import implied_connections, output_topics, placement
 from demandops.plan.checks import denial, quota, topic_clash, version_difference
 from demandops.plan.flows import flows
 from demandops.plan.overrides.claim_overrides import (
@@ -107,6 +107,12 @@ class Decision:
     approval: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped the rendered files."""
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """Where the generator placed applications whose node the demand does not name, and why."""
+        listed = self.request.demanded
+        return tuple(f"application '{one.held.id}' {one.placed}" for one in listed if one.placed)
 
     @property
     def lease_s(self) -> int | None:
@@ -223,12 +229,14 @@ def admit(
         Refused: with every fault, of form and of content.
     """
     config, ledger = state.config, state.ledger
+    not_placed: list[Fault] = []
     if isinstance(goal, dict) and Decommission.is_goal(goal):
         return Decommission.parse(goal)
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
         _refuse_large(parsed, config)
-        request = permission.with_lease_terms(parsed, config)
+        request, not_placed = placement.with_chosen_nodes(parsed, ledger, config)
+        request = permission.with_lease_terms(request, config)
         request = output_topics.with_further_topics(request, ledger, config)
         request = implied_connections.with_implied_connections(request, ledger, config)
     else:
@@ -241,7 +249,7 @@ def admit(
     request = admission.with_chosen_types(request, config, ledger.connection)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
-    content = [*admission.faults(request, config), *permission.faults(request, config)]
+    content = [*not_placed, *admission.faults(request, config), *permission.faults(request, config)]
     # do not report as missing what could not be read
     unread = bool(malformed & {"apps", "applications", "connections"})
     faults += [

@@ -99,7 +99,8 @@ class DemandAdapter(DeploymentRequestAdapter):
 def _text(outcome: Receipt | BaseException) -> str:
     if isinstance(outcome, Receipt):
         warnings = (f"warning: {one_line(warning)}" for warning in outcome.warnings)
-        return "\n".join([f"{outcome.outcome}: {outcome.commit}", *warnings, *_not_held(outcome)])
+        head = [f"{outcome.outcome}: {outcome.commit}", *map(one_line, outcome.placed)]
+        return "\n".join([*head, *warnings, *_not_held(outcome)])
     if isinstance(outcome, InvalidInput):
         return refusal_text(outcome)
     if isinstance(outcome, Withdrawn):

@@ -30,7 +30,7 @@ NO_REVISION = (
     "error: 'nope' is neither a commit of the state repo nor a time; `demandops log` lists the "
     "commits, a time is written like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h\n"
 )
-REQUEST_KEYS = ["index", "request", "outcome", "commit", "faults", "warnings", "not_held"]
+REQUEST_KEYS = ["index", "request", "outcome", "commit", "faults", "warnings", "not_held", "placed"]
 NO_CARRIER = (
     "application 'edge/object_detection_fusion': no connection carries point_cloud "
     "/vehicles/vehicle00/drivers/lidar/pointcloud of 'vehicle00' to 'edge'"
@@ -143,6 +143,7 @@ class TestRequest:
             "faults": [],
             "warnings": [NO_CARRIER],
             "not_held": [],
+            "placed": [],
         }
         assert (refused["outcome"], refused["commit"]) == ("refused", None)
         assert refused["faults"] == [

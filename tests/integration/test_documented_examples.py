@@ -23,7 +23,7 @@ from demandops.render.output_check import check_files
 from demandops.staterepo import skeleton
 from demandops.staterepo.history import commit_message
 
-from tests.kit.config import configuration, edited
+from tests.kit.config import brokers, configuration, edited
 from tests.kit.memory import MemoryRepo
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -66,6 +66,28 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
     assert list(books["connections"]) == ["derived/vehicle00/edge"]
     assert decision.lease_s == 600
     assert decision.warnings == ()
+
+
+def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
+    def said(start: str) -> str:
+        return block("placement.md", start).strip()
+
+    nodes = yaml.safe_load(configuration()["inventory/nodes.yaml"])
+    listed = yaml.safe_load(block("placement.md", "nodes:\n"))["nodes"]
+    new = {node["id"] for node in listed}
+    nodes["nodes"] = [one for one in nodes["nodes"] if one["id"] not in new] + listed
+    repo = MemoryRepo({"inventory/nodes.yaml": yaml.safe_dump(nodes)} | brokers(*sorted(new)))
+    goal = yaml.safe_load(block("placement.md", "apiVersion: demandops/v1\nkind: Dem"))
+    start = "application 'object_detection_fusion' is placed on 'edge-north', "
+    assert repo.send(goal).placed == (said(start + "the nearest"),)
+    goal["positions"][0]["y"] = 0
+    again = repo.send(goal)
+    assert (again.outcome, again.placed) == ("unchanged", (said(start + "where"),))
+    goal["positions"][0]["y"] = 1800
+    goal["applications"][0]["place"]["capabilities"].append("fpga")
+    with pytest.raises(Refused) as refused:
+        repo.decide(goal)
+    assert refusal_text(refused.value) == said("no-node:")
 
 
 def test_the_deployment_request_of_the_documentation_runs() -> None:

@@ -71,6 +71,7 @@ def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
         "faults": [],
         "warnings": [],
         "not_held": [],
+        "placed": [],
         "proposal": {"branch": branch, "link": ""},
     }
 

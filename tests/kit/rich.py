@@ -83,7 +83,10 @@ nodes:
     wan: {host: 192.0.2.1, firstPort: 20000, lastPort: 20099, transport: udp}
     types: {/vehicles/vehicle00/ego_data: perception_msgs/msg/EgoData}
     bridged: {edge: [/clock]}
-  - {id: edge, type: edge, cluster: c-its}
+    capabilities: [lidar]
+    position: {x: 12.5, y: -3.0}
+    drained: false
+  - {id: edge, type: edge, cluster: c-its, capabilities: [gpu]}
   - {id: cloud, type: cloud, cluster: depot}
 """
 _BROKERS = """
@@ -325,6 +328,8 @@ request: patrol-1
 requesters: [vehicle00]
 lease: 10m
 answer: pushed
+positions:
+  - {node: edge, x: 1.5, y: 2.0}
 applications:
   - id: main
     type: object-detection-fusion
@@ -339,7 +344,7 @@ applications:
       - {output: object-fusion.raw_objects, node: vehicle00, topic: /raw}
   - id: second
     type: object-detection-fusion
-    node: edge
+    place: {role: edge, labels: [node_id=edge], capabilities: [gpu]}
     inputs: {point_cloud: [{topic: /points, source: vehicle00}]}
     parameters_json: {rate: "7"}
 connections:

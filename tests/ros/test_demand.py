@@ -94,10 +94,14 @@ def test_a_refusal_names_code_field_and_remedy(
     assert caught.value.code == "unknown-application"
     assert "applications[0].type: 'recoder' is not a known application type" in str(caught.value)
     assert "applications[0].node: 'egde' is not in inventory/nodes.yaml" in str(caught.value)
-    later = {"place": {"role": "edge"}, "deliver": [{"output": "driver.bag", "node": "edge"}]}
+    later = {
+        "node": "",
+        "place": {"role": "egde"},
+        "deliver": [{"output": "driver.bag", "node": "edge"}],
+    }
     with pytest.raises(DemandError) as caught:
         vehicle.put("refused", [RECORDER | later])
-    assert "applications[0].place: is not supported" in str(caught.value)
+    assert "applications[0].place: no node has the role 'egde'" in str(caught.value)
     assert "applications[0].deliver[0].output: 'driver.bag' is not an output" in str(caught.value)
     with pytest.raises(DemandError) as caught:
         vehicle.release("refused")
@@ -111,6 +115,17 @@ def test_a_refusal_names_code_field_and_remedy(
     assert shared.bookkeeping()["connections"]["refused"]["topics"] == {
         topic: ["vehicle00"] for topic in ("/a", "/b")
     }
+
+
+def test_a_node_is_chosen_by_the_place_in_the_message(
+    shared: Served, vehicle: DemandClient
+) -> None:
+    place = {"role": "cloud", "labels": ["node_id=cloud"], "capabilities": []}
+    item = {key: value for key, value in RECORDER.items() if key != "node"} | {"place": place}
+    assert vehicle.put("placed", [item]).outcome == "booked"
+    services = shared.bookkeeping()["services"].values()
+    assert "cloud" in {entry["node"] for entry in services if entry["service"] == "recorder"}
+    assert vehicle.release("placed").outcome == "released"
 
 
 def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: DemandClient) -> None:

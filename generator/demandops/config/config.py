@@ -98,6 +98,8 @@ class Config:
         init=False, compare=False, repr=False
     )
     """The nodes by what their id becomes in names of topics, which several may share."""
+    nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
+    """The nodes of each type, sorted by id; an empty name stands for all."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The roles of which a service of any appdef runs once for each topic, sorted."""
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
@@ -112,6 +114,12 @@ class Config:
             part = naming.topic_part(id)
             found[part] = (*found.get(part, ()), id)
         object.__setattr__(self, "nodes_by_topic_part", found)
+        by_role: dict[str, list[Node]] = {}
+        for _, node in sorted(self.nodes.items()):
+            for role in ("", node.type):
+                by_role.setdefault(role, []).append(node)
+        by_role_sorted = {role: tuple(nodes) for role, nodes in by_role.items()}
+        object.__setattr__(self, "nodes_by_role", by_role_sorted)
         services = (one for services in self.services.values() for one in services.values())
         roles = tuple(sorted({one.root for one in services if one.root}))
         object.__setattr__(self, "roles_with_services", roles)

@@ -1,7 +1,7 @@
 """The inventory: nodes, clusters and brokers.
 
-A node is a vehicle, a roadside station, an edge or a cloud server. It belongs to one cluster and
-one access domain. A node selector identifies it in its cluster.
+A node is a vehicle, a roadside station, an edge or a cloud server, or what else runs services. It
+belongs to one cluster and one access domain. A node selector identifies it in its cluster.
 """
 
 from __future__ import annotations
@@ -145,9 +145,21 @@ class Ros(CamelModel):
     rmw: Rmw = "rmw_cyclonedds_cpp"
 
 
+Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
+
+
+class Position(CamelModel):
+    """A place in metres, in the map frame that all positions of a state repo share."""
+
+    x: Coordinate
+    y: Coordinate
+
+
 class Node(CamelModel):
     """A C-ITS entity that runs services.
 
+    ``type`` is its role, any word; ``capabilities`` are words for what it has. A demand may ask for
+    them instead of the node (:mod:`demandops.plan.placement`), but gets no ``drained`` one then.
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
     The access domain's ROS domain replaces that of ``ros``, if it has one.
     ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
@@ -158,7 +170,7 @@ class Node(CamelModel):
     """
 
     id: NodeId
-    type: Literal["vehicle", "station", "edge", "cloud"]
+    type: Word
     cluster: DnsLabel
     selector: dict[LabelKey, LabelValue] | None = None
     topics: dict[Word, Topic] = Field(default_factory=dict)
@@ -170,6 +182,9 @@ class Node(CamelModel):
     wan: Wan | None = None
     types: dict[Topic, MessageType] = Field(default_factory=dict)
     bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
+    capabilities: Items[Word] = ()
+    position: Position | None = None
+    drained: bool = False
 
     @model_validator(mode="after")
     def _findable(self) -> Node:

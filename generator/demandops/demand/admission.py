@@ -33,6 +33,9 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         yield from _id("id" if request.is_reference else "request", request.id)
     if not request.is_reference:
         yield from _own_fields(request)
+    for index, node in enumerate(request.positions if isinstance(request, Put) else ()):
+        yield from _id(f"positions[{index}].node", node)
+        yield from _node(f"positions[{index}].node", node, config)
     if not request.demanded and not isinstance(request, Release | Renew):
         yield fault(
             "id" if request.is_reference else "applications",
@@ -42,7 +45,10 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
     for one in request.demanded:
         found = [*_id("id", one.held.id), *_requesters(one.requesters)]
         if isinstance(one.held, Application):
-            found += _application(one.held, config, request.adds_claims)
+            of_app = _application(one.held, config, request.adds_claims)
+            # without a node, its placement has a fault of its own
+            placed = one.held.node or one.requirement is None
+            found += [each for each in of_app if placed or each.field != "node"]
         else:
             found += _connection(one.held, config, request.adds_claims)
         yield from (replace(each, field=one.place(each.field)) for each in found)
@@ -51,11 +57,13 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
     """Yield a fault if the request is larger than the state repo's limits allow."""
     items = len(request.demanded) + len(request.own_requesters)
+    items += len(request.positions) if isinstance(request, Put) else 0
     for one in request.demanded:
         held = one.held
         items += len(one.requesters) if request.is_reference else 0
         if isinstance(held, Application):
             items += len(held.all_inputs()) + len(held.deliver)
+            items += one.requirement.size if one.requirement else 0
         else:
             items += len(held.topics)
         if isinstance(held, Application) and held.parameters:

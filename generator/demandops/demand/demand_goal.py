@@ -17,12 +17,20 @@ from pydantic import Field, PlainValidator
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel
+from demandops.config.inventory import Coordinate, Position
 from demandops.config.policy import seconds_of
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
 from demandops.demand.application import Application, Delivery, InputTopic
-from demandops.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
+from demandops.demand.demand_request import (
+    Demanded,
+    DemandRequest,
+    Put,
+    Release,
+    Renew,
+    Requirement,
+)
 from demandops.demand.goal_validation import is_unicode, parse_valid_part
 from demandops.errors import Fault, fault
 from demandops.identifiers import absolute_topic
@@ -39,7 +47,7 @@ class GoalTopic(FrozenModel):
 
 
 class GoalPlace(FrozenModel):
-    """What the node of an application must have, if the goal names none."""
+    """What the node of an application must have; ``labels`` are ``key=value``."""
 
     role: str = ""
     labels: list[str] = Field(default_factory=list)
@@ -55,11 +63,11 @@ class GoalDelivery(FrozenModel):
 
 
 class GoalPosition(FrozenModel):
-    """Where a node is, in metres in the map frame of the inventory."""
+    """Where a node is that has no position in the inventory, in metres in its map frame."""
 
     node: str = ""
-    x: float = 0.0
-    y: float = 0.0
+    x: Coordinate = 0.0
+    y: Coordinate = 0.0
 
 
 class GoalApplication(FrozenModel):
@@ -133,7 +141,7 @@ _DEEPEST = 50
 """The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
 _LONGEST_KEY = 128
 """The longest key in a parameter's value: YAML reads 1024 characters, escapes included."""
-_LISTS_OF_TEXT = ("requesters",)
+_LISTS_OF_TEXT = ("requesters", "labels", "capabilities")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
@@ -155,7 +163,8 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         "own_requesters": requesters,
     }
     lease_s = _lease(goal.lease, faults)
-    faults += _not_supported(goal)
+    if goal.priority:
+        faults.append(fault("priority", "is not supported: no demand waits; leave it out"))
     if goal.operation != "put":
         faults += _not_of_a_put(goal, lease_s)
         return (Release if goal.operation == "release" else Renew)(**head), faults
@@ -165,6 +174,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
             requesters,
             partial(_field, f"applications[{index}]"),
             connect=app.connect,
+            requirement=_requirement(f"applications[{index}].place", app.place, faults),
         )
         for index, app in enumerate(goal.applications)
     )
@@ -172,7 +182,9 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         Demanded(_connection(connection), requesters, partial(_field, f"connections[{index}]"))
         for index, connection in enumerate(goal.connections)
     )
-    return Put(**head, demanded=(*applications, *connections), lease_s=lease_s), faults
+    positions = _positions(goal.positions, faults)
+    demanded = (*applications, *connections)
+    return Put(**head, demanded=demanded, lease_s=lease_s, positions=positions), faults
 
 
 def _field(item: str, path: str) -> str:
@@ -192,18 +204,37 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
             f"a {goal.operation} names only its demand; to release a part, put the demand without "
             "it",
         )
+    if goal.positions:
+        yield fault("positions", f"a {goal.operation} places nothing; leave them out")
 
 
-def _not_supported(goal: DemandGoal) -> Iterator[Fault]:
-    """Yield a fault for each field that this version cannot carry out."""
-    for name in ("priority", "positions"):
-        if getattr(goal, name):
-            yield fault(name, "is not supported: this version chooses no nodes; leave it out")
-    for index, app in enumerate(goal.applications):
-        where = f"applications[{index}]"
-        if app.place != GoalPlace():
-            message = "is not supported: this version chooses no nodes; name the node"
-            yield fault(f"{where}.place", message)
+def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
+    """Return what a place requires; ``None`` if it is empty."""
+    if place == GoalPlace():
+        return None
+    told = {found.field for found in faults}
+    labels = [tuple(label.split("=", 1)) for label in place.labels]
+    for index, label in enumerate(labels):
+        field = f"{where}.labels[{index}]"
+        if (len(label) < 2 or not label[0]) and field not in told:
+            message = f"{quoted(place.labels[index])} is not a label; write it as key=value"
+            faults.append(fault(field, message))
+    for index, capability in enumerate(place.capabilities):
+        field = f"{where}.capabilities[{index}]"
+        if not capability and field not in told:
+            faults.append(fault(field, "is empty; name a capability, or leave it out"))
+    pairs = tuple((label[0], label[1]) for label in labels if len(label) > 1)
+    return Requirement(place.role, pairs, tuple(place.capabilities))
+
+
+def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Position]:
+    found: dict[str, Position] = {}
+    for index, one in enumerate(listed):
+        if one.node in found:
+            message = f"{quoted(one.node)} has a position already; give it once"
+            faults.append(fault(f"positions[{index}].node", message))
+        found[one.node] = Position(x=one.x, y=one.y)
+    return found
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:

@@ -6,10 +6,11 @@ Goals of ROS actions and YAML files are parsed into these values, and
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeVar
 
+from demandops.config.inventory import Position
 from demandops.connections.connection import Connection
 from demandops.demand.application import Application
 from demandops.demand.lease import Term
@@ -27,6 +28,20 @@ def place_in(field: str) -> Place:
 
 
 @dataclass(frozen=True, slots=True)
+class Requirement:
+    """What the node of an application must have: its type, labels as pairs, capabilities."""
+
+    role: str = ""
+    labels: tuple[tuple[str, str], ...] = ()
+    capabilities: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """How many labels and capabilities it has."""
+        return len(self.labels) + len(self.capabilities)
+
+
+@dataclass(frozen=True, slots=True)
 class Demanded:
     """One application or connection that a request lists, and its requesters."""
 
@@ -38,6 +53,10 @@ class Demanded:
     """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
     note: str = ""
     """How it is carried, if not as the request says; a warning of the receipt."""
+    requirement: Requirement | None = None
+    """What the node of an application must have; it may be named as well."""
+    placed: str = ""
+    """Where the generator placed it and why, if the request names no node."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault of a field of this item."""
@@ -97,9 +116,14 @@ class Shutdown(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Put(DemandRequest):
-    """Our own goal: sets what its demand holds. ``lease_s`` is the wanted lease in seconds."""
+    """Our own goal: sets what its demand holds.
+
+    ``lease_s`` is the wanted lease in seconds. ``positions`` says where nodes are that have no
+    position in the inventory.
+    """
 
     lease_s: int | None = None
+    positions: Mapping[str, Position] = field(default_factory=dict)
 
     operation = "put"
     adds_claims = True

@@ -69,6 +69,13 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
     return app.node, *(one.source for role in sorted(roles) for one in app.inputs.get(role, ()))
 
 
+def may_place(one: Demanded, appdef: str, node: str, config: Config) -> bool:
+    """Return whether the requesters may have an application of this type on a node."""
+    domain = config.domain_of.get(node)
+    access: Access = [("applications", appdef), ("nodes", node)]
+    return domain is not None and not any(_not_allowed(one, domain, access))
+
+
 def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
     """Yield a fault for each requester to whom no rule of the domain grants the access."""
     rules = domain.rules or _NO_RULES

@@ -79,7 +79,7 @@ class Ledger:
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends. They give the next end without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
-    ``shutdowns`` are the recent ones.
+    ``shutdowns`` are the recent ones. ``applications_on`` counts the applications of each node.
     """
 
     claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
@@ -87,6 +87,7 @@ class Ledger:
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
     ended: Mapping[str, str] = field(default_factory=dict)
     shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
+    applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -289,7 +290,10 @@ class Ledger:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
             if entry[0] == _ENDS:
                 minutes = minutes.insert(entry[1])
-        return Ledger(claims, index, minutes, self.ended, self.shutdowns)
+        counts = self.applications_on
+        if key.subject.kind is SubjectKind.APPLICATION:
+            counts = _counted(counts, self.first_claim(key.subject), held[0] if held else None)
+        return Ledger(claims, index, minutes, self.ended, self.shutdowns, counts)
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
         """Return the ledger without these claims."""
@@ -313,6 +317,18 @@ class Ledger:
     def __len__(self) -> int:
         """Return how many claims there are."""
         return sum(len(claims) for claims in self.claims.values())
+
+
+def _counted(
+    counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
+) -> HashTrieMap[str, int]:
+    """Return how many applications each node has, after the first claim on one changed."""
+    old, new = (claim.application.node if claim else None for claim in (before, after))
+    for node, change in ((old, -1), (new, 1)) if old != new else ():
+        if node is not None:
+            count = (counts.get(node) or 0) + change
+            counts = counts.insert(node, count) if count else counts.remove(node)
+    return counts
 
 
 def index_entries(claim: Claim | None) -> set[Entry]:

@@ -62,7 +62,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
                 field = f"deliver[{flow.delivery}]"
             place = partial(_input_field, one.place(field))
             ends = (needed.id, *needed.nodes)
-            first.setdefault(ends, replace(one, held=needed, place=place, connect="none"))
+            first.setdefault(ends, Demanded(needed, one.requesters, place, one.term))
             routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
     demanded = []
     for one in request.demanded:

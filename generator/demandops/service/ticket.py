@@ -36,6 +36,7 @@ class Receipt:
     ``commit`` is the tip if the demand changed nothing. ``lease_s`` is the lease in seconds, None
     without one. ``targets`` are the releases that the demand needs or removes, if the generator was
     asked for them. ``changes`` are the changed claims; empty if an earlier run published them.
+    ``placed`` says which nodes the generator chose, and why.
     """
 
     operation: str
@@ -44,6 +45,7 @@ class Receipt:
     commit: str
     warnings: tuple[str, ...] = ()
     not_held: tuple[str, ...] = ()
+    placed: tuple[str, ...] = ()
     lease_s: int | None = None
     targets: tuple[Target, ...] = ()
     changes: tuple[ClaimChange, ...] = ()
@@ -126,6 +128,7 @@ def receipt_of(
         commit=commit,
         warnings=decision.warnings,
         not_held=decision.changes.not_held,
+        placed=decision.placed,
         lease_s=decision.lease_s,
         targets=targets,
         changes=decision.changes.claims,

@@ -130,6 +130,8 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "ports in the wrong order": (
         NODES, V1, V1 + "    wan: {host: 192.0.2.1, firstPort: 3000, lastPort: 2000}\n",
     ),
+    "a position off the map": (NODES, V1, V1 + "    position: {x: 1.0e+9}\n"),
+    "a role of two words": (NODES, "type: station", "type: road station"),
     "a message type without its package": (NODES, V1, V1 + "    types: {/a: String}\n"),
     "topics that are bridged to a node that does not exist": (
         NODES, V1, V1 + "    bridged: {egde: [/a]}\n",
@@ -287,11 +289,13 @@ MISTAKES: dict[str, Mapping[str, str | None]] = {
         CLUSTERS: "apiVersion: demandops/v1\nkind: Clusters\nclusters: [{name: west}]\n"
     },
     "several faults of one file": {
-        NODES: skeleton()[NODES].replace("type: vehicle", "type: car").replace("id: edge", "id: 5")
+        NODES: skeleton()[NODES]
+        .replace("type: vehicle", "type: A Car")
+        .replace("id: edge", "id: 5")
     },
     "a fault of form and one of meaning in a file": {
         NODES: "c-it".join(
-            skeleton()[NODES].replace("type: vehicle", "type: car", 1).rsplit("c-its", 1)
+            skeleton()[NODES].replace("type: vehicle", "type: A Car", 1).rsplit("c-its", 1)
         )
     },
     "a fault of form in one file and one of meaning in another": edited(

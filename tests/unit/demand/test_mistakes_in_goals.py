@@ -20,13 +20,11 @@ ELSEWHERE = {
     "shutdown": "apps[0].header.id",  # the shutdown finds no claim
     "connections[0].type": "connections[0].",  # another type has other rules
     "applications[0].parameters.rate": "parameters.rate",  # when it is merged, without its place
+    "applications[1].place": "applications[1].node",  # without both
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
 """Where a fault may also be when the mistake is here."""
-NOT_SUPPORTED = (
-    *("DemandGoal.priority", "DemandGoal.positions", "GoalPosition."),
-    *("GoalApplication.place", "GoalPlace."),
-)
+NOT_SUPPORTED = ("DemandGoal.priority",)
 """Fields that no valid goal may set yet."""
 
 

@@ -24,6 +24,14 @@ from tests.kit.goals import (
 )
 from tests.kit.memory import MemoryRepo
 
+
+def placed(place: Goal, node: str = "", application: str = "fusion") -> Goal:
+    """Return a demand that asks for a place for its application."""
+    made = put("d", "vehicle01")
+    made["applications"][0] |= {"place": place, "node": node, "id": application}
+    return made
+
+
 REFUSED: dict[str, Goal] = {
     "an application type that no definition has": goal([application(type=9)]),
     "an application without a type": goal(
@@ -85,6 +93,25 @@ REFUSED: dict[str, Goal] = {
     "a shutdown of which nothing is held": goal([application()], [connection()], shutdown=True),
     "an application without inputs": goal([application(clouds=[])]),
     "nothing": goal(),
+    "a place that no node has": placed(
+        {"role": "vehicle", "labels": ["a=b"], "capabilities": ["x"]}
+    ),
+    "a role that no node has": placed({"role": "egde"}),
+    "a label without a value, a capability without a name": placed(
+        {"labels": ["zone"], "capabilities": [""]}
+    ),
+    "a node without what the place asks for": placed({"role": "edge"}, node="cloud"),
+    "neither a node nor a place": placed({}),
+    "positions twice, and of an unknown node": placed({"role": "edge"})
+    | {"positions": [{"node": node, "x": 1, "y": 2} for node in ("edge", "egde", "edge")]},
+    "a priority, and positions of a release": {
+        "kind": "Demand",
+        "operation": "release",
+        "demand": "d",
+        "requesters": ["vehicle00"],
+        "priority": 1,
+        "positions": [{"node": "edge", "x": 1, "y": 2}],
+    },
     "two nodes for one application": goal([application(), application(node="cloud")]),
     "many faults, told in the order of the request": goal(
         [
@@ -105,6 +132,9 @@ CONTRADICTING: dict[str, Goal] = {
     "another broker": goal([], [connection(who=OTHER, broker="cloud")]),
     "another target for a topic that is carried": goal(
         [], [connection(who=OTHER, topics=["/new", CLOUD[0]], targets=["/new", "/other"])]
+    ),
+    "a place that its node does not have": placed(
+        {"role": "cloud"}, application="edge/object_detection_fusion"
     ),
     "several contradictions": goal([application(node="cloud")], [connection(broker="cloud")]),
     "a shutdown by another requester": goal([application(who=OTHER)], shutdown=True),

@@ -126,6 +126,7 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
         "faults": [],
         "warnings": [],
         "not_held": [],
+        "placed": [],
     } | more
 
 
@@ -188,7 +189,7 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
         return _refused(index, document, error)
     if not isinstance(result, Receipt):
         return _row(index, document.request_id, "proposed", proposal=result)
-    told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held")}
+    told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
     return _row(index, result.request_id, result.outcome, **told)
 
 
@@ -244,6 +245,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
                     console().print(f"  needs approval: {rule} requires it")
                 print_consequences(decision)
             more = {"warnings": decision.warnings, "not_held": decision.changes.not_held}
+            more |= {"placed": decision.placed}
             more |= {"approval": decision.approval} if decision.approval else {}
             rows.append(_row(index, decision.request.id, outcome, **more))
     return rows
@@ -262,6 +264,8 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
             if proposal is not None:
                 told = f"awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
             out.print(f"{title} {told}", soft_wrap=True)
+        for choice in row["placed"]:
+            out.print(f"  {choice}", soft_wrap=True)
         for warning in row["warnings"]:
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:

@@ -159,7 +159,8 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     title, verb = _VERBS["renew" if renewed else request.operation]
     named = "" if request.is_reference else f" of demand '{request.demand}'"
     why = f"request '{request.id}'{named}, received {time}, {verb} {what_of_whom}."
-    return f"{title} {subjects}", why
+    placed = "".join(f" {text[0].upper()}{text[1:]}." for text in decision.placed)
+    return f"{title} {subjects}", why + placed
 
 
 def _of_request(decision: Decision) -> list[tuple[str, str]]:
