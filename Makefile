@@ -11,9 +11,9 @@ GO_DIR := build/go-$(GO)
 # Slow, so other targets of the gate run them.
 PACKAGE_TESTS := tests/packages
 SIMULATION_TESTS := tests/simulation
-KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py
-# One more than there are cores: while a test waits for another process, a core is free.
-WORKERS := $(shell echo $$(($$(nproc) + 1)))
+KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
+# More than there are cores: while a test waits for another process, a core is free.
+WORKERS := $(shell echo $$(($$(nproc) + 2)))
 # Tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # Tests start many processes, and each would compile all modules anew.
