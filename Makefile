@@ -4,12 +4,14 @@ VENV   ?= .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.setup-done
 # Each target first checks what the system must give for it.
-SYSTEM := system-demo system-test system-faults system-e2e system-e2e-argocd
+SYSTEM := system-demo system-test system-page system-faults system-e2e system-e2e-argocd
 # Distributions have too old a Go, so the end-to-end tests bring this one unless PATH has it.
 GO     := 1.26
 GO_DIR := build/go-$(GO)
 # Slow, so other targets of the gate run them.
 PACKAGE_TESTS := tests/packages
+PAGE_TESTS := tests/page
+DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
 # More than there are cores: while a test waits for another process, a core is free.
@@ -21,7 +23,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-packages faults e2e e2e-argocd coverage check format fuzz golden bench bench-audit load simulate wheel clean
+.PHONY: help setup demo test test-packages page faults e2e e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate docs wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## Show what there is to make
@@ -36,7 +38,7 @@ setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 inte
 $(STAMP): pyproject.toml constraints.txt
 	@echo "setup: installing Python packages into $(VENV), about a minute"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ros,dev]'
+	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ros,dev,docs]'
 	@touch $@
 
 go:
@@ -54,10 +56,15 @@ demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eig
 
 test: system-test setup  ## Run all tests but the slow ones, which other targets run
 	@$(PY) -m pytest -n $(WORKERS) --dist worksteal tests \
-	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS) $(SIMULATION_TESTS) $(KILL_TESTS))
+	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS) $(PAGE_TESTS) $(DOCS_TESTS) \
+	    $(SIMULATION_TESTS) $(KILL_TESTS))
 
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
+
+# With FIGURES=1 it also writes the screenshots of the docs: docs/figures
+page: system-page setup  ## Look at the web page in a headless browser: every view, live, light, dark, on a phone
+	@$(PY) -m pytest -q $(PAGE_TESTS)
 
 # The core's tests need no Git: without_git forbids its import, and --confcutdir leaves conftest.py out.
 CORE := config decision demand ledger plan render
@@ -87,11 +94,17 @@ e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONF
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
 
-check: system-test setup  ## Format, lint, types, imports, test and test-packages
+# With FIGURES=1 it also draws the plots of the docs: docs/figures
+experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
+experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (docs/experiment.md)
+	@$(PY) -m tests.experiment $(EXPERIMENT)
+
+check: system-test setup  ## Format, lint, types, imports, docs, test and test-packages
 	@$(PY) -m ruff format --check .
 	@$(PY) -m ruff check .
 	@$(PY) -m mypy
 	@$(VENV)/bin/lint-imports --no-logo
+	@$(MAKE) --no-print-directory docs
 	@$(MAKE) --no-print-directory test
 	@$(MAKE) --no-print-directory test-packages
 
@@ -99,13 +112,19 @@ format: setup  ## Format the code and mend what the linter can
 	@$(PY) -m ruff format .
 	@$(PY) -m ruff check --fix .
 
-golden: setup  ## Write the golden folders anew; review the diff
+golden: setup  ## Write the golden folders and what follows from the charts anew; review the diff
 	@$(PY) -m tests.golden.write
+	@$(PY) -m tests.terminal.write
+	@$(PY) -m tests.unit.charts.write
 	@$(PY) -m tests.unit.messages
 
-bench: setup  ## Measure what a commit costs, beside the floor, and how a demand's cost grows
+bench: system-page setup  ## Measure what a commit costs beside the floor, how a demand's cost grows, the event detector and the page
 	@$(PY) -m tests.benchmarks.commits
 	@$(PY) -m tests.benchmarks.growth
+	@$(PY) -m tests.benchmarks.configured
+	@$(PY) -m tests.benchmarks.detector
+	@$(PY) -m tests.benchmarks.request
+	@$(PY) -m tests.benchmarks.page
 
 bench-audit: setup  ## Measure what an auditor's questions cost after 10,000 commits
 	@$(PY) -m tests.benchmarks.audit
@@ -122,8 +141,18 @@ simulate: setup  ## Find planted faults, then play histories of generators and p
 	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
 
+# The theme's authors announce their next program at each build unless this is set.
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: setup  ## Build the documentation into build/site, check its links, run its commands
+	@$(PY) -m mkdocs build
+	@$(PY) -m pytest -q -n auto --dist worksteal $(DOCS_TESTS)
+	@echo "docs: open build/site/index.html"
+
 wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .
+
+release: setup  ## Build wheel, sdist and docs into dist/, and try them in an empty environment
+	@PYTHON='$(PY)' deploy/release
 
 clean:  ## Remove what the other targets made
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache .coverage

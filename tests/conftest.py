@@ -13,6 +13,7 @@ from types import FrameType
 import pytest
 import yaml
 from demandops.service import Generator
+from demandops.staterepo.pull_request.helm import HELM_BIN
 
 from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
@@ -43,7 +44,9 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep journals, clones and git away from the set-up of this machine's user."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("home")))
+        patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
         patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
+        patch.setenv(HELM_BIN, "/nowhere/helm")  # so `check` prints the same on each machine
         for name, value in repo.NO_GIT_CONFIG.items():
             patch.setenv(name, value)
         yield

@@ -6,4 +6,4 @@ staterepo → service → cli. ``docs/architecture.md`` describes them and the o
 
 __all__ = ["__version__"]
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"

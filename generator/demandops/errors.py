@@ -26,26 +26,40 @@ class Fault:
 
     ``code`` is a stable word for programs (``unknown-node``). ``field`` is the path inside the
     input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it, on one
-    line. ``file`` names the file, if the input is one.
+    line. ``file`` names the file, if the input is one, and ``line`` the line of the field, if it is
+    known.
     """
 
     code: str
     field: str
     message: str
     file: str = ""
+    line: int | None = None
 
     def __post_init__(self) -> None:
         """Quote the message, which may name any value; ``file`` and ``field`` stay exact."""
         object.__setattr__(self, "message", one_line(self.message))
 
     def __str__(self) -> str:
-        """Return ``file: field: message`` on one line, without the empty parts."""
-        places = (one_line(place) for place in (self.file, self.field))
+        """Return ``file:line: field: message`` on one line, without the empty parts."""
+        places = (one_line(place) for place in (self.place, self.field))
         return ": ".join(part for part in (*places, self.message) if part)
+
+    @property
+    def place(self) -> str:
+        """File and line, as far as they are known: ``inventory/nodes.yaml:12``."""
+        return place_text(self.file, self.line)
 
     def within(self, file: str) -> Fault:
         """Return the same fault, located in ``file``."""
         return replace(self, file=file)
+
+
+def place_text(file: str, line: int | None) -> str:
+    """Return a file with a line, as editors and terminals link it."""
+    if line is None:
+        return file
+    return f"{file}:{line}" if file else f"line {line}"
 
 
 class DemandOpsError(Exception):
@@ -66,6 +80,10 @@ class InvalidInput(DemandOpsError):
     def __str__(self) -> str:
         """Return one line for each fault."""
         return "\n".join(str(fault) for fault in self.faults)
+
+    def text_with_codes(self) -> str:
+        """Return ``<code>: <field>: <remedy>``, one line for each fault."""
+        return "\n".join(f"{fault.code}: {fault}" for fault in self.faults)
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
@@ -119,7 +137,7 @@ class ShuttingDown(DemandOpsError):
 class Unsound(DemandOpsError):
     """Raised when a demand could be lost or booked twice, or another process might answer it too.
 
-    Nobody is answered, and the process ends with exit code 3. The next start goes by the journal.
+    Nobody is answered, and the process ends with exit code 3. The next start reads the journal.
     """
 
 
@@ -138,7 +156,7 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     Return an empty string if no words are known.
     """
     names = sorted(known)
-    close = get_close_matches(word, _beside(word, names), n=1)
+    close = get_close_matches(word, _neighbors(word, names), n=1)
     if close:
         return f"; did you mean '{close[0]}'?"
     if not names:
@@ -147,10 +165,10 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     return f"; known: {listed}"
 
 
-def _beside(word: str, names: list[str]) -> list[str]:
-    """Return the names beside a word in the alphabet, read from either end.
+def _neighbors(word: str, names: list[str]) -> list[str]:
+    """Return the names next to a word in the order of their first, and of their last letters.
 
-    To compare a word with thousands of names takes long, and one file or goal may have thousands of
+    Comparing a word with thousands of names is slow, and one file or goal may have thousands of
     unknown words.
     """
     if len(names) <= _COMPARED:

@@ -1,4 +1,4 @@
-"""The rules for ids, topic names and message types in requests, inventory and ledger."""
+"""The rules for ids, topic names and message types, and the patterns of other fields in words."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def id_problem(value: str) -> str:
     if len(value) > MAX_ID:
         return f"has {len(value)} characters; at most {MAX_ID} are allowed"
     if ".." in value:
-        return f"{quoted(value)} holds '..'; choose an id without it"
+        return f"{quoted(value)} contains '..'; choose an id without it"
     if value != value.strip():
         return f"{quoted(value)} starts or ends with white space; remove it"
     if not is_visible(value):
         char = next(char for char in value if not is_visible(char))
         return (
-            f"{quoted(value)} holds U+{ord(char):04X}, which nobody sees; choose an id without it"
+            f"{quoted(value)} has the invisible character U+{ord(char):04X}; choose one without it"
         )
     return ""
 
@@ -74,3 +74,46 @@ def message_type_problem(name: str) -> str:
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
     return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"
+
+
+_LOWER = "lower-case letters, digits"
+_ANY = "letters, digits"
+
+PATTERN_WORDS = {
+    r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": f"{_LOWER} and '-' between them, such as c-its",
+    r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, such as road-station",
+    r"^[a-z][a-z0-9]{0,9}$": f"up to ten {_LOWER}, with a letter first, such as od",
+    r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, such as sensor_msgs",
+    r"^[a-z0-9./-]+$": f"{_LOWER}, '.', '/' and '-', such as cpu or nvidia.com/gpu",
+    r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
+    r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, such as ROS_DOMAIN_ID",
+    r"^[A-Za-z0-9_.-]+$": f"{_ANY}, '_', '.' and '-', such as start.launch.py",
+    r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$": f"{_ANY}, '_', '.' and '-', such as ca.crt",
+    r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
+    r"^[A-Z][A-Za-z0-9]*$": "a kind of Kubernetes object, such as ConfigMap",
+    r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$": "the group of an API, such as batch, or nothing",
+    r"^https?://\S+$": "a URL that begins with https:// or http://",
+    r"^https?://[^\s]+$": "a URL that begins with https:// or http://",
+    r"^oci://[^\s]+$": "a URL that begins with oci://",
+    r"^values/[A-Za-z0-9_.-]+$": "a file of the folder values/, such as values/service.yaml.j2",
+    r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$": "a host name or address, such as 10.0.0.1",
+    r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": f"{_ANY}, '_' and '-', parts by '/', such as fleet/one",
+    r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
+    r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
+    r"^[a-z0-9][a-z0-9._/:-]*$": "an image without its tag, such as registry.example/detection",
+    r"^sha256:[0-9a-f]{64}$": "a digest: sha256: and 64 digits from 0 to f",
+    r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
+    r"^(tcp|udp|ws)/[^\s/#?]+:\d{1,5}$": "an endpoint of Zenoh, such as tcp/router.example:7447",
+    r"^(\d+h)?(\d+m)?(\d+s)?$": "a duration, such as 30s, 1m or 1h30m",
+    r"^[^\s,][^\n\r,]*$": "a label without a comma",
+    r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$": (
+        "the key of a label, such as node_id or example.org/host"
+    ),
+    r"^([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?$": (
+        f"the value of a label: up to 63 {_ANY}, '_', '.' and '-'"
+    ),
+    r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$": (
+        "a topic that begins with '/', such as /{instance}_objects"
+    ),
+}
+"""What to write, by the pattern of a field."""

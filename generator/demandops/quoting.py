@@ -17,7 +17,7 @@ LONGEST_LINE = 4000
 
 _INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0"
 _HIDDEN = re.compile(f"[{_INVISIBLE}\U000e0100-\U000e01ef]")
-"""What Unicode ignores when it displays text, although Python calls it printable."""
+"""Matches characters that are displayed as nothing, although Python calls them printable."""
 _BMP = 0xFFFF
 
 

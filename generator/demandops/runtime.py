@@ -83,7 +83,7 @@ class Runtime:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Why threads failed that did not recover since, by their names."""
+        """Name of each thread that failed and has not recovered → the reason."""
         now = self.monotonic()
         known = sorted(self._failures.items())
         return {name: text for name, (text, at) in known if now - at < _STEADY_S}

@@ -41,6 +41,16 @@ PROPOSAL_LIMIT = 100
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose files are all rendered from ledger and configuration."""
 
+SCHEMAS_ROOT = "schemas"
+"""The folder of a state repo that has the JSON Schemas, for editors."""
+
+
+def modeline(path: str, schema: str) -> str:
+    """Return the comment by which editors check a file of the state repo with a schema."""
+    up = "../" * path.count("/")
+    return f"# yaml-language-server: $schema={up}{SCHEMAS_ROOT}/{schema}.json\n"
+
+
 NOTES_ROOT = ".demandops"
 """The top-level folder of the generator's reports to people; no decision depends on them."""
 
@@ -58,6 +68,15 @@ def data_folder(name: str) -> Path:
     if packaged.is_dir():
         return packaged
     return _CHECKOUT / {"skeleton": "state-repo-skeleton"}.get(name, name)
+
+
+def documentation() -> Path | None:
+    """Return the folder of the documentation's site, or None if it was not built.
+
+    A release has it inside the package; in a checkout ``make docs`` builds it.
+    """
+    folders = (_PACKAGE / "_data" / "docs", _CHECKOUT / "build" / "site")
+    return next((folder for folder in folders if (folder / "index.html").is_file()), None)
 
 
 def forge_token_file() -> Path | None:

@@ -1,15 +1,138 @@
-"""What both ends of an action must agree on: deep queues, and one server for each name."""
+"""The ends of an action: a client with deep queues, and a search for other servers of a name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
 
+import rclpy
+from action_msgs.msg import GoalStatus
+from demandops.runtime import REAL
+from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from demandops_ros.ros_process import ExecutorThread
+
 DEEP_QOS = QoSProfile(depth=2000)
-"""The queues for goals, results, cancels and feedback. ROS's default of 10 loses some of a burst. A
-client's queue also gets the answers to other clients, which the client drops."""
+"""The queues for goals, results, cancels and feedback. ROS's default of 10 loses messages of a
+burst, because a client's queue also gets the answers to other clients."""
+
+_UNHEARD_S = 5.0
+"""Seconds until a goal counts as lost; a node accepts a goal within milliseconds."""
+
+
+class DemandError(Exception):
+    """Raised when a demand fails. ``code`` is a word for programs, such as ``unknown-node``."""
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class GoalSender:
+    """Sends goals of one action and waits for the answers; many threads may send at once.
+
+    It works beside the caller's own rclpy: it has its own context and thread.
+    """
+
+    def __init__(
+        self,
+        action: Any,  # noqa: ANN401 - a generated class
+        action_name: str,
+        node_name: str,
+        timeout_s: float,
+        domain_id: int | None = None,
+    ) -> None:
+        """Start the client.
+
+        Args:
+            action: the action's class.
+            action_name: the name under which a node serves it.
+            node_name: the name of the client's own ROS node.
+            timeout_s: how long to wait for the node, and for each answer.
+            domain_id: the ROS domain; the environment's if left out.
+        """
+        self.timeout_s = timeout_s
+        self._action_name = action_name
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain_id)
+        self._node = rclpy.create_node(node_name, context=self._context)
+        self._client = ActionClient(
+            self._node,
+            action,
+            action_name,
+            goal_service_qos_profile=DEEP_QOS,
+            result_service_qos_profile=DEEP_QOS,
+            cancel_service_qos_profile=DEEP_QOS,
+            feedback_sub_qos_profile=DEEP_QOS,
+        )
+        self._thread = ExecutorThread(self._node, "client")
+
+    def close(self) -> None:
+        """Stop the thread and destroy the node."""
+        self._thread.close()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def send(
+        self,
+        goal: Any,  # noqa: ANN401 - a generated class
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+    ) -> tuple[bool, Any, bool]:
+        """Send a goal and wait for its result.
+
+        Returns:
+            Whether it succeeded, its result, and whether an earlier attempt was lost, which may
+            have succeeded as well.
+
+        Raises:
+            DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
+                answer came in time.
+        """
+        deadline = REAL.monotonic() + self.timeout_s
+        if not self._client.wait_for_server(timeout_sec=self.timeout_s):
+            raise DemandError(
+                "no-server", f"no node serves {self._action_name}; start one with demandops serve"
+            )
+        handle, lost = self._send_until_heard(goal, on_feedback, deadline)
+        if not handle.accepted:
+            message = "the node accepts no demands now, and its log says why; send it again later"
+            raise DemandError("rejected", message)
+        answer = self._await(handle.get_result_async(), deadline)
+        return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
+
+    def _send_until_heard(
+        self,
+        goal: Any,  # noqa: ANN401
+        on_feedback: Callable[[Any], None],
+        deadline: float,
+    ) -> tuple[Any, bool]:
+        """Send a goal until the node responds; return its handle and whether an attempt was lost.
+
+        The response is lost if the node has not discovered this client yet. Sending again is
+        harmless: a demand that is put twice counts once.
+        """
+        lost = False
+        while True:
+            sent = self._client.send_goal_async(
+                goal, feedback_callback=lambda message: on_feedback(message.feedback)
+            )
+            try:
+                return self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S)), lost
+            except DemandError:
+                if REAL.monotonic() >= deadline:
+                    raise
+                lost = True
+
+    def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
+        done = REAL.event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(max(0.0, deadline - REAL.monotonic())):
+            raise DemandError(
+                "timeout", f"no answer on {self._action_name} within {self.timeout_s:g} s"
+            )
+        return future.result()
 
 
 class OtherServers:
@@ -39,5 +162,5 @@ class OtherServers:
         publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
         names = [f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers]
         if self._own in names:
-            names.remove(self._own)  # once: another may have the same name
+            names.remove(self._own)  # removes it once, because another node may have the same name
         return sorted(names)

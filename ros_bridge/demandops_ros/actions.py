@@ -10,7 +10,6 @@ from typing import Any
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
 from demandops.cluster.health.release_health import Level
-from demandops.decision import refusal_text
 from demandops.errors import (
     DemandOpsError,
     InvalidInput,
@@ -102,7 +101,7 @@ def _text(outcome: Receipt | BaseException) -> str:
         head = [f"{outcome.outcome}: {outcome.commit}", *map(one_line, outcome.placed)]
         return "\n".join([*head, *warnings, *_not_held(outcome)])
     if isinstance(outcome, InvalidInput):
-        return refusal_text(outcome)
+        return outcome.text_with_codes()
     if isinstance(outcome, Withdrawn):
         return str(outcome)
     text = outcome if isinstance(outcome, DemandOpsError) else one_line(repr(outcome))

@@ -26,7 +26,7 @@ def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # 
         response.ok = True
     except DemandOpsError as error:
         response.ok, response.message = False, str(error)
-    except Exception as error:  # whoever asks must get an answer
+    except Exception as error:  # the caller must get an answer
         REAL.failed("bookkeeping", error)
         response.ok, response.message = (
             False,
@@ -48,8 +48,7 @@ _PAUSE_FACTOR = 20
 class BookkeepingTopic:
     """Publishes the bookkeeping on ``~/bookkeeping`` after each change; late joiners get the last.
 
-    The cost grows with the ledger, so a thread of its own does it, for at most a twentieth of the
-    time.
+    The work grows with the ledger, so a thread of its own does it, and rests for 19 times as long.
     """
 
     def __init__(

@@ -19,16 +19,14 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import rclpy
-from action_msgs.msg import GoalStatus
 from demandops.runtime import REAL, Thread
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
-from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
 
-from demandops_ros.action_endpoints import DEEP_QOS
+from demandops_ros.action_endpoints import DemandError, GoalSender
 from demandops_ros.messages import demand_goal_from_data
+
+__all__ = ["Answer", "DemandClient", "DemandError", "HeldDemand", "StageListener"]
 
 log = logging.getLogger("demandops.client")
 
@@ -38,24 +36,14 @@ StageListener = Callable[[str, str], None]
 _RENEW_AFTER = 1 / 3
 """The fraction of a lease after which to renew it; two more attempts fit before its end."""
 _RETRY_S = 5.0
-_UNHEARD_S = 5.0
-"""Seconds until a goal counts as lost; a node accepts a goal within milliseconds."""
-
-
-class DemandError(Exception):
-    """Raised when a demand fails. ``code`` is a word for programs, such as ``unknown-node``."""
-
-    def __init__(self, code: str, message: str) -> None:
-        super().__init__(message)
-        self.code = code
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
     """The result of a goal.
 
-    ``outcome`` is booked, released or unchanged. ``lease_s`` is 0 without a lease. ``reached`` is
-    pushed, reconciled or healthy.
+    ``outcome`` is booked, waiting, released or unchanged. ``lease_s`` is 0 without a lease.
+    ``reached`` is pushed, reconciled or healthy.
     """
 
     outcome: str
@@ -87,22 +75,7 @@ class DemandClient:
         """
         self.requesters = requesters
         self.timeout_s = timeout_s
-        self._action_name = action_name
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain_id)
-        self._node = rclpy.create_node(node_name, context=self._context)
-        self._client = ActionClient(
-            self._node,
-            Demand,
-            action_name,
-            goal_service_qos_profile=DEEP_QOS,
-            result_service_qos_profile=DEEP_QOS,
-            cancel_service_qos_profile=DEEP_QOS,
-            feedback_sub_qos_profile=DEEP_QOS,
-        )
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
-        self._spinner = REAL.keep_running("client", self._executor.spin)
+        self._sender = GoalSender(Demand, action_name, node_name, timeout_s, domain_id)
 
     def __enter__(self) -> DemandClient:
         """Return the client itself."""
@@ -114,10 +87,7 @@ class DemandClient:
 
     def close(self) -> None:
         """Stop the client's thread and destroy its node."""
-        self._executor.shutdown(timeout_sec=1)
-        self._spinner.join(5)
-        self._node.destroy_node()
-        self._context.try_shutdown()
+        self._sender.close()
 
     def put(
         self,
@@ -179,58 +149,18 @@ class DemandClient:
     ) -> Answer:
         """Send a document of the kind ``Demand`` and wait for the answer; see :meth:`put`."""
         goal = demand_goal_from_data({"requesters": list(self.requesters), **data})
-        deadline = REAL.monotonic() + self.timeout_s
-        if not self._client.wait_for_server(timeout_sec=self.timeout_s):
-            raise DemandError(
-                "no-server", f"no node serves {self._action_name}; start one with demandops serve"
-            )
-        handle, lost = self._send_until_heard(goal, on_stage, deadline)
-        if not handle.accepted:
-            message = "the node accepts no demands now, and its log says why; send it again later"
-            raise DemandError("rejected", message)
-        answer = self._await(handle.get_result_async(), deadline)
-        result = answer.result
+        succeeded, result, lost = self._sender.send(
+            goal, lambda feedback: on_stage(feedback.stage, feedback.message)
+        )
         if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:
             return Answer(
                 "released", "", 0.0, ("released by an attempt whose answer was lost",), "pushed"
             )
-        if answer.status != GoalStatus.STATUS_SUCCEEDED:
+        if not succeeded:
             raise DemandError(result.code or "aborted", result.message)
         lease_s = result.lease.sec + result.lease.nanosec / 1e9
         warnings = tuple(result.warnings)
         return Answer(result.outcome, result.commit, lease_s, warnings, result.reached)
-
-    def _send_until_heard(
-        self,
-        goal: Any,  # noqa: ANN401
-        on_stage: StageListener,
-        deadline: float,
-    ) -> tuple[Any, bool]:
-        """Send a goal until the node responds; return its handle and whether an attempt was lost.
-
-        The response is lost if the node has not discovered this client yet. Sending again is
-        harmless: a demand that is put twice counts once.
-        """
-        lost = False
-        while True:
-            sent = self._client.send_goal_async(
-                goal, feedback_callback=lambda fb: on_stage(fb.feedback.stage, fb.feedback.message)
-            )
-            try:
-                return self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S)), lost
-            except DemandError:
-                if REAL.monotonic() >= deadline:
-                    raise
-                lost = True
-
-    def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
-        done = REAL.event()
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(max(0.0, deadline - REAL.monotonic())):
-            raise DemandError(
-                "timeout", f"no answer on {self._action_name} within {self.timeout_s:g} s"
-            )
-        return future.result()
 
 
 class HeldDemand:
@@ -285,4 +215,4 @@ class HeldDemand:
         except DemandError as problem:
             if problem.code != "not-held":
                 raise
-            self._put_and_remember()  # it ended while the network was down
+            self._put_and_remember()  # the lease ended while the network was down

@@ -45,9 +45,15 @@ def demand(
 
     FILE is a YAML document of the kind Demand (docs/demand.md), or - for standard input. If the
     demand fails, prints the node's reason and exits with 1.
+
+    \b
+    Examples:
+      demandops demand visit.yaml
+      demandops demand visit.yaml --hold
+      demandops demand visit.yaml --release
     """
     if hold + release + renew > 1:
-        raise click.UsageError("--hold, --release and --renew exclude each other")
+        raise click.UsageError("--hold, --release and --renew cannot be combined")
     data = _read_document(file)
     if release or renew:
         names = ("demand", "requesters", "request")

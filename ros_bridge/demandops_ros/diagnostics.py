@@ -32,7 +32,7 @@ class Diagnostics:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         of_each = (_of_state_repo, _of_configuration, _of_parts)
-        message.status = [status(self._generator) for status in of_each]
+        message.status = [of_one(self._generator) for of_one in of_each]
         message.status.append(_of_actions(self._generator, self._others.find()))
         self._publisher.publish(message)
 
@@ -43,7 +43,7 @@ def _of_state_repo(generator: Generator) -> DiagnosticStatus:
     if remote.push_denied:
         level, text = DiagnosticStatus.ERROR, remote.push_denied
     if remote.unreachable:
-        # while no demand waits, only people's changes are late
+        # if no demand waits, only people's changes are delayed, which is no error
         level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
         text = remote.unreachable
     values = {
@@ -54,7 +54,7 @@ def _of_state_repo(generator: Generator) -> DiagnosticStatus:
         "unpublished demands": str(unpublished),
         "commit": str(generator.snapshot.commit),
     }
-    return _status("demandops: state repo", generator.address, level, text, values)
+    return status("demandops: state repo", generator.address, level, text, values)
 
 
 def _of_configuration(generator: Generator) -> DiagnosticStatus:
@@ -66,7 +66,7 @@ def _of_configuration(generator: Generator) -> DiagnosticStatus:
     values = {"problems": str(len(problems))}
     for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
         values[f"problem {number}"] = str(problem)
-    return _status("demandops: configuration", generator.address, level, text, values)
+    return status("demandops: configuration", generator.address, level, text, values)
 
 
 def _of_parts(generator: Generator) -> DiagnosticStatus:
@@ -74,7 +74,7 @@ def _of_parts(generator: Generator) -> DiagnosticStatus:
     level, text = DiagnosticStatus.OK, "all parts work"
     if failures:
         level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
-    return _status("demandops: generator", generator.address, level, text, failures)
+    return status("demandops: generator", generator.address, level, text, failures)
 
 
 def _of_actions(generator: Generator, others: dict[str, list[str]]) -> DiagnosticStatus:
@@ -82,12 +82,13 @@ def _of_actions(generator: Generator, others: dict[str, list[str]]) -> Diagnosti
     if any(others.values()):
         level, text = DiagnosticStatus.WARN, "another node serves them too; see the log"
     values = {action: ", ".join(nodes) for action, nodes in others.items()}
-    return _status("demandops: actions", generator.address, level, text, values)
+    return status("demandops: actions", generator.address, level, text, values)
 
 
-def _status(
+def status(
     name: str, address: str, level: bytes, text: str, values: dict[str, str]
 ) -> DiagnosticStatus:
+    """Return a status whose text and values are one line each."""
     pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
     message = one_line(text)
     return DiagnosticStatus(

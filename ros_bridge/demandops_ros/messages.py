@@ -166,7 +166,7 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 def _fields(
     data: Mapping[str, Any], names: Mapping[str, str], more: set[str], what: str
 ) -> dict[str, Any]:
-    """Return the fields of a message, renamed by ``names``; refuse any that is unknown."""
+    """Return the fields of ``data``, renamed to those of a message; refuse an unknown field."""
     known = {*more, *names}
     for name in data:
         if name not in known:

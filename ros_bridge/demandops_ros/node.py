@@ -1,8 +1,8 @@
 """The ROS 2 node: action servers that submit demands to the generator.
 
 A goal is accepted once its demand is in the generator's journal. Many goals may be open without
-blocking the executor. What the generator's threads tell is queued, and a guard condition wakes the
-executor to handle it. A goal is executed, in ROS's sense, when its outcome is known.
+blocking the executor: events from the generator's threads are queued, and a guard condition wakes
+the executor to handle them. A goal is executed, in ROS's sense, when its outcome is known.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from demandops_ros.diagnostics import Diagnostics
 _RESULT_KEPT_S = 900
 """How long a client may ask for a result, instead of rclpy's ten seconds."""
 _DEFAULT_DEPTH = 10
-"""How many answers ROS 2 queues for a client by default; it drops the oldest of more."""
+"""How many answers ROS 2 queues for a client by default; it drops older ones."""
 _SHALLOW = (
     f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
     f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
@@ -58,7 +58,7 @@ class _Goal:
     is_refused: bool = False
 
     def __str__(self) -> str:
-        """Return how the log names it."""
+        """Return the goal's name in the log."""
         return f"goal {quoted(self.adapter.name(self.message))}"
 
 
@@ -90,7 +90,7 @@ class DemandNode(Node):  # type: ignore[misc]
         """The goals without a result, by the identity of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
-        # a group of its own, so that a service that waits for an event does not block events
+        # a callback group of its own, so that a service that waits does not block the events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
         )
@@ -161,8 +161,8 @@ class DemandNode(Node):  # type: ignore[misc]
     ) -> GoalResponse:
         """Accept a goal once its demand is in the journal, so that no crash loses an accepted goal.
 
-        Goals that come meanwhile share the next sync. A goal that names what does not exist is
-        accepted too: a result can carry the reason, a rejection cannot.
+        Goals that come meanwhile share the next sync. An invalid goal is accepted too, because a
+        result can contain the reason, but a rejection cannot.
         """
         goal = self._goals[id(message)] = _Goal(adapter, message)
         journaled = Future(executor=self.executor)
@@ -198,7 +198,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._after(goal, goal.ticket.future, self._answer)
 
     def _forget_unless_accepted(self, goal: _Goal) -> None:
-        """Let a demand run without its goal if the client could not be told that it is accepted."""
+        """Forget a goal whose client never got the acceptance; its demand is still carried out."""
         if goal.handle is None:
             del self._goals[id(goal.message)]
             self.get_logger().warning(f"{goal}: nobody gets the answer of {goal.ticket.operation}")
@@ -224,16 +224,16 @@ class DemandNode(Node):  # type: ignore[misc]
             self.get_logger().info(f"{goal}: cancelled")
         else:
             handle.abort()
-            if not goal.is_refused:  # else the log has it
+            if not goal.is_refused:  # a refusal is already in the log
                 self.get_logger().error(f"{goal}: {text}")
         return result
 
     # ---- an accepted goal, in the executor's thread ----
 
     def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
-        """Take the next step of a goal with a future's result; an internal error is a result too.
+        """Call ``step`` with a future's result or error, in the executor, once there is one.
 
-        No coroutine waits, because rclpy's executor resumes each one that waits at each event.
+        It uses no coroutine: rclpy's executor would resume each waiting coroutine at each event.
         """
 
         def take() -> None:
@@ -281,7 +281,7 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- from other threads into the executor's ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Give feedback; log a refusal at once, because a crash may come before the result."""
+        """Send feedback; log a refusal now, because a crash may prevent the result."""
         if stage == "refused":
             goal.is_refused = True
             self.get_logger().error(f"{goal}: {_one_line(text)}")
@@ -296,7 +296,7 @@ class DemandNode(Node):  # type: ignore[misc]
         while self._events:
             try:
                 self._events.popleft()()
-            except Exception as error:  # the other goals must get their events
+            except Exception as error:  # a failure must not keep events from other goals
                 REAL.failed("events of goals", error)
 
 

@@ -60,7 +60,7 @@ def read(given: Mapping[str, str | None]) -> dict[str, Any]:
     A temporary node reads them, because the generator starts before the node.
 
     Args:
-        given: values in place of some defaults; None and "" leave the default.
+        given: values that replace defaults; None and "" keep the default.
 
     Raises:
         click.UsageError: if a value is not valid.

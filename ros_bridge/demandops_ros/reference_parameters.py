@@ -1,8 +1,8 @@
 """The parameters of the reference's node, and what replaces them here.
 
-A fleet may start our node with the parameter file of the reference's. Its entries are for the node
-``application_manager``. The name of the action is taken from there. Brokers, topics and namespaces
-are in the state repo; a value that is not there gets a warning.
+A fleet may start our node with the parameter file of the reference's node, whose name there is
+``application_manager``. Our node takes the action's name from the file. Brokers, topics and
+namespaces come from the state repo; a value in the file that the repo lacks gets a warning.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _REPLACED = {
 
 
 def read(ros_args: Sequence[str]) -> dict[str, Any]:
-    """Return the parameters that ROS arguments and their files have for the reference's node."""
+    """Return the reference node's parameters from ROS arguments and the files that they name."""
     renames = {
         at
         for at, word in enumerate(ros_args)

@@ -2,60 +2,37 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import click
-import rclpy
 from demandops.cli.main import ExitCode
-from demandops.cli.output import errors, progress, signing_option
+from demandops.cli.output import errors, progress
+from demandops.cli.target import signing_option
 from demandops.cluster import access, reconcile_trigger
 from demandops.cluster.leadership import Leadership
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.input_file import read_secret
-from demandops.quoting import OneLineFormatter
 from demandops.runtime import REAL
 from demandops.service import Generator
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.impl.rcutils_logger import RcutilsLogger
-from rclpy.logging import LoggingSeverity, get_logger, set_logger_level
+from demandops.staterepo.reader import Reader
+from demandops.web.follower import Follower
+from demandops.web.server import WebServer
+from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros import parameters, reference_parameters
+from demandops_ros import parameters, reference_parameters, ros_process
 from demandops_ros.node import DemandNode
 
 _POLL_S = 0.02
 _TASK_S = 5.0
 _FLUSH_S = 0.3
-
-
-class RosLogHandler(logging.Handler):
-    """Passes the generator's log records to ROS's log."""
-
-    def __init__(self, logger: RcutilsLogger) -> None:
-        super().__init__()
-        self._log = logger
-        self.setFormatter(OneLineFormatter())
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Log a record at the matching ROS level."""
-        text = self.format(record)  # one call for each level, because rclpy wants it so
-        if record.levelno >= logging.ERROR:
-            self._log.error(text)
-        elif record.levelno >= logging.WARNING:
-            self._log.warning(text)
-        elif record.levelno >= logging.INFO:
-            self._log.info(text)
-        else:
-            self._log.debug(text)
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -95,6 +72,12 @@ class RosLogHandler(logging.Handler):
     "loopback address.",
 )
 @click.option(
+    "--web",
+    metavar="HOST:PORT",
+    help="Show the state repo on a web page there, such as 127.0.0.1:8080; see docs/page.md. Off "
+    "by default.",
+)
+@click.option(
     "--leader-lease",
     metavar="NAMESPACE/NAME",
     help="The Lease that makes one of several nodes the leader, which answers the actions; the "
@@ -109,6 +92,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
     fetch_interval: str | None,
     webhook: str | None,
     webhook_secret_file: Path | None,
+    web: str | None,
     leader_lease: str | None,
     signing_key: Path | None,
 ) -> None:
@@ -118,20 +102,16 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
     fetch_interval, requester_queue_limit (how many demands of one requester may wait), log_level
-    (debug, info, warn, error or fatal). The parameter file of the reference's node is understood
-    too: docs/migration.md. Stop it with Ctrl-C or SIGTERM: it finishes what it can
-    within seconds, and the journal keeps the rest.
+    (debug, info, warn, error or fatal). The parameter file of the reference's node works too
+    (docs/migration.md). Stop it with Ctrl-C or SIGTERM: it publishes waiting demands for some
+    seconds, and the journal keeps the others for the next start.
+
+    \b
+    Examples:
+      demandops serve --state-repo fleet.git
+      demandops serve --state-repo https://git.example/fleet.git --clusters clusters.yaml
     """
-    ros_args = list(ctx.args)
-    if ros_args and ros_args[0] != "--ros-args":
-        raise click.UsageError(
-            f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
-        )
-    if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
-        # ROS's log library does not start in a container without a home
-        os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
-    rclpy.init(args=["demandops", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-    try:
+    with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args:
         of_reference = reference_parameters.read(ros_args)
         settings = parameters.read(
             {
@@ -140,8 +120,8 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
                 "fetch_interval": fetch_interval,
             }
         )
-        # the generator takes demands from the journal before there is a node
-        _log_to(get_logger("demandops"), settings["log_level"])
+        # the generator may publish demands of the journal before the node exists
+        ros_process.log_to(get_logger("demandops"), settings["log_level"])
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = access.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
@@ -159,33 +139,42 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
         push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
+        page = _page(web, generator, settings, clusters) if web else None
         status = RolloutWatcher(clusters, generator) if clusters else None
         with _Signals() as signals:
             leadership = None
             if leader_lease:
-                # what the journal holds comes before the demands of clients, unless it has to wait
+                # publish the journal's demands before those of clients, unless they must wait
                 leadership = Leadership(
                     leader_lease,
                     lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
                     signals.wake,
                 )
                 signals.wait(lambda: leadership.is_leader)
-            if signals.stopping:  # before it was the leader
+            if signals.stopping:  # a signal came before this process was the leader
                 generator.close()
             else:
                 _run(generator, settings, status, push_webhook, signals)
             if leadership is not None:
                 leadership.close()
             trigger.close()
-    finally:
-        rclpy.try_shutdown()
+            if page is not None:
+                page.close()
 
 
-def _log_to(logger: RcutilsLogger, level: str) -> None:
-    set_logger_level(logger.name, LoggingSeverity[level.upper()])
-    library_log = logging.getLogger("demandops")
-    library_log.handlers, library_log.propagate = [RosLogHandler(logger)], False
-    library_log.setLevel(logging.DEBUG)
+def _page(
+    address: str,
+    generator: Generator,
+    settings: dict[str, Any],
+    clusters: Mapping[str, access.ClusterAccess],
+) -> WebServer:
+    """Start the web page, which fetches the state repo itself, at the node's interval."""
+    interval = parse_interval(settings["fetch_interval"])
+    follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
+    generator.on_publish(lambda config: follower.wake())
+    page = WebServer(address, "--web", follower)
+    get_logger("demandops").info(f"showing the state repo at {page.url}")
+    return page
 
 
 def _run(
@@ -207,11 +196,9 @@ def _run(
         shown = generator.address if name == "state_repo" else value
         # read only, because the parameters are read at the start
         node.declare_parameter(name, shown, parameters.descriptor(name, read_only=True))
-    _log_to(node.get_logger(), settings["log_level"])
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    # the executor spins in a thread, so that the main thread notices a signal at once
-    spinner = REAL.keep_running("executor", executor.spin)
+    ros_process.log_to(node.get_logger(), settings["log_level"])
+    # a thread of its own, so that the main thread notices a signal at once
+    thread = ros_process.ExecutorThread(node)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
     if push_webhook is not None:
@@ -219,15 +206,14 @@ def _run(
     signals.wait()
     if push_webhook is not None:
         push_webhook.close()
-    _drain(executor, node, generator, status)
-    executor.shutdown(timeout_sec=1)
-    spinner.join(5)
+    _drain(thread, node, generator, status)
+    thread.close()
     node.close()
     node.destroy_node()
 
 
 def _drain(
-    executor: SingleThreadedExecutor,
+    thread: ros_process.ExecutorThread,
     node: DemandNode,
     generator: Generator,
     status: RolloutWatcher | None,
@@ -236,13 +222,13 @@ def _drain(
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
     published = generator.stop().result()
     if status is not None:
-        status.close()  # answers the goals that wait for a rollout
+        status.close()  # this ends the goals that wait for a rollout
     end = REAL.monotonic() + _TASK_S
     while node.open_goals and REAL.monotonic() < end:
         REAL.sleep(_POLL_S)
     for _ in range(2):  # results are sent by tasks of the executor: wait until they have run
         done = REAL.event()
-        executor.create_task(done.set)
+        thread.call(done.set)
         done.wait(_TASK_S)
     REAL.sleep(_FLUSH_S)  # time for clients to request them
     if not published:
@@ -286,7 +272,7 @@ class _Signals:
             os.read(self._read, 1)
         if REAL.unsound is not None:
             errors.print(f"error: {REAL.unsound}")
-            os._exit(ExitCode.PROGRAM_ERROR)  # no goal may get an answer on the way
+            os._exit(ExitCode.PROGRAM_ERROR)  # an orderly end could still answer goals
 
     def wake(self) -> None:
         """Make :meth:`wait` look again; from any thread."""

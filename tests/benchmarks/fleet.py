@@ -7,7 +7,7 @@ what the generator itself writes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -38,6 +38,7 @@ class Fleet:
     path: Path
     edges: int
     releases: int
+    nodes: int = 0
 
 
 def edge_id(number: int) -> str:
@@ -93,11 +94,20 @@ def _file(kind: str, **lists: object) -> str:
     return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": kind} | lists)
 
 
-def lay_down(path: Path, releases: int, edges_per_cluster: int = 10) -> Fleet:
+Configure = Callable[[dict[str, str]], object]
+"""Changes the files of a configuration."""
+
+
+def lay_down(
+    path: Path,
+    releases: int,
+    edges_per_cluster: int = 10,
+    configure: Configure = lambda files: None,
+) -> Fleet:
     """Make a bare state repo with about ``releases`` releases running, by regions."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
-    _lay_down(path, edges, edges_per_cluster, VEHICLES_PER_EDGE, 0)
-    return Fleet(path, edges, edges * RELEASES_PER_EDGE)
+    nodes = _lay_down(path, edges, edges_per_cluster, VEHICLES_PER_EDGE, 0, configure)
+    return Fleet(path, edges, edges * RELEASES_PER_EDGE, nodes)
 
 
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
@@ -106,7 +116,21 @@ def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
     return path
 
 
-def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, further: int) -> None:
+def lay_down_idle(path: Path, edges: int, vehicles: int) -> Fleet:
+    """Make a bare state repo with edges and their vehicles, of which none demands anything yet."""
+    _lay_down(path, edges, edges, 0, vehicles)
+    return Fleet(path, edges, 0)
+
+
+def _lay_down(
+    path: Path,
+    edges: int,
+    edges_per_cluster: int,
+    vehicles: int,
+    further: int,
+    configure: Configure = lambda files: None,
+) -> int:
+    """Make the repo, and return how many nodes it has."""
     files = configuration()
     files["demandops.yaml"] += "limits: {demandItems: 100000, fileBytes: 10000000}\n"
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster, vehicles + further)
@@ -115,6 +139,7 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
     files["inventory/clusters.yaml"] = _file("Clusters", clusters=clusters)
     broker = {"node": "cloud", "host": "broker", "port": 1883}
     files["inventory/brokers.yaml"] = _file("Brokers", brokers=[broker])
+    configure(files)
     config = load(files)
     state, now = State.of(config, Ledger()), datetime.now(timezone.utc)
     ledger = Ledger()
@@ -131,13 +156,20 @@ def _lay_down(path: Path, edges: int, edges_per_cluster: int, vehicles: int, fur
     text = "A fleet\n\nOperation: init\nRender-Version: 2\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+    return len(config.nodes) - len(config.hosts)
 
 
-def table(title: str, rows: Sequence[Mapping[str, float]]) -> Table:
+def table(title: str, rows: Sequence[Mapping[str, object]]) -> Table:
     """Return figures as people read them; the columns are the keys of the first row."""
     made = Table(title=title)
     for column in rows[0]:
         made.add_column(column.replace("_", " "), justify="right")
     for row in rows:
-        made.add_row(*(f"{n:,.2f}" if isinstance(n, float) else f"{n:,}" for n in row.values()))
+        made.add_row(*map(_cell, row.values()))
     return made
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:,.2f}"
+    return f"{value:,}" if isinstance(value, int) else str(value)

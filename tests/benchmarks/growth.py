@@ -2,7 +2,9 @@
 
 A vehicle joins and leaves an application that 10, 100 and 1,000 others hold. One goal lists 10,
 1,000 and 8,000 topics. Each figure is the time from ``submit`` to the receipt in one running
-generator; its start is reported beside it. Prints two tables, writes ``build/growth.json``.
+generator, by the clock and of the processor; its start is reported beside it. The sizes take turns
+in one process, so that they share what else the machine does. Prints two tables, writes
+``build/growth.json``.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ import argparse
 import json
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,47 +30,60 @@ ROUNDS = 40
 WARM_UP = 20
 
 Row = dict[str, float]
+Ego = Callable[[int, int], list[str]]
 
 
-def _seconds(generator: Generator, goal: dict[str, Any]) -> float:
-    start = time.perf_counter()
+def _costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
+    """Carry a goal out; return its seconds by the clock and of the processor."""
+    start, worked = time.perf_counter(), time.process_time()
     generator.submit(goal).future.result()
-    return time.perf_counter() - start
+    return time.perf_counter() - start, time.process_time() - worked
 
 
-def _row(
-    folder: Path, name: str, size: int, vehicles: int, rounds: int, ego: Callable[[int], list[str]]
-) -> Row:
-    """Measure a further vehicle, again and again, on an application that ``vehicles`` hold."""
-    laid = fleet.lay_down_crowd(folder / "state-repo.git", vehicles, rounds + WARM_UP)
-    start = time.perf_counter()
-    generator = Generator(str(laid), data=folder / "data")
-    load = time.perf_counter() - start
-    times: list[tuple[float, float]] = []
-    try:
+def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Row]:
+    """Measure a further vehicle on applications of several sizes, by turns in one process.
+
+    ``sizes`` has how many vehicles hold each application, ``ego`` gives the topics of a goal for a
+    size and a number.
+    """
+    generators: dict[int, Generator] = {}
+    rows: dict[int, Row] = {}
+    costs: dict[int, list[tuple[float, ...]]] = {size: [] for size in sizes}
+    with ExitStack() as open_ones:
+        for size, vehicles in sizes.items():
+            path = folder / f"{size}.git"
+            laid = fleet.lay_down_crowd(path, vehicles, rounds + WARM_UP)
+            start = time.perf_counter()
+            generators[size] = Generator(str(laid), data=folder / f"data{size}")
+            rows[size] = {"start_ms": (time.perf_counter() - start) * 1e3}
+            open_ones.callback(generators[size].close)
         for number in range(rounds + WARM_UP):
-            edge, vehicle = fleet.edge_id(0), fleet.vehicle_id(0, vehicles + number)
-            join = fleet.goal(edge, vehicle, ego=ego(number))
-            leave = join | {"shutdown": True}
-            times.append((_seconds(generator, join), _seconds(generator, leave)))
-    finally:
-        generator.close()
-    joins, leaves = map(statistics.median, zip(*times[WARM_UP:], strict=True))
-    return {name: size, "start_ms": load * 1e3, "join_ms": joins * 1e3, "leave_ms": leaves * 1e3}
+            for size, vehicles in sizes.items():
+                edge, vehicle = fleet.edge_id(0), fleet.vehicle_id(0, vehicles + number)
+                join = fleet.goal(edge, vehicle, ego=ego(size, number))
+                leave = join | {"shutdown": True}
+                costs[size].append(
+                    (*_costs(generators[size], join), *_costs(generators[size], leave))
+                )
+    for size, row in rows.items():
+        names = ("join_ms", "join_cpu_ms", "leave_ms", "leave_cpu_ms")
+        medians = map(statistics.median, zip(*costs[size][WARM_UP:], strict=True))
+        row |= {name: median * 1e3 for name, median in zip(names, medians, strict=True)}
+    return [{"size": size, **row} for size, row in rows.items()]
 
 
-def vehicles_row(folder: Path, vehicles: int) -> Row:
-    """Measure one more vehicle on an application that ``vehicles`` hold."""
-    return _row(folder, "vehicles", vehicles, vehicles, ROUNDS, lambda number: [])
+def vehicles_rows(folder: Path, vehicles: Sequence[int]) -> list[Row]:
+    """Measure one more vehicle on an application that so many hold."""
+    return _rows(folder, {size: size for size in vehicles}, ROUNDS, lambda size, number: [])
 
 
-def topics_row(folder: Path, topics: int) -> Row:
-    """Measure one goal with ``topics`` topics, and its shutdown."""
+def topics_rows(folder: Path, topics: Sequence[int]) -> list[Row]:
+    """Measure one goal with so many topics, and its shutdown."""
 
-    def ego(number: int) -> list[str]:
-        return [f"/t{number}/n{index}" for index in range(topics)]
+    def ego(size: int, number: int) -> list[str]:
+        return [f"/t{number}/n{index}" for index in range(size)]
 
-    return _row(folder, "topics", topics, 10, 3, ego)
+    return _rows(folder, dict.fromkeys(topics, 10), 3, ego)
 
 
 def main() -> int:
@@ -80,11 +96,11 @@ def main() -> int:
     out = Console(highlight=False)
     args.output.parent.mkdir(parents=True, exist_ok=True)
     results: dict[str, list[Row]] = {}
-    for name, measure in (("vehicles", vehicles_row), ("topics", topics_row)):
-        rows = results[name] = []
-        for size in getattr(args, name):
-            with TemporaryDirectory(prefix="bench-", dir=args.output.parent) as folder:
-                rows.append(measure(Path(folder), size))
+    for name, measure in (("vehicles", vehicles_rows), ("topics", topics_rows)):
+        with TemporaryDirectory(prefix="bench-", dir=args.output.parent) as folder:
+            rows = results[name] = measure(Path(folder), getattr(args, name))
+        for row in rows:
+            row["cpu_ratio"] = row["join_cpu_ms"] / rows[0]["join_cpu_ms"]
         out.print(fleet.table(f"One more demand, by {name} (medians)", rows))
     args.output.write_text(json.dumps(results, indent=2) + "\n")
     out.print(f"written to {args.output}")

@@ -5,12 +5,12 @@ from __future__ import annotations
 import errno
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tests.faults.invariants import DEMAND, after_fault, after_restart
-from tests.faults.rig import PLENTY_S, Rig, Strace
+from tests.faults.rig import GIT, PLENTY_S, Ran, Rig, Strace
 from tests.faults.trace import Call, file_class, parse
 
 EVERYTHING = "trace=%file,%desc,%process"
@@ -52,19 +52,28 @@ _TRIES = 8
 """How often to count the calls again if one is missed: either thread may write the journal."""
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls of a demand, by the folder in which this process books it."""
+_OF_SERVER = ("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch")
+"""What is said if a process of git, here or at the server, does not say why it failed.
+
+A server that cannot read its references offers none.
+"""
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """What is said if libgit2 does not say why it could not read a file."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """The n-th call of a kind in a thread or program, and the class of file that it touches."""
+    """The n-th call of a kind in a thread or process, and the class of file that it touches.
+
+    ``which``: the how many-th process of its git command makes it; 0 for a thread.
+    """
 
     role: str
     kind: str
     file: str
     n: int
     creates: bool = False
+    which: int = 0
     place: int = 0
     """How many calls of its class came before it."""
 
@@ -72,6 +81,11 @@ class Site:
     def of_class(self) -> tuple[str, str, str, bool]:
         """What it has in common with the other calls of its class."""
         return self.role, self.kind, self.file, self.creates
+
+    @property
+    def is_threads(self) -> bool:
+        """Whether a thread of the generator makes the call, not a process of git."""
+        return not self.which
 
     @property
     def changes(self) -> bool:
@@ -110,12 +124,17 @@ class Result:
 
 
 def sites(rig: Rig) -> list[Site]:
-    """Book one demand under strace, and return its calls."""
+    """Book one demand under strace, once for the threads and once for git, and return its calls."""
+    options = ["-s", "64", "-e", EVERYTHING]
     rig.restore()
-    ran = rig.must(rig.book(DEMAND, Strace(["-f", "-s", "64", "-e", EVERYTHING]), PLENTY_S))
+    ran = rig.must(rig.book(DEMAND, Strace(["-f", *options]), PLENTY_S))
+    threads = set(ran.roles.values())
+    calls = parse(ran.trace, ran.roles, rig.folder)
+    made = [_site(call, rig) for call in calls if call.role in threads]
+    rig.restore()
+    made += _git_sites(rig, rig.must(rig.book(DEMAND, Strace(options, GIT), PLENTY_S)))
     found, counts = [], Counter[object]()
-    for call in parse(ran.trace, ran.roles, rig.folder):
-        site = _site(call, rig)
+    for site in made:
         found.append(replace(site, place=counts[site.of_class]))
         counts[site.of_class] += 1
     _KNOWN[rig.folder] = found
@@ -123,21 +142,49 @@ def sites(rig: Rig) -> list[Site]:
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return the same call as it is counted in this process, which may read more or fewer files."""
+    """Return the same call as it is counted in this process, which may read more or fewer files.
+
+    If the thread did not make it this time, that of another thread on the same class of file.
+    """
     known = _KNOWN[rig.folder]
     same = [each for each in known if (each.of_class, each.place) == (site.of_class, site.place)]
-    return same[0] if same else site
+    threads = [each for each in known if each.is_threads and each.of_class[1:] == site.of_class[1:]]
+    return next(iter(same or (threads if site.is_threads else [])), site)
 
 
-def _site(call: Call, rig: Rig) -> Site:
+def _site(call: Call, rig: Rig, which: int = 0) -> Site:
     creates = "O_CREAT" in call.arguments
-    return Site(call.role, call.kind, file_class(call.paths[-1], rig.folder), call.n, creates)
+    file = file_class(call.paths[-1], rig.folder)
+    return Site(call.role, call.kind, file, call.n, creates, which)
+
+
+def _counted(rig: Rig, site: Site) -> tuple[int, list[str]]:
+    """Return the how many-th call it is for strace, and the options by which strace counts.
+
+    Of a thread's calls on the journal only those on the journal count: how many others there are,
+    such as those that wake a thread, is a matter of time.
+    """
+    if site.is_threads and site.file.endswith("/outbox.jsonl") and not site.creates:
+        return site.place + 1, ["-P", str(next(rig.home.rglob("outbox.jsonl")))]
+    return site.n, []
+
+
+def _git_sites(rig: Rig, ran: Ran) -> list[Site]:
+    return [_site(call, rig, which) for which, call in _git_calls(rig, ran)]
+
+
+def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
+    """Yield the calls of each process of git that was traced, and the how many-th it is."""
+    for trace in ran.git:
+        text = "".join(f"1 {line}\n" for line in trace.text.splitlines())
+        for call in parse(text, {1: trace.command}, rig.folder, trace.folder):
+            yield trace.which, call
 
 
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call; if ``short``, at the last call of each class.
 
-    Calls that only read meet fewer faults then. Those of git and at a remote fewer still.
+    Calls that only read meet fewer faults then, and none if there is a remote.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -146,7 +193,7 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     made = []
     for group in classes.values():
         chosen = group
-        if short and remote and (">" in group[0].role or not group[0].changes):
+        if short and remote and not group[0].changes:
             continue
         if short:
             is_sync = group[0].kind in SYNCS and not remote
@@ -176,29 +223,31 @@ def run(rig: Rig, job: Job) -> Result:
 
 def _run(rig: Rig, job: Job, site: Site) -> Result:
     happens = "signal=KILL" if job.fault == KILL else f"error={job.fault}"
-    command = site.role.partition(" > ")[0]
-    options = ["-s64", "-e", f"inject={site.kind}:{happens}:when={site.n}", "-e"]
-    options.append(f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork")
     rig.restore()
-    folder = "/"
-    if command.startswith("git "):
-        options.append("-f")
-        command, folder = command.removeprefix("git "), str(next(rig.home.rglob("clone.git")))
-    ran = rig.book(DEMAND, Strace(options, command))
+    n, only = _counted(rig, site)
+    options = [*only, "-s64", "-e", f"inject={site.kind}:{happens}:when={n}", "-e"]
+    options.append(f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork")
+    at = site.role if site.is_threads else f"{site.role} {site.which}"
+    ran = rig.book(DEMAND, Strace(options, at))
+    calls = parse(ran.trace, ran.roles, rig.folder)
+    if not site.is_threads:
+        calls = [call for _, call in _git_calls(rig, ran)]
     hit = [
         _site(call, rig)
-        for call in parse(ran.trace, ran.roles, rig.folder, folder)
+        for call in calls
         if "INJECTED" in call.result or (job.fault == KILL and call.result.startswith("?"))
     ]
     where = (site.role, site.kind, site.file)
     part = "remote" if job.remote else "local"
     if not any(each.file == site.file for each in hit):
         return Result(part, where, job.fault, (_MISSED,))
-    number = getattr(errno, job.fault, 0)
-    told = (os.strerror(number), "no room", *_HIDDEN)
-    own = not command.startswith("git") and ">" not in site.role and command == site.role
-    own = own and (not job.remote or "outbox" in site.file)  # a push is the remote's promise
+    told = [os.strerror(getattr(errno, job.fault, 0)), "no room", *_HIDDEN]
+    if not site.is_threads:
+        told += _OF_SERVER
+    own = site.is_threads and (not job.remote or "outbox" in site.file)  # a push: the remote's
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
-    problems = list(after_fault(ran, told, unsound=unsound))
+    problems = list(after_fault(ran, tuple(told), unsound=unsound))
+    if site.role == "git receive-pack":  # its operator mends that; until then the generator waits
+        rig.unlock_server()
     problems += after_restart(rig, ran)
     return Result(part, where, job.fault, tuple(problems))

@@ -235,6 +235,8 @@ def _lose(
             continue
         seen.add(state)
         part = "power loss, remote" if rig.remote else "power loss"
+        if rig.remote:  # the server lost no power: it ends what it began
+            rig.unlock_server()
         yield Result(part, (when, title, ""), "", tuple(after_restart(rig, ran)))
 
 

@@ -14,9 +14,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import yaml
@@ -34,21 +35,54 @@ END_S = 8.0
 """After SIGTERM, it must end within this time."""
 BEGIN = "/faults-begin"
 
+GIT = "git"
+"""Where strace runs if it is to trace each process of git by itself."""
+
 _GIT = """#!/bin/sh
-# Has the first git command of the name that is asked for run under strace.
-if [ "$1" = "$FAULTS_COMMAND" ] && mkdir "$FAULTS_ONCE" 2>/dev/null; then
-  exec strace $FAULTS_STRACE "$FAULTS_GIT" "$@"
+# Runs one of git's programs, under strace if it is the process that is asked for.
+program=${0##*/}
+command=${program#git-}
+if [ "$program" = git ]; then
+  for command in "$@"; do case $command in -*) ;; *) break ;; esac; done
 fi
-exec "$FAULTS_GIT" "$@"
+if [ -n "$FAULTS_AT" ]; then
+  number=1
+  until mkdir "$FAULTS_TRACES/$command $number" 2>/dev/null; do number=$((number + 1)); done
+  case "$FAULTS_AT" in git | "git $command $number")
+    trace="$FAULTS_TRACES/$command $number"
+    pwd -P >"$trace/folder"
+    exec strace -y -o "$trace/calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
+    ;;
+  esac
+fi
+exec "$FAULTS_EXEC/$program" "$@"
 """
 
 
 @dataclass(frozen=True)
 class Strace:
-    """How to run strace, from when on: the start of a thread, or of a git command."""
+    """How to run strace, and on what: a thread from its start, or processes of git.
+
+    ``at``: a thread's name, :data:`GIT`, or the n-th process of one git command, ``git push 1``.
+    """
 
     options: Sequence[str]
     at: str = "MainThread"
+
+    @property
+    def is_of_git(self) -> bool:
+        """Whether it traces processes of git."""
+        return self.at.split()[0] == GIT
+
+
+@dataclass(frozen=True)
+class GitTrace:
+    """The calls of one process of git: ``git push``, the how many-th, and where it started."""
+
+    command: str
+    which: int
+    folder: str
+    text: str
 
 
 @dataclass(frozen=True)
@@ -60,6 +94,7 @@ class Ran:
     err: str
     trace: str = ""
     roles: dict[int, str] = field(default_factory=dict)
+    git: tuple[GitTrace, ...] = ()
     hangs: str = ""
 
     @property
@@ -82,9 +117,7 @@ class Rig:
         self.state, self.home = self.folder / "state.git", self.folder / "home"
         self.address = self.state.as_uri() if remote else str(self.state)
         self.scratch.mkdir(parents=True)
-        wrapper = self.scratch / "git"
-        wrapper.write_text(_GIT)
-        wrapper.chmod(0o755)
+        self._wrap_git()
         self.folder.mkdir()
         self.must(self.demandops("init", str(self.state), "--bare"))
         began = time.monotonic()
@@ -92,6 +125,20 @@ class Rig:
         self.must(self.book(0))
         self.limit = max(LIMIT_S, PATIENCE * (time.monotonic() - began))
         self.save()
+
+    def _wrap_git(self) -> None:
+        """Have every program of git start by way of a script, those that git starts too."""
+        wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
+        wrapper.write_text(_GIT)
+        wrapper.chmod(0o755)
+        self._git.mkdir()
+        for program in _git_core().glob("git*"):
+            (self._git / program.name).symlink_to(wrapper)
+
+    def unlock_server(self) -> None:
+        """Remove the locks that git left in the state repo."""
+        for lock in self.state.rglob("*.lock"):
+            lock.unlink()
 
     def must(self, ran: Ran) -> Ran:
         """Return the process' result; it must have done its work."""
@@ -119,18 +166,22 @@ class Rig:
         self, *command: str, strace: Strace | None = None, limit: float = PLENTY_S
     ) -> Ran:
         """Run a command in a process of its own."""
-        paths = {name: self.scratch / name for name in ("out", "err", "trace", "once")}
+        paths = {name: self.scratch / name for name in ("out", "err", "trace")}
         for path in paths.values():
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
+        traces = self.scratch / "traces"
+        shutil.rmtree(traces, ignore_errors=True)
+        traces.mkdir()
         environment = NO_GIT_CONFIG | {
             "DEMANDOPS_DATA_HOME": str(self.home),
-            "PATH": f"{self.scratch}:{os.environ['PATH']}",
-            "FAULTS_GIT": str(shutil.which("git")),
-            "FAULTS_ONCE": str(paths["once"]),
+            "PATH": f"{self._git}:{os.environ['PATH']}",
+            "GIT_EXEC_PATH": str(self._git),
+            "FAULTS_EXEC": str(_git_core()),
+            "FAULTS_TRACES": str(traces),
+            "FAULTS_AT": "",
         }
-        if strace is not None:
-            environment["FAULTS_COMMAND"] = strace.at
-            environment["FAULTS_STRACE"] = " ".join(_strace(strace, paths["trace"])[1:])
+        if strace is not None and strace.is_of_git:
+            environment |= {"FAULTS_AT": strace.at, "FAULTS_STRACE": " ".join(strace.options)}
         told, tell = os.pipe()
         waits, go = os.pipe()
         process = os.fork()
@@ -141,7 +192,8 @@ class Rig:
             _become(command, paths["out"], paths["err"], tell, waits)
         os.close(tell)
         os.close(waits)
-        return self._watch(process, told, go, strace, paths, limit)
+        ran = self._watch(process, told, go, strace, paths, limit)
+        return replace(ran, git=tuple(_git_traces(traces)))
 
     def _watch(
         self,
@@ -188,7 +240,6 @@ class Rig:
             os.close(end)
         if tracer is not None:
             tracer.communicate()
-        del paths["once"]
         texts = {
             name: path.read_text(errors="replace") if path.exists() else ""
             for name, path in paths.items()
@@ -203,14 +254,22 @@ def goal(number: int) -> Goal:
     return numbered(number)
 
 
-def _strace(strace: Strace, out: Path) -> list[str]:
-    return ["strace", "-y", "-o", str(out), *strace.options]
+@cache
+def _git_core() -> Path:
+    return Path(subprocess.check_output(["git", "--exec-path"], text=True).strip())
+
+
+def _git_traces(folder: Path) -> Iterator[GitTrace]:
+    for calls in sorted(folder.glob("*/calls")):
+        command, number = calls.parent.name.rsplit(" ", 1)
+        started_in = calls.with_name("folder").read_text().strip()
+        text = calls.read_text(errors="replace")
+        yield GitTrace(f"{GIT} {command}", int(number), started_in, text)
 
 
 def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
-    tracer = subprocess.Popen(
-        [*_strace(strace, out), "-p", str(thread)], stderr=subprocess.PIPE, text=True
-    )
+    command = ["strace", "-y", "-o", str(out), *strace.options, "-p", str(thread)]
+    tracer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert tracer.stderr is not None
     line = tracer.stderr.readline()
     assert "attached" in line, line

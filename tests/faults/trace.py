@@ -66,10 +66,12 @@ def file_class(path: str, root: Path) -> str:
 def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
     """Return the calls that touch a file below ``root``, in the order in which they ended.
 
-    ``roles`` names the threads; a process that executes a program is called after it. The first
-    process starts in ``folder``.
+    ``roles`` names threads and processes; any other process is called after the program that it
+    executes. The first process starts in ``folder``.
     """
-    roles, folders, counts = dict(roles), dict[int, str](), dict[tuple[int, str], int]()
+    known, roles = set(roles), dict(roles)
+    folders: dict[int, str] = {}
+    counts: dict[tuple[int, str], int] = {}
     first = _LINE.match(text)
     if first:
         folders[int(first[1])] = folder
@@ -91,10 +93,8 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
         paths = [
             os.path.normpath(path) for path in _paths(kind, arguments, folders.get(process, "/"))
         ]
-        if kind == "execve" and result.startswith("0"):
+        if kind == "execve" and result.startswith("0") and process not in known:
             roles[process] = _program(arguments, roles.get(process, ""))
-            if roles[process].startswith("git ") and " > " not in roles[process]:
-                counts = {key: n for key, n in counts.items() if key[0] != process}
         elif kind == "chdir" and not result.startswith("-1"):
             folders[process] = paths[0]
         inside = tuple(path for path in paths if path.startswith(f"{root}/"))

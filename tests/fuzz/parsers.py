@@ -12,10 +12,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import click
 import pygit2
 import yaml
 from application_manager_interfaces.action import DeploymentRequest
 from demandops import strict_yaml
+from demandops.cli import contexts
+from demandops.cli.actions.override import ends_at
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import Target as ReleaseTarget
 from demandops.config import override, policy
@@ -23,9 +26,20 @@ from demandops.config.base_model import parse_file
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
+from demandops.detection.detector import Detector, Want
+from demandops.detection.events.detection_state import Observation
+from demandops.detection.message_reader import MessageReader, Unreadable
+from demandops.detection.rules import rule_file
+from demandops.detection.rules.rule_file import RuleFile
 from demandops.errors import InvalidInput
 from demandops.forge import ForgeError, Gitea, GitHub
-from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
+from demandops.ledger import (
+    claim_file,
+    ended_override_file,
+    kept_replicas,
+    recent_shutdowns,
+    waiting,
+)
 from demandops.ledger.ledger import Ledger
 from demandops.migration import imported_goals, reference_files, reference_map
 from demandops.service.push_webhook import PushWebhook
@@ -38,7 +52,7 @@ from demandops_ros import messages
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import golden, rich
+from tests.kit import detection, golden, rich
 from tests.kit.cluster import Letters, condition, deployment
 from tests.kit.config import configuration
 from tests.kit.goals import EXPERIMENT
@@ -246,10 +260,143 @@ def shutdown(data: bytes) -> None:
     recent_shutdowns.read_all({recent_shutdowns.path_of("0f" * 10): _text(data)})
 
 
+def replicas(data: bytes) -> None:
+    path = kept_replicas.path_of(("replicas", "object-fusion", "edge", "", "", "", "", ""))
+    record = kept_replicas.read(_text(data), path)
+    assert record is None or kept_replicas.read(kept_replicas.text_of(*record), path) == record
+
+
+def waiting_demand(data: bytes) -> None:
+    path = waiting.path_of("x")
+    record = waiting.read(_text(data), path)
+    if record is not None:
+        assert waiting.read(waiting.text_of(record), path) == record
+        goal_as_data(dict(record.goal))
+
+
+# ---- files that only one person or one program reads ----
+
+
+def contexts_file(data: bytes) -> None:
+    os.environ["XDG_CONFIG_HOME"] = str(_folder())
+    contexts.path().parent.mkdir(exist_ok=True)
+    contexts.path().write_bytes(data)
+    try:
+        content = contexts.read()
+    except InvalidInput as error:
+        _told(error)
+        return
+    contexts.write(content)
+    assert contexts.read() == content
+
+
+def detector_rules(data: bytes) -> None:
+    """Rules that are read also compile, take what is seen, and want goals."""
+    try:
+        file = rule_file.read(_text(data), "rules.yaml")
+    except InvalidInput as error:
+        _told(error)
+        return
+    detector, wants = Detector(file, 0.0), list[Want]()
+    for number, now in enumerate((0.0, 0.5, 2.0, 30.0, 1e5)):
+        seen = [
+            one
+            for source in file.sources
+            for entity in ("a", "b")
+            for one in _seen(file, source, entity, now, number)
+        ]
+        wants += [want for _, want in detector.step(seen[:20], now)]
+    wants += detector.replace_rules(file, 1e5, 1.0)
+    for want in wants[:5]:
+        if want.goal is not None:
+            goal_as_data(want.goal)
+
+
+def _seen(
+    file: RuleFile, source: str, entity: str, now: float, number: int
+) -> Iterable[Observation]:
+    """Yield what a message of any type says whose fields are all the same."""
+    with suppress(Unreadable):
+        yield MessageReader(file, source).observation(_Message(number * 3.0), entity, now)
+
+
+class _Message(float):
+    """A number that has every field, and itself in it."""
+
+    def __getattr__(self, name: str) -> _Message:
+        return self
+
+    def __getitem__(self, place: int) -> _Message:
+        return self
+
+    def __str__(self) -> str:
+        return "entity"
+
+
+def end_of_override(data: bytes) -> None:
+    ends_at(_text(data))
+
+
+_WAITING = b"""apiVersion: demandops.ledger/v2
+kind: WaitingDemand
+demand: x
+request: x
+requesters:
+- vehicle00
+since: "2026-01-31T12:00:00.000000Z"
+priority: 5
+goal:
+  kind: Demand
+  demand: x
+  requesters: [vehicle00]
+  applications:
+  - id: x
+    type: object-detection-fusion
+    place: {role: edge}
+    inputs: {ego_data: [{topic: /ego, source: vehicle00}]}
+"""
+_CONTEXTS = b"""apiVersion: demandops/v1
+kind: Contexts
+current: fleet
+contexts:
+  fleet: {stateRepo: https://git.example/fleet.git, clusters: /etc/clusters.yaml, signingKey: /k}
+  other: {stateRepo: ../other}
+"""
+_SQUARE = [{"x": x, "y": y} for x, y in ((0, 0), (9, 0), (9, 9), (0, 9))]
+_AREA = {"source": "cars", "polygon": _SQUARE}
+_RULES = (
+    Path(__file__).parents[2].joinpath("examples/experiment/rules.yaml").read_bytes(),
+    *(
+        detection.text_of(detection.rule("r", **condition)).encode()
+        for condition in (
+            {"near": {"source": "cars", "point": {"x": 1, "y": 2}, "start": 5, "stop": 9}},
+            {"near": {**_AREA, "start": 5, "stop": 9}, "dwell": "1s", "retry": "5s"},
+            {"together": {"source": "cars", "other": "bikes", "start": 5, "stop": 9}},
+            {"count": {**_AREA, "start": 2, "stop": 1}},
+            {
+                "threshold": {
+                    "source": "batteries",
+                    "field": "percentage",
+                    "below": 3,
+                    "stop": 8,
+                }
+            },
+            {"schedule": {"start": "06:00", "stop": "22:00", "days": ["mon"], "zone": "UTC"}},
+        )
+    ),
+)
 _MARKER = (
     b'apiVersion: demandops.ledger/v1\nkind: EndedOverride\noverride: x\nexpires: "2026-01-31T12:00'
     b':00Z"\n'
 )
+_REPLICAS = b"""apiVersion: demandops.ledger/v2
+kind: KeptReplicas
+service: object-fusion
+node: edge
+keeps:
+- replicas: 3
+  until: "2026-01-31T12:00:00.000000Z"
+"""
 _SHUTDOWN = b"""apiVersion: demandops.ledger/v2
 kind: Shutdown
 digest: 0f0f0f0f0f0f0f0f0f0f
@@ -470,6 +617,15 @@ TARGETS = (
     Target(claim, _bytes(path for path in _BOOKED if "shutdowns" not in path.parts)),
     Target(marker, (_MARKER,)),
     Target(shutdown, (_SHUTDOWN,)),
+    Target(replicas, (_REPLICAS,)),
+    Target(waiting_demand, (_WAITING,)),
+    Target(contexts_file, (_CONTEXTS,)),
+    Target(detector_rules, _RULES),
+    Target(
+        end_of_override,
+        (b"2h", b"3d", b"1h30m", b"2027-01-31T18:00:00Z"),
+        expected=(click.BadParameter,),
+    ),
     Target(
         journal_line,
         (journal._sealed(_LINES, "")[0], *(json.dumps(one).encode() + b"\n" for one in _LINES)),

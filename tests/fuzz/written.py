@@ -17,7 +17,11 @@ import pygit2
 import pyjson5
 import yaml
 from demandops import naming, strict_yaml
+from demandops.cli.actions.override import new_override
+from demandops.cli.actions.person_change import Way
+from demandops.config.base_model import parse_file
 from demandops.config.load import load
+from demandops.config.override import Override, OverrideFile
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_goal import _value_problem
@@ -188,6 +192,19 @@ def name_of_object(ids: tuple[str, str]) -> None:
         assert not topic_problem(f"/{naming.topic_part(*ids)}"), ids
 
 
+def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
+    """What a person gives a command is in the file as it was given, or refused."""
+    reason, owner, nodes, patch = words
+    way = Way("", None, " ".join(reason.split()) or "x", False, False, False, "text")
+    given = {"owner": owner or "x", "values": patch}
+    text = new_override(None, "x", way, {"node": (*nodes,)}, given)  # type: ignore[arg-type]
+    wanted = {"reason": way.reason, **given, "select": [{"node": nodes}]}
+    data = strict_yaml.load(text)
+    assert {key: data[key] for key in wanted} == wanted
+    assert text.startswith("# yaml-language-server: ") and _yaml(text) == data
+    Override.from_file("x", parse_file(OverrideFile, text, "overrides/x.yaml"))
+
+
 # ---- Git and forges ----
 
 
@@ -231,6 +248,7 @@ def pull_request(words: tuple[str, list[str]]) -> None:
 
 
 _PAIR = st.tuples(TEXT, TEXT)
+_PATCH = st.dictionaries(TEXT, values, max_size=3).filter(lambda one: not _value_problem(one, 0))
 
 TARGETS = (
     Target(text_in_yaml, values=TEXT),
@@ -239,6 +257,10 @@ TARGETS = (
     Target(
         rendered_file,
         values=st.tuples(st.integers(), st.lists(TEXT, min_size=1, max_size=3)).map(_filled),
+    ),
+    Target(
+        override_by_command,
+        values=st.tuples(TEXT, TEXT, st.lists(TEXT, min_size=1, max_size=2), _PATCH),
     ),
     Target(ledger_path, values=_PAIR),
     Target(name_of_object, values=_PAIR),

@@ -136,6 +136,7 @@ class TestWhy:
         assert found["stopped"]["operation"] == "shutdown"
         assert found["stopped"]["why"].endswith("in the name of vehicle00, station00.")
         assert ask("why", PATH)["stopped"] == found["stopped"]
+        assert ask("why", DETECTION[:-1])["name"] == DETECTION
 
     def test_what_ran_before(self, ask: Run, played: Any) -> None:
         found = ask("why", DETECTION, "--at", "main~2")
@@ -150,6 +151,26 @@ class TestWhy:
         gone = ask("why", "vehicle00/edge")
         assert (gone["kind"], gone["runs"]) == ("connection", False)
         assert gone["stopped"]["requesters"] == ["vehicle00", "station00"]
+
+    def test_an_application_definition_a_requester_and_an_override(
+        self, ask: Run, played: Any, demandops: Run
+    ) -> None:
+        found = ask("why", "object-detection-fusion")
+        assert (found["kind"], found["runs"]) == ("appdef", True)
+        assert found["file"] == "appdefs/object-detection-fusion/appdef.yaml"
+        assert FUSION in [one["name"] for one in found["releases"]]
+        assert {one["subject"]["id"] for one in found["claims"]} == {APP}
+        found = ask("why", "vehicle02", "--kind", "requester")
+        assert found["runs"]
+        assert {who for one in found["claims"] for who in one["requesters"]} >= {"vehicle02"}
+        select = ["--service", "object-fusion", "--replicas", "0", "-m", "a test"]
+        where = ("--state-repo", played.path)
+        assert demandops("override", "create", "quiet", *select, *where).code == 0
+        found = ask("why", "quiet")
+        assert (found["kind"], found["file"]) == ("override", "overrides/quiet.yaml")
+        assert [one["name"] for one in found["releases"]] == [FUSION]
+        out = demandops("why", "quiet", *where).out
+        assert out.startswith(f"override quiet is not rendered yet at {played.tip[:10]}\n")
 
     def test_a_claim_by_its_file(self, ask: Run, played: Any) -> None:
         path = next(p for p in played.files("ledger/connections/"))
@@ -205,9 +226,9 @@ class TestWhy:
 
     def test_a_near_miss(self, demandops: Run, played: Any) -> None:
         for name, hint in (
-            ("od-edge-vehicle0", DETECTION),  # which ran once
+            ("od-edge-vehicle09", DETECTION),  # which ran once
             ("vehicle02/edgy", "vehicle02/edge"),
-            (FUSION[:-1], FUSION),
+            (f"{FUSION[:-1]}x", FUSION),
         ):
             told = f"error: nothing called '{name}' runs or ever ran; did you mean '{hint}'?\n"
             assert demandops("why", name, "--state-repo", played.path) == (1, "", told)
@@ -243,7 +264,7 @@ class TestLogFilters:
         for filters, operations in (
             ("--requester vehicle01", ["shutdown", "join"]),
             ("--requester vehicle01 --operation join", ["join"]),
-            ("--requester nobody", []),
+            ("--requester vehicle01 main~6", []),
             ("--connection vehicle03/edge", ["join"]),
             (f"--application {APP} -n 3", ["shutdown", "shutdown", "join"]),
             ("--operation init", ["init"]),
@@ -278,8 +299,21 @@ class TestLogFilters:
         ran = demandops("log", "--since", "soon", "--state-repo", played.path)
         assert ran.code == 2
         assert "'soon' is not a time; write it like 2026-01-31T14:03" in ran.err
-        ran = demandops("log", "--requester", "nobody", "--state-repo", played.path)
+        ran = demandops("log", "--requester", "vehicle01", "main~6", "--state-repo", played.path)
         assert (ran.code, ran.out) == (0, "no commit matches\n")
+
+    def test_what_no_commit_is_about_is_refused(self, demandops: Run, played: Any) -> None:
+        options = ("--requester", "vehicle1", "--node", "egde", "--application", "nothing")
+        ran = demandops("log", *options, "--state-repo", played.path)
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            "error: --requester: no commit is about 'vehicle1'; did you mean 'vehicle01'?\n"
+            f"error: --application: no commit is about 'nothing'; known: {APP}\n"
+            "error: --node: there is no node 'egde'; did you mean 'edge'?\n"
+        )
+        ran = demandops("log", "--operation", "joyn", "--state-repo", played.path)
+        assert ran.code == 2
+        assert "'joyn' is not one of 'join', 'shutdown'" in ran.err
 
 
 def test_bookkeeping_at_a_time(ask: Run, played: Any) -> None:
@@ -300,7 +334,7 @@ def test_one_thing_has_the_documented_keys_in_every_command(
     back = ask("rollback", "main~1", "--dry-run")
     failed = demandops("log", "nothing", "--state-repo", played.path, "--output", "json")
     assert keys["commit"] == [*ask("log")[0]] == list(told["started"])[:-1]
-    assert keys["claim"] == [*back["restored"][0]] == [*told["claims"][0]][:-3]
+    assert keys["claim"] == [*back["restored"][0]] == [*told["claims"][0]][:-4]
     assert keys["subject"] == [*told["subject"]] == [*told["claims"][0]["subject"]]
     assert keys["release"] == [*told["releases"][0]] == [*ask("status")["releases"][0]][:-9]
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]

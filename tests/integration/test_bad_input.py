@@ -14,8 +14,10 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.cli.contexts import ContextsFile
 from demandops.cli.repo.schema import SCHEMAS
 from demandops.cluster.access import AccessFile
+from demandops.detection.rules.rule_file import RuleFile
 from demandops.migration.reference_map import ReferenceMap
 
 from tests.kit.goals import perception
@@ -123,7 +125,8 @@ def test_a_mistake_anywhere_in_a_goal_changes_nothing(
 
 
 def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
-    shown = {model for model, _ in SCHEMAS.values()} - {AccessFile, ReferenceMap}
+    of_other_tests = {AccessFile, ContextsFile, ReferenceMap, RuleFile}
+    shown = {model for model, _ in SCHEMAS.values()} - of_other_tests
     assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
 
 
@@ -199,15 +202,16 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
     ),
     "a number that YAML 1.1 reads into a time": (
         "id: 12:30:45\n",
-        "{file}: request 0 '' refused\n  id: must be text, not 45045; put it in quotes\n",
+        "{file}: request 0 '' refused\n  line 1: id: must be text, not 45045; put it in quotes\n",
     ),
     "a number beyond a byte": (
         "connections: [{id: c, type: " + "9" * 4000 + "}]\n",
-        "{file}: request 0 '' refused\n  connections[0].type: ",
+        "{file}: request 0 '' refused\n  line 1: connections[0].type: ",
     ),
     "an infinite number": (
         "connections: [{id: c, type: .inf}]\n",
-        "{file}: request 0 '' refused\n  connections[0].type: must be a whole number, not inf\n",
+        "{file}: request 0 '' refused\n"
+        "  line 1: connections[0].type: must be a whole number, not inf\n",
     ),
 }
 

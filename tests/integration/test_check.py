@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from demandops.cli.main import run
 
 from tests.kit.cli import Run
-from tests.kit.goals import put
-from tests.kit.repo import git
+from tests.kit.goals import EXPERIMENT, put
+from tests.kit.repo import GitRepo, git
 
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 
@@ -32,6 +33,9 @@ spec:
     kind: GitRepository
     name: "demandops"
 """
+NO_HELM = "charts not rendered: helm is missing\n"
+LINK: dict[str, object] = {"id": "a/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
+LINK |= {"topics": [{"source": "/a"}]}
 Check = Callable[..., tuple[int, str, str]]
 
 
@@ -55,7 +59,30 @@ def edit(file: Path, old: str, new: str) -> None:
 
 
 def test_what_init_laid_down_is_sound(check: Check) -> None:
-    assert check() == (0, "REPO: all files are valid and everything renders\n", "")
+    assert check() == (0, "REPO: all files are valid and every release renders\n" + NO_HELM, "")
+
+
+def test_a_pipeline_may_require_helm(check: Check) -> None:
+    code, out, errors = check("--require-helm")
+    assert (code, out.splitlines()[:1]) == (1, [])
+    assert errors == (
+        "error: charts not rendered: helm is missing; install it and put it on PATH, or name it in "
+        "HELM_BIN\n"
+    )
+
+
+def test_a_changed_library_needs_new_versions_of_its_charts(checkout: Path, check: Check) -> None:
+    library = "appdefs/charts/ros-service"
+    edit(checkout / library / "values.yaml", "domainId: 0", "domainId: 1")
+    code, _, errors = check()
+    assert code == 1
+    assert errors == "".join(
+        f"error: {folder}/{chart}/Chart.yaml:5: version: is still 0.1.0, but {library}/values.yaml "
+        f"changed; raise it here and at charts.{chart} in registry/charts.yaml, or no cluster "
+        "applies it\n"
+        for folder in ["appdefs/object-detection-fusion/charts"]
+        for chart in ("object-detection", "object-fusion")
+    )
 
 
 def test_a_chart_that_changed_without_a_new_version_is_caught(checkout: Path, check: Check) -> None:
@@ -63,7 +90,7 @@ def test_a_chart_that_changed_without_a_new_version_is_caught(checkout: Path, ch
     code, _, errors = check()
     assert code == 1
     assert errors == (
-        f"error: {CHART}/Chart.yaml: version: is still 0.1.0, but values.yaml changed; raise it "
+        f"error: {CHART}/Chart.yaml:5: version: is still 0.1.0, but values.yaml changed; raise it "
         "here and at charts.object-fusion in registry/charts.yaml, or no cluster applies it\n"
     )
 
@@ -78,7 +105,7 @@ def test_a_chart_that_changed_with_a_new_version_is_fine_and_shows_what_follows(
     code, out, errors = check()
     assert (code, errors) == (0, "")
     assert out == (
-        "REPO: all files are valid and everything renders\n"
+        f"REPO: all files are valid and every release renders\n{NO_HELM}"
         "\n"
         "what merging would do since BASE:\n"
         "\n"
@@ -113,6 +140,50 @@ def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
     assert (code, errors) == (1, f"error: {checkout} is not a Git checkout; leave out --base\n")
 
 
+def test_an_input_that_the_merge_keeps_from_arriving_is_told(
+    state: GitRepo, tmp_path: Path, demandops: Run
+) -> None:
+    assert demandops("request", EXPERIMENT[0], "--state-repo", state.path).code == 0
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(state.path), str(clone))
+    (clone / "overrides" / "rest.yaml").write_text(
+        "apiVersion: demandops/v1\nkind: Override\nreason: why\nowner: petra\n"
+        "select: [{connections: [vehicle00/edge]}]\ndeny: true\n"
+    )
+    ran = demandops("check", clone)
+    told = [line for line in ran.err.splitlines() if "does not arrive" in line]
+    assert len(told) == 2
+    assert told[0].startswith("warning: ledger/applications/")
+    git(clone, "add", "--all")
+    git(clone, "commit", "--quiet", "--message=Rest")
+    git(clone, "push", "--quiet")
+    assert "does not arrive" not in demandops("check", clone).err, "it did not change this"
+
+
+def test_what_the_merge_target_has_already_is_no_consequence(
+    state: GitRepo, tmp_path: Path, demandops: Run
+) -> None:
+    files = state.files()
+    state.commit(
+        {
+            "inventory/clusters.yaml": files["inventory/clusters.yaml"] + "  - name: other\n",
+            "inventory/nodes.yaml": files["inventory/nodes.yaml"].replace(
+                "type: cloud\n    cluster: c-its", "type: cloud\n    cluster: other"
+            ),
+        }
+    )
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(state.path), str(clone))
+    written = "the generator will write or remove"
+    assert written in demandops("check", clone).out
+    given = yaml.safe_dump(put("a", "vehicle00", applications=[], connections=[LINK]))
+    assert demandops("request", "-", "--state-repo", state.path, stdin=given).code == 0
+    git(clone, "fetch", "--quiet")
+    out = demandops("check", clone).out
+    assert written not in out
+    assert "the merge target has 2 commits that this checkout lacks: git pull --rebase" in out
+
+
 def test_a_folder_that_is_no_state_repo(demandops: Run, tmp_path: Path) -> None:
     said = (
         f"error: {tmp_path} is not a state repo, because it has no demandops.yaml; `demandops "
@@ -123,6 +194,8 @@ def test_a_folder_that_is_no_state_repo(demandops: Run, tmp_path: Path) -> None:
 
 def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None:
     edit(checkout / "inventory" / "brokers.yaml", "node: edge", "node: egde")
+    text = (checkout / "inventory" / "brokers.yaml").read_text()
+    line = text[: text.index("egde")].count("\n") + 1
     code, out, _ = check("--output", "json")
     assert code == 1
     found = json.loads(out)
@@ -132,6 +205,7 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
             "file": "inventory/brokers.yaml",
             "field": "brokers[1].node",
             "message": "'egde' is not in nodes.yaml; did you mean 'edge'?",
+            "line": line,
         }
     ]
     assert (found["releases"], found["files"], found["bookkeeping"]) == (None, None, None)
@@ -144,7 +218,7 @@ def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Chec
     report.write_text("problems: []\n")
     git(checkout, "add", "--all")
     git(checkout, "commit", "-qm", "Report what is not valid in the state repo")
-    assert check() == (0, "REPO: all files are valid and everything renders\n", "")
+    assert check() == (0, "REPO: all files are valid and every release renders\n" + NO_HELM, "")
     report.unlink()
     code, _, err = check()
     assert code == 1
@@ -174,12 +248,12 @@ def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check
     assert code == 0
     charts = "appdefs/object-detection-fusion/charts"
     assert [line.split(": ")[1] for line in errors.splitlines()] == [
-        f"{charts}/object-detection/templates/serviceaccount.yaml",
-        *[f"{charts}/object-fusion/templates/serviceaccount.yaml"],
+        "appdefs/charts/ros-service/templates/_serviceaccount.yaml",
         *[f"{charts}/object-fusion/templates/watcher-rbac.yaml"] * 2,
         "bootstrap/c-its.yaml",
     ]
     assert errors.splitlines()[-1] == (
         "warning: bootstrap/c-its.yaml: changes with the merge, and no controller applies it; "
-        "apply it to the cluster again: kubectl apply -f bootstrap/c-its.yaml"
+        "afterwards, an administrator of cluster 'c-its' applies it: "
+        "git show main:bootstrap/c-its.yaml | kubectl apply -f -"
     )

@@ -19,7 +19,17 @@ import yaml
 from demandops import __version__
 from demandops.cli.views import bookkeeping
 
-from tests.kit.goals import APP, CLOUD, EXPERIMENT, Goal, application, connection, goal, perception
+from tests.kit.goals import (
+    APP,
+    CLOUD,
+    EXPERIMENT,
+    Goal,
+    application,
+    connection,
+    goal,
+    perception,
+    put,
+)
 from tests.kit.repo import FORGER, git
 
 SHA = re.compile(r"[0-9a-f]{40}")
@@ -37,6 +47,11 @@ NO_CARRIER = (
 )
 
 Run = Callable[..., Any]
+
+
+def cells_of(table: str) -> list[list[str]]:
+    """Return the cells of a table without empty ones."""
+    return [re.split(r"\s{2,}", line) for line in table.splitlines()]
 
 
 def text(*goals: Goal) -> str:
@@ -87,6 +102,62 @@ class TestInit:
         assert kinds[-2:] == ["AppProject", "Application"]
         assert "GitRepository" not in kinds
 
+    def test_without_a_url_no_cluster_can_follow_it(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "state"
+        ran = demandops("init", folder)
+        assert "kubectl" not in ran.out
+        assert "no cluster can follow it yet: write the url that clusters fetch" in ran.out
+        assert not (folder / "bootstrap").exists()
+        root = folder / "demandops.yaml"
+        root.write_text(
+            root.read_text().replace("# url: https://git.example", "url: https://git.own")
+        )
+        ran = demandops("check", folder)
+        assert ran.code == 0
+        assert "write  bootstrap/c-its.yaml" in ran.out
+
+    def test_argo_cd_needs_a_url(self, demandops: Run, tmp_path: Path) -> None:
+        ran = demandops("init", tmp_path / "state", "--gitops", "argocd")
+        assert (ran.code, ran.out) == (1, "")
+        assert ran.err == (
+            "error: --gitops argocd needs --url, because all its manifests name the URL from which "
+            "the clusters fetch the state repo: --url https://HOST/PATH or git@HOST:PATH\n"
+        )
+        assert not (tmp_path / "state").exists()
+
+    def test_an_address_as_git_writes_it(self, demandops: Run, tmp_path: Path) -> None:
+        folder = tmp_path / "state"
+        ran = demandops("init", folder, "--url", "git@git.example:fleet/state.git")
+        assert ran.code == 0
+        assert f"git -C {folder} show main:bootstrap/c-its.yaml | kubectl apply -f -" in ran.out
+        url = "ssh://git@git.example/fleet/state.git"
+        assert yaml.safe_load((folder / "demandops.yaml").read_text())["flux"]["url"] == url
+        assert url in (folder / "bootstrap" / "c-its.yaml").read_text()
+        root = folder / "demandops.yaml"
+        root.write_text(root.read_text().replace(url, "git@git.example:fleet/state.git"))
+        assert demandops("check", folder).err == (
+            "error: demandops.yaml:12: flux.url: 'git@git.example:fleet/state.git' is not a URL, "
+            f"which the controllers need; write {url}\n"
+        )
+
+    @pytest.mark.parametrize("gitops", ["flux", "argocd"])
+    def test_an_empty_fleet(self, demandops: Run, tmp_path: Path, gitops: str) -> None:
+        folder, url = tmp_path / "state", "https://git.example/own.git"
+        options = ["--url", url, "--gitops", gitops, "--example", "none"]
+        assert demandops("init", folder, *options).code == 0
+        ran = demandops("check", folder)
+        assert (ran.code, ran.err) == (0, "")
+        assert [path.name for path in (folder / "appdefs").iterdir()] == ["charts"]
+        for path in (folder / "inventory").iterdir():
+            assert not yaml.safe_load(path.read_text())[path.stem]
+        texts = "".join(
+            path.read_text() for top in ("policy", "registry") for path in (folder / top).iterdir()
+        )
+        assert "perception" not in texts.replace("collective", "")
+        assert list(
+            yaml.safe_load((folder / "registry" / "images.yaml").read_text())["images"]
+        ) == ["mqtt-client"]
+
     def test_an_empty_folder_is_used_also_the_one_that_one_stands_in(
         self, demandops: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -126,10 +197,10 @@ class TestInit:
 class TestRequest:
     def test_the_json_is_what_programs_rely_on(self, state: Any, request_json: Run) -> None:
         asked = goal([application(), application("other")], shutdown=True)
-        before = state.tip
-        ran = request_json(
-            goal([application()], id="r"), goal([application(node="egde")], id="s"), asked
-        )
+        goals = goal([application()], id="r"), goal([application(node="egde")], id="s"), asked
+        before, given = state.tip, text(*goals)
+        line = given[: given.index("egde")].count("\n") + 1
+        ran = request_json(*goals)
         assert (ran.code, ran.err) == (1, "")
         booked, refused, released = ran.json()
         assert list(booked) == list(refused) == REQUEST_KEYS
@@ -152,6 +223,7 @@ class TestRequest:
                 "file": "",
                 "field": "apps[0].header.node_id",
                 "message": "'egde' is not in inventory/nodes.yaml; did you mean 'edge'?",
+                "line": line,
             }
         ]
         assert (released["outcome"], released["commit"]) == ("released", state.tip)
@@ -172,8 +244,8 @@ class TestRequest:
         assert ran.err == (
             f"  warning: {NO_CARRIER}\n"
             "standard input: request 1 'two' refused\n"
-            "  apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you mean "
-            "'edge'?\n"
+            "  line 21: apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you "
+            "mean 'edge'?\n"
             "  not held: application 'other' for vehicle00\n"
         )
 
@@ -196,6 +268,21 @@ class TestRequest:
             (4, "a2"),
         ]
         assert [row["commit"] for row in rows] == log_of(demandops, state)[:5][::-1]
+
+    def test_what_documents_demand_is_released(self, demandops: Run, state: Any) -> None:
+        where = ("--state-repo", state.path)
+        link = {"id": "d/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
+        link |= {"topics": [{"source": "/d"}]}
+        ours = put("d", "vehicle00", applications=[], connections=[link], lease=600)
+        given = text(perception(), ours)
+        ran = demandops("request", "-", *where, stdin=given)
+        assert ran.code == 0
+        assert (
+            ran.err == "  warning: lease: 600 is 600 seconds; write the unit, like 600s or 600m\n"
+        )
+        ran = demandops("request", "-", "--release", *where, "-o", "json", stdin=given)
+        assert [row["outcome"] for row in ran.json()] == ["released", "released"]
+        assert demandops("get", "claims", *where, "-o", "name").out.strip() == ""
 
     def test_empty_documents_are_passed_over(self, demandops: Run, state: Any) -> None:
         given = f"---\n---\n{text(perception())}\n---\n# nothing\n---\n{text(perception())}"
@@ -234,9 +321,9 @@ class TestRequest:
     @pytest.mark.parametrize(
         "command",
         [
-            ("bookkeeping",), ("decommission", "n"), ("diff", "a", "b"), ("log",), ("overrides",),
-            ("proposals",), ("rollback", "r", "-m", "why"), ("status",), ("upgrade",), ("verify",),
-            ("why", "n"),
+            ("bookkeeping",), ("decommission", "n"), ("diff", "a", "b"), ("get", "overrides"),
+            ("get", "proposals"), ("log",), ("rollback", "r", "-m", "why"), ("status",),
+            ("upgrade",), ("verify",), ("why", "n"),
         ],
     )  # fmt: skip
     def test_a_command_that_fails_prints_its_faults_as_json(
@@ -246,7 +333,7 @@ class TestRequest:
         told, text = demandops(*command, *where), demandops(*command, *where[:2])
         (fault,) = told.json()["faults"]
         assert (told.code, text.code, text.out) == (1, 1, "")
-        assert list(fault) == ["code", "field", "message", "file"]
+        assert list(fault) == ["code", "field", "message", "file", "line"]
         assert told.err == text.err == f"error: {fault['message']}\n"
 
     def test_a_dry_run_shows_the_consequence_and_books_nothing(
@@ -287,7 +374,9 @@ class TestRequest:
             "released",
             "unchanged",
         ]
-        assert all(list(row) == REQUEST_KEYS for row in ran.json())
+        keys = [*REQUEST_KEYS, "releases", "files"]
+        assert all(list(row) == keys for row in ran.json() if row["outcome"] != "refused")
+        assert [each["change"] for each in ran.json()[0]["releases"]] == ["start"] * 4
         assert (ran.code, state.tip) == (1, before)
 
     def test_the_experiments_files_as_they_are(self, demandops: Run, state: Any) -> None:
@@ -356,6 +445,13 @@ class TestBookkeeping:
                     "requesters": ["vehicle00"],
                 }
             },
+            "demands": {
+                "f55dfde4475a5cd804f0": {
+                    "action": "DeploymentRequest",
+                    "request": "request",
+                    "requesters": ["vehicle00"],
+                }
+            },
             "commit": joined.tip,
         }
 
@@ -377,11 +473,10 @@ class TestBookkeeping:
     def test_the_text_is_a_table(self, demandops: Run, joined: Any) -> None:
         ran = demandops("bookkeeping", "--state-repo", joined.path)
         assert (ran.code, ran.err) == (0, "")
-        cells = [[c.strip() for c in line.split("│")] for line in ran.out.splitlines()]
-        assert ["", "od-edge-vehicle00", "object-detection", "0.1.0", "edge", "vehicle00", CLOUD[0],
-                "vehicle00", ""] in cells  # fmt: skip
-        assert ["", "vehicle00/edge", "mqtt", "vehicle00", "edge", CLOUD[0],
-                "vehicle00", ""] in cells  # fmt: skip
+        cells = cells_of(ran.out)
+        assert ["od-edge-vehicle00", "object-detection", "0.1.0", "edge", "vehicle00", CLOUD[0],
+                "vehicle00"] in cells  # fmt: skip
+        assert ["vehicle00/edge", "mqtt", "vehicle00", "edge", CLOUD[0], "vehicle00"] in cells
         assert ran.out.splitlines()[-1] == f"at {joined.tip}"
 
 
@@ -421,13 +516,15 @@ class TestLog:
     def test_the_text_is_a_table(self, demandops: Run, joined: Any) -> None:
         joined.commit({"inventory/README.md": "hello\n"})
         ran = demandops("log", "--state-repo", joined.path)
-        rows = [[c.strip() for c in line.split("│")][1:-1] for line in ran.out.splitlines()
-                if line.startswith("│")]  # fmt: skip
-        assert [(row[0], row[2], row[3], row[4]) for row in rows] == [
-            (joined.tip[:10], "by hand", "A person", "By hand"),
-            (rows[1][0], "join", "vehicle00", f"Join {APP}, vehicle00/edge"),
-            (rows[2][0], "init", "DemandOps generator", "Create the state repo"),
+        _, *rows = cells_of(ran.out)
+        assert [(row[0], *row[2:]) for row in rows] == [
+            (joined.tip[:10], "By hand", "A person"),
+            (rows[1][0], f"Join {APP}, vehicle00/edge", "vehicle00"),
+            (rows[2][0], "Create the state repo", "DemandOps generator"),
         ]
+        assert all(row[1].endswith(" ago") for row in rows)
+        wide = cells_of(demandops("log", "-o", "wide", "--state-repo", joined.path).out)
+        assert wide[2][5:] == ["join", "vehicle00", "request"]
 
     def test_as_many_and_from_where_one_says(
         self, demandops: Run, state: Any, request_json: Run
@@ -502,9 +599,11 @@ class TestDiff:
             "no difference in releases",
         ]
         shown = demandops("bookkeeping", "--state-repo", state.path).out
-        cells = [[c.strip() for c in line.split("│")][-3:-1] for line in shown.splitlines()]
-        rows = [["/a (station00)", "station00"], ["/b", "vehicle00"]]
-        assert [one for one in cells if one[:1] and one[0].startswith("/")] == rows * 2
+        topics, requesters = "/a (station00), /b", "station00, vehicle00"
+        assert [cells[-2:] for cells in cells_of(shown) if topics in cells] == [
+            [topics, requesters],
+            [topics, requesters],
+        ]
 
     def test_the_json_tells_the_same(self, demandops: Run, joined: Any) -> None:
         ran = demandops("diff", "main~1", "main", "--state-repo", joined.path, "--output", "json")
@@ -588,10 +687,8 @@ class TestStateRepo:
         for command in ("bookkeeping", "request -"):
             assert demandops(*command.split(), stdin=text(perception())).code == 0
 
-    def test_one_that_is_checked_out_is_refused_with_the_remedy(
-        self, demandops: Run, checkout: Path
-    ) -> None:
-        for command in ("bookkeeping", "request -", "request - --dry-run"):
+    def test_one_that_is_checked_out_is_not_written(self, demandops: Run, checkout: Path) -> None:
+        for command in ("request -", "decommission edge", "rollback main -m why"):
             where = ("--state-repo", checkout)
             assert demandops(*command.split(), *where, stdin=text(perception())) == (
                 1,

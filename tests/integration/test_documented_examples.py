@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from datetime import datetime, timedelta, timezone
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,11 @@ import yaml
 from click.testing import CliRunner
 from demandops.cli.main import cli
 from demandops.config.load import load
-from demandops.decision import State, decide, refusal_text, rendered_files
+from demandops.decision import State, decide, rendered_files
 from demandops.demand.demand_request import Expire
+from demandops.detection.detector import Detector
+from demandops.detection.events.detection_state import Observation
+from demandops.detection.rules import rule_file
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
@@ -24,6 +28,7 @@ from demandops.staterepo import skeleton
 from demandops.staterepo.history import commit_message
 
 from tests.kit.config import brokers, configuration, edited
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -68,12 +73,15 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
     assert decision.warnings == ()
 
 
+_EDGE = "nodes:\n- {id: edge, type: edge, cluster: c-its,"
+
+
 def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
     def said(start: str) -> str:
         return block("placement.md", start).strip()
 
     nodes = yaml.safe_load(configuration()["inventory/nodes.yaml"])
-    listed = yaml.safe_load(block("placement.md", "nodes:\n"))["nodes"]
+    listed = yaml.safe_load(block("placement.md", f"{_EDGE} capabilities"))["nodes"]
     new = {node["id"] for node in listed}
     nodes["nodes"] = [one for one in nodes["nodes"] if one["id"] not in new] + listed
     repo = MemoryRepo({"inventory/nodes.yaml": yaml.safe_dump(nodes)} | brokers(*sorted(new)))
@@ -87,7 +95,40 @@ def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
     goal["applications"][0]["place"]["capabilities"].append("fpga")
     with pytest.raises(Refused) as refused:
         repo.decide(goal)
-    assert refusal_text(refused.value) == said("no-node:")
+    assert refused.value.text_with_codes() == said("no-node:")
+
+
+def test_a_service_of_the_documentation_gets_the_node_that_it_says() -> None:
+    inventory = yaml.safe_load(configuration()["inventory/nodes.yaml"])
+    for node in inventory["nodes"]:
+        node["capabilities"] = ["gpu"] if node["id"] == "cloud" else []
+    appdef = "appdefs/object-detection-fusion/appdef.yaml"
+    definition = yaml.safe_load(configuration()[appdef])
+    for name, more in yaml.safe_load(block("placement.md", "services:"))["services"].items():
+        definition["services"][name] |= more
+    files = {"inventory/nodes.yaml": yaml.safe_dump(inventory), appdef: yaml.safe_dump(definition)}
+    decision = MemoryRepo(files).send(demand())
+    assert decision.placed == (block("placement.md", "service 'object-fusion'").strip(),)
+
+
+def test_the_capacity_of_the_documentation_is_kept() -> None:
+    example = yaml.safe_load(block("placement.md", f"{_EDGE} capacity"))
+    (node,) = example["nodes"]
+    inventory = yaml.safe_load(configuration()["inventory/nodes.yaml"])
+    inventory["nodes"] = [node if one["id"] == "edge" else one for one in inventory["nodes"]]
+    appdef = "appdefs/object-detection-fusion/appdef.yaml"
+    definition = yaml.safe_load(configuration()[appdef])
+    for name, more in example["services"].items():
+        definition["services"][name] |= more
+    repo = MemoryRepo(
+        {"inventory/nodes.yaml": yaml.safe_dump(inventory), appdef: yaml.safe_dump(definition)}
+    )
+    goal = demand()
+    repo.send(goal)
+    goal["demand"], goal["applications"][0]["id"] = "second", "edge/second"
+    with pytest.raises(Refused) as refused:
+        repo.decide(goal)
+    assert refused.value.text_with_codes() == block("placement.md", "capacity:").strip()
 
 
 def test_the_deployment_request_of_the_documentation_runs() -> None:
@@ -148,13 +189,13 @@ def test_the_policy_of_the_documentation_refuses_as_it_says(
     goal["applications"] = [application | {"node": node, "inputs": inputs}]
     with pytest.raises(Refused) as refused:
         decided(on, goal)
-    said = refusal_text(refused.value)
+    said = refused.value.text_with_codes()
     assert said == block("policy.md", start).strip()
     assert decided(on, demand()).outcome == "booked"
 
 
 def test_the_policy_of_the_documentation_lets_data_cross_by_its_rules_only() -> None:
-    (policy,) = (text for text in blocks("policy.md") if "peers: [fleet]" in text)
+    (policy,) = (text for text in blocks("policy.md") if "name: everybody" in text)
     head = "apiVersion: demandops/v1\nkind: AccessDomains\n"
     closed = policy.replace("peers: [city]", "nodes: ['*']")
     file = "policy/access-domains.yaml"
@@ -162,7 +203,7 @@ def test_the_policy_of_the_documentation_lets_data_cross_by_its_rules_only() -> 
     assert decided(state(**{file: f"{head}{policy.lstrip()}"}), goal).outcome == "booked"
     with pytest.raises(Refused) as refused:
         decided(state(**{file: f"{head}{closed.lstrip()}"}), goal)
-    said = refusal_text(refused.value).replace("rule 'everybody' of ", "")
+    said = refused.value.text_with_codes().replace("rule 'everybody' of ", "")
     assert said == block("policy.md", "not-allowed: requesters[0]: access domain 'fleet'").strip()
 
 
@@ -197,11 +238,93 @@ def test_the_versions_of_the_documentation_are_an_update_and_back() -> None:
     reason = block("versions.md", "application definition").strip()
     assert repo.decide(upgrade).approval == (reason,)
     end = Expire(id=second["demand"], demand=second["demand"])
-    said = [text.strip() for text in blocks("versions.md") if "Desired state:" in text]
+    said = [text.strip() for text in blocks("versions.md") if text.lstrip().startswith("Desired")]
     for goal, text in zip((second, end), said, strict=True):
         decision = repo.send(goal, repo.now + timedelta(minutes=20 if goal is end else 0))
         assert decision.approval == ()
         assert f"\n{text}\n" in commit_message.of_decision(decision, "op", NOW)
+
+
+def test_the_node_in_several_domains_of_the_documentation() -> None:
+    (policy,) = (text for text in blocks("policy.md") if "name: guests" in text)
+    (edge,) = yaml.safe_load(block("policy.md", "nodes:\n  - id: edge"))["nodes"]
+    nodes = yaml.safe_load(configuration()["inventory/nodes.yaml"])
+    nodes["nodes"] = [one | edge if one["id"] == "edge" else one for one in nodes["nodes"]]
+    head = "apiVersion: demandops/v1\nkind: AccessDomains\n"
+    repo = MemoryRepo(
+        {"inventory/nodes.yaml": yaml.safe_dump(nodes), "policy/access-domains.yaml": head + policy}
+    )
+
+    def folders(who: str, node: str = "edge") -> set[str]:
+        releases = repo.decide(put(who, who, node=node, connect="none")).releases
+        return {one.file.split("/")[2] for one in releases}
+
+    assert folders("traffic-control") == {"city"}
+    assert folders("vehicle01") == {"fleet"}
+    with pytest.raises(Refused) as refused:
+        folders("vehicle00")
+    assert refused.value.text_with_codes() == block("policy.md", "several-access-domains:").strip()
+    assert folders("vehicle00", "edge@fleet") == {"fleet"}
+    assert folders("vehicle00", "edge@city") == {"city"}
+
+
+def test_the_instance_of_its_own_of_the_documentation() -> None:
+    listed = block("versions.md", "apiVersion: demandops/v1\nkind: Versions")
+    listed = listed.replace("    charts: {object-fusion: 0.2.0}\n", "")
+    repo = MemoryRepo(
+        {"registry/versions.yaml": listed.replace("charts: {object-fusion: 0.2.0}", "charts: {}")}
+        | edited(
+            "appdefs/object-detection-fusion/appdef.yaml",
+            "inputs:\n",
+            "versions: separate\ninputs:\n",
+        )
+    )
+    for who in ("station", "vehicle"):
+        decision = repo.send(yaml.safe_load(block("versions.md", f"kind: Demand\ndemand: {who}00")))
+    said = block("versions.md", "application 'edge/object_detection_fusion' in version")
+    note, _, desired = said.strip().partition("\n\n")
+    assert note in decision.warnings
+    assert f"\n{desired}\n" in commit_message.of_decision(decision, "op", NOW)
+    page = (DOCS / "versions.md").read_text()
+    (release,) = (
+        one for one in repo.state.plans.values() if one.name.startswith("od-edge-station00-1")
+    )
+    assert f"`{release.outputs['object_list']}`" in page
+
+
+def test_the_rules_of_the_documentation_form_demands_that_are_booked() -> None:
+    near, more = (text for text in blocks("detector.md") if "kind: DetectorRules" in text)
+    start = datetime(2026, 5, 4, 4, 29, 30, tzinfo=timezone.utc).timestamp()  # a Monday
+
+    def wanted(text: str, *steps: tuple[float, str, tuple[float, float], float]) -> list[Any]:
+        detector = Detector(rule_file.read(text, "rules.yaml"), start)
+        told = []
+        for after, entity, position, speed in steps:
+            values = {"twist.twist.linear.x": speed}
+            seen = Observation("vehicles", entity, start + after, position, values)
+            told += [(event, want.goal) for event, want in detector.step([seen], start + after)]
+        return told
+
+    ((_, perception),) = wanted(near, (1, "vehicle00", (-5352, -3280), 10))
+    cars = [f"vehicle0{number}" for number in range(3)]
+    steps = [
+        (tick, car, (1000.0 * at * (tick > 1), 10.0), float(at))
+        for tick in range(64)
+        for at, car in enumerate(cars)
+    ]
+    told = wanted(more, *steps)
+    counted = wanted(more.replace("start: 5", "start: 3"), *steps[:3])
+    kinds = [(event.rule, *event.subjects) for event, goal in told if goal is not None]
+    assert kinds == [
+        *(("platoon", one, other) for one, other in combinations(cars, 2)),
+        ("rush-hour",),
+        *(("slow", car) for car in cars[:2]),
+    ]
+    assert [goal.data["request"] for event, goal in counted if event.rule == "crowded"] == [
+        "3 vehicles at the crossing"
+    ]
+    for goal in (perception, *(goal for _, goal in (*told, *counted) if goal is not None)):
+        assert decided(state(), goal.document).outcome == "booked"
 
 
 def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
@@ -226,5 +349,5 @@ def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
 
 def test_schemas_are_written_to_a_folder(tmp_path: Path) -> None:
     ran = CliRunner().invoke(cli, ["schema", "--write", str(tmp_path / "schemas")])
-    assert ran.output == f"16 schemas in {tmp_path / 'schemas'}\n"
-    assert len(list((tmp_path / "schemas").glob("*.json"))) == 16
+    assert ran.output == f"18 schemas in {tmp_path / 'schemas'}\n"
+    assert len(list((tmp_path / "schemas").glob("*.json"))) == 18

@@ -47,9 +47,9 @@ def overridden(state: GitRepo, request_json: Callable[..., Ran]) -> GitRepo:
 
 
 def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: GitRepo) -> None:
-    listed = demandops("overrides", "--state-repo", overridden.path, "--output", "json")
+    listed = demandops("get", "overrides", "--state-repo", overridden.path, "--output", "json")
     assert listed.code == 0
-    rows = {row["name"]: row for row in listed.json()}
+    rows = {row["name"]: row for row in listed.json()["items"]}
     assert [*rows] == ["closed", "idle", "lasting", "many", "off", "over"]
     assert rows["many"] == {
         "name": "many",
@@ -90,11 +90,11 @@ def test_overrides_are_listed_with_what_each_does(demandops: Run, overridden: Gi
     assert kept["subject"] == {"kind": "application", "id": "edge/object_detection_fusion"}
     (off,) = rows["off"]["releases"]
     assert off["name"].startswith("of-edge-")
-    table = demandops("overrides", "--state-repo", overridden.path)
-    for word in ("od-edge-vehicle00", "matches nothing", "2020-01-01T00:00:00Z", "petra"):
+    table = demandops("get", "overrides", "--state-repo", overridden.path, "-o", "wide")
+    for word in ("od-edge-vehicle00", "matches nothing", "2020-01-01 00:00:00", "petra"):
         assert word in table.out
-    before = demandops("overrides", "--state-repo", overridden.path, "--at", "main~2")
-    assert before.out == "no overrides; see docs/overrides.md\n"
+    before = demandops("get", "overrides", "--state-repo", overridden.path, "--at", "main~2")
+    assert before.out == "no overrides\n"
 
 
 def test_bookkeeping_shows_what_is_suspended(demandops: Run, overridden: GitRepo) -> None:
@@ -189,8 +189,8 @@ def test_why_tells_what_overrides_do(demandops: Run, overridden: GitRepo) -> Non
     (fusion,) = [
         release["name"]
         for entry in demandops(
-            "overrides", "--state-repo", overridden.path, "--output", "json"
-        ).json()
+            "get", "overrides", "--state-repo", overridden.path, "--output", "json"
+        ).json()["items"]
         if entry["name"] == "off"
         for release in entry["releases"]
     ]

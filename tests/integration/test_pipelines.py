@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -73,6 +74,14 @@ def environment(tmp_path: Path, **more: str) -> dict[str, str]:
     return {**os.environ, "DEMANDOPS_DATA_HOME": str(tmp_path / "data"), **more}
 
 
+def helm(tmp_path: Path) -> dict[str, str]:
+    """Return the variables for a program that says as helm does of a sound chart: nothing."""
+    program = tmp_path / "helm"
+    program.write_text(f"#!{BASH}\n")
+    program.chmod(0o755)
+    return {"HELM_BIN": str(program)}
+
+
 def put_demandops(at: Path) -> None:
     """Put this program where the pipeline installs it."""
     at.parent.mkdir(parents=True)
@@ -88,7 +97,7 @@ def installing(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, dic
         (script,) = [one["run"] for one in pipeline["jobs"]["check"]["steps"] if "pip" in str(one)]
     else:
         lines = pipeline["demandops"]["script"]
-        until = next(number for number, line in enumerate(lines) if line.startswith("git fetch"))
+        until = next(number for number, line in enumerate(lines) if line.startswith("archive="))
         script = "\n".join(lines[:until]).replace("/tmp/demandops", '"$RUNNER_TEMP/demandops"')
     pip, python = tmp_path / "demandops" / "bin" / "pip", tmp_path / "path" / "python"
     for program, text in ((pip, 'echo "pip $*"'), (python, 'echo "python $1 $2"')):
@@ -102,7 +111,7 @@ def test_a_pipeline_installs_what_the_variable_names(
     installing: tuple[str, dict[str, str]],
 ) -> None:
     script, environ = installing
-    package = "git+https://git.example.org/demandops.git@v0.1.0"
+    package = "git+https://git.example.org/demandops.git@v1.0.0"
     done = subprocess.run(
         [BASH, "-e", "-c", script],
         env={**environ, "DEMANDOPS_PACKAGE": package},
@@ -142,7 +151,7 @@ def test_github_checks_and_reports(
     put_demandops(tmp_path / "demandops" / "bin" / "demandops")
     (step,) = [one for one in github["jobs"]["check"]["steps"] if one.get("name") == "Check"]
     summary = tmp_path / "summary.md"
-    more = {"RUNNER_TEMP": str(tmp_path), "GITHUB_STEP_SUMMARY": str(summary)}
+    more = {"RUNNER_TEMP": str(tmp_path), "GITHUB_STEP_SUMMARY": str(summary), **helm(tmp_path)}
     done = subprocess.run(
         [BASH, "-e", "-c", step["run"]],
         cwd=checkout,
@@ -171,7 +180,7 @@ def test_gitlab_checks_and_reports(
     done = subprocess.run(
         [BASH, "-e", "-c", script.replace("/tmp/demandops/bin/demandops", str(program))],
         cwd=checkout,
-        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main"),
+        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main", **helm(tmp_path)),
         capture_output=True,
         text=True,
         check=False,
@@ -180,6 +189,31 @@ def test_gitlab_checks_and_reports(
     report = (checkout / "report.md").read_text()
     assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else '1 error'}")
     assert report in done.stdout
+
+
+@pytest.mark.parametrize("sound", [True, False], ids=["sound", "altered"])
+def test_gitlab_brings_helm_as_its_digest_says(
+    tmp_path: Path, gitlab: dict[str, Any], sound: bool
+) -> None:
+    (script,) = [line for line in gitlab["demandops"]["script"] if line.startswith("archive=")]
+    names = {"amd64": "x86_64", "arm64": "aarch64"}
+    archive = f"helm-v4.2.4-linux-{next(k for k, v in names.items() if v == os.uname().machine)}"
+    tree = tmp_path / "linux" / "helm"
+    tree.parent.mkdir()
+    tree.write_text("a program")
+    packed = tmp_path / f"{archive}.tar.gz"
+    subprocess.run(["tar", "-czf", str(packed), "-C", str(tmp_path), "linux/helm"], check=True)
+    digest = hashlib.sha256(packed.read_bytes() + b"!" * (not sound)).hexdigest()
+    (tmp_path / f"{packed.name}.sha256sum").write_text(f"{digest}  {packed.name}\n")
+    source = {"HELM_VERSION": "v4.2.4", "HELM_SOURCE": tmp_path.as_uri()}
+    done = subprocess.run(
+        [BASH, "-e", "-c", script.replace("/tmp/demandops", str(tmp_path / "brought"))],
+        env=environment(tmp_path, CI_PROJECT_DIR=str(tmp_path), **source),
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode == 0) == sound, done.stderr
+    assert (tmp_path / "brought" / "helm" / "helm").exists() == sound
 
 
 class Notes:

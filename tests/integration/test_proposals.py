@@ -39,25 +39,27 @@ def test_a_demand_that_needs_approval_is_proposed_and_listed(
     demandops: Run, send: Send, strict: GitRepo
 ) -> None:
     before = strict.tip
-    nothing = demandops("proposals", "--state-repo", strict.path, "--output", "json")
-    assert (nothing.code, nothing.json()) == (0, [])
+    nothing = demandops("get", "proposals", "--state-repo", strict.path, "--output", "json")
+    assert (nothing.code, nothing.json()["items"]) == (0, [])
     ran = send(strict)
     assert (ran.code, ran.err) == (0, "")
     *_, words, branch = ran.out.strip().rpartition("approval ")
     assert words
     assert ran.out == f"standard input: request 0 'request' awaiting approval {branch}\n"
     assert strict.tip == before
-    [row] = demandops("proposals", "--state-repo", strict.path, "--output", "json").json()
+    [row] = demandops("get", "proposals", "--state-repo", strict.path, "--output", "json").json()[
+        "items"
+    ]
     assert row["branch"] == branch
     assert row["requesters"] == ["vehicle00"]
     assert row["summary"] == "Join edge/object_detection_fusion, vehicle00/edge"
     assert row["commit"] == git(strict, "rev-parse", branch)
     assert (row["link"], len(row["operations"])) == (None, 1)
-    table = demandops("proposals", "--state-repo", strict.path)
+    table = demandops("get", "proposals", "--state-repo", strict.path)
     assert branch in table.out
     assert "vehicle00" in table.out
-    by_url = demandops("proposals", "--state-repo", strict.path.as_uri(), "--output", "json")
-    assert by_url.json() == [row]
+    by_url = demandops("get", "proposals", "--state-repo", strict.path.as_uri(), "--output", "json")
+    assert by_url.json()["items"] == [row]
 
 
 def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:

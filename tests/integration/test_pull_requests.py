@@ -15,6 +15,7 @@ from demandops.cli.repo import pull_request_comment
 from demandops.staterepo.pull_request import merge_check as checking
 
 from tests.kit.cli import Run
+from tests.kit.goals import APP
 from tests.kit.repo import git
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "experiment"
@@ -97,6 +98,7 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
     assert out == (
         f"\ninstead of editing {FUSION}, {name}:\n"
         "\n"
+        "# yaml-language-server: $schema=../schemas/override.json\n"
         "apiVersion: demandops/v1\n"
         "kind: Override\n"
         'reason: "Say here why; this replaces a manual edit of a generated file"\n'
@@ -234,9 +236,16 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
     commit(branch)
     base = git(branch, "rev-parse", "origin/main")[:10]
     source, target = Path(CLIENT).stem, "mqtt-vehicle00-edge-target-3c0f22bda69b"
+    (need,) = (path.relative_to(branch) for path in claims(branch, f"application: {APP}"))
+    missing = [
+        f"{role} /vehicles/vehicle00/{topic} does not arrive: no connection carries it from "
+        "'vehicle00' to 'edge'"
+        for role, topic in (("ego_data", "ego_data"), ("point_cloud", "drivers/lidar/pointcloud"))
+    ]
     assert check() == (
         0,
-        f"{branch}: all files are valid and everything renders\n"
+        f"{branch}: all files are valid and every release renders\n"
+        "charts not rendered: helm is missing\n"
         "\n"
         f"what merging would do since {base}:\n"
         "\n"
@@ -250,7 +259,7 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
         "the generator will write or remove 2 files:\n"
         f"  remove {EDGE}/{target}.yaml\n"
         f"  remove {CLIENT}\n",
-        "",
+        "".join(f"warning: {need}: application '{APP}': {each}\n" for each in missing),
     )
 
 
@@ -342,6 +351,7 @@ def test_a_symbolic_link_is_not_followed(
         "file": "inventory/brokers.yaml",
         "field": "",
         "message": "is a symbolic link, which is not followed; replace it by a file",
+        "line": None,
     } in data["faults"]
     assert "hunter2" not in json.dumps(data)
 
@@ -351,7 +361,7 @@ def test_the_check_of_another_render_version_says_so(
 ) -> None:
     monkeypatch.setattr(checking, "RENDER_VERSION", 3)
     assert check()[2] == (
-        "error: demandops.yaml: renderVersion: is 2, but this program renders version 3; check "
+        "error: demandops.yaml:15: renderVersion: is 2, but this program renders version 3; check "
         "with the generator's version of the program, or run `demandops upgrade` to render "
         "everything again\n"
     )
@@ -465,7 +475,8 @@ def test_a_report_of_nothing_says_so(branch: Path, check: Run) -> None:
     assert check("--output", "markdown") == (
         0,
         "<!-- demandops check -->\n"
-        "## DemandOps: valid, and everything renders\n"
+        "## DemandOps: valid, and every release renders\n"
+        "\ncharts not rendered: helm is missing\n"
         f"\nCompared with `{base}`.\n"
         "\nMerging changes no release and no demand.\n",
         "",

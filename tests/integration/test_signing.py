@@ -259,7 +259,7 @@ def test_a_key_that_is_gone_later_is_told_to_the_requester(
         hidden.rename(key)
         generator.submit(goal([], [connection("c")])).future.result(30)
     finally:
-        assert generator.close()
+        assert generator.close(rig.PATIENCE_S)
 
 
 def test_ssh_keygen_is_missing(key: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

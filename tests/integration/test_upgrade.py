@@ -291,7 +291,7 @@ def test_where_nothing_would_change_nothing_is_committed(
         ),
         (
             ["--gitops", "argocd", "--url", "git.example"],
-            "demandops.yaml: argocd.url: 'git.example' is not a name that can be used here",
+            "demandops.yaml: argocd.url: 'git.example' is not a URL that clusters can fetch",
         ),
     ],
 )

@@ -14,7 +14,7 @@ from demandops.service import Generator, Receipt, Ticket
 
 from tests.kit.goals import Goal
 
-PATIENCE_S = 15.0
+PATIENCE_S = 60.0
 """How long a test waits for an answer, in seconds."""
 
 
@@ -25,7 +25,7 @@ def running(address: str | Path, **options: Any) -> Iterator[Generator]:
     try:
         yield generator
     finally:
-        generator.close(timeout=5)
+        generator.close(PATIENCE_S)
 
 
 def restart(address: str | Path) -> bool:

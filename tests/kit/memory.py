@@ -12,10 +12,10 @@ from typing import Any
 import yaml
 from demandops.config.config import Config
 from demandops.config.load import load
-from demandops.decision import Decision, State, decide, rendered_files
+from demandops.decision import Decision, State, decide, rendered_files, scale_down
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
-from demandops.ledger import claim_file, recent_shutdowns
+from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
@@ -80,6 +80,17 @@ class MemoryRepo:
             else:
                 self.files[path] = text
         return decision
+
+    def scale_down(self, now: datetime) -> list[str]:
+        """Take replicas away whose time is over, as the generator does; return the releases."""
+        names = []
+        for instance in self.state.ledger.kept.due(now):
+            self.state, change = scale_down(self.state, instance, now, self.files.get)
+            names += [release.name for release in change.releases]
+            for path, text in change.files.items():
+                assert self.files.get(path) != text, f"written or removed without need: {path}"
+                self.files.pop(path) if text is None else self.files.update({path: text})
+        return names
 
     def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
         """Decide a goal and commit the decision, or return the refusal."""
@@ -163,8 +174,13 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_booked(path: str) -> bool:
-    """Return whether demands write the file: a claim's, or a recent shutdown's."""
-    return bool(claim_file.kind_of(path)) or path.startswith(recent_shutdowns.SHUTDOWNS_ROOT)
+    """Return whether demands write the file: not what people write, nor ended overrides."""
+    roots = (
+        recent_shutdowns.SHUTDOWNS_ROOT,
+        kept_replicas.REPLICAS_ROOT,
+        waiting.WAITING_ROOT,
+    )
+    return bool(claim_file.kind_of(path)) or path.startswith(roots)
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
@@ -172,7 +188,12 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
     booked = {path: text for path, text in files.items() if is_booked(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
-    return replace(ledger, shutdowns=recent_shutdowns.read_all(booked))
+    return replace(
+        ledger,
+        shutdowns=recent_shutdowns.read_all(booked),
+        waiting=waiting.read_all(booked),
+        kept=kept_replicas.read_all(booked),
+    )
 
 
 def outcome(taken: Decision | Refused) -> str:

@@ -48,6 +48,7 @@ flux: {url: "https://git.example/fleet/state.git", interval: 1m, secret: git}
 argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
 proposals: {forge: gitlab, url: "https://git.example/fleet/state", labels: [demand]}
 limits: {demandItems: 400, parameterBytes: 90000, fileBytes: 900000}
+placement: spread
 """
 _PROPOSALS_BY_API = """
 apiVersion: demandops/v1
@@ -86,7 +87,13 @@ nodes:
     capabilities: [lidar]
     position: {x: 12.5, y: -3.0}
     drained: false
-  - {id: edge, type: edge, cluster: c-its, capabilities: [gpu]}
+    capacity: {cpu: "8", memory: 16Gi, example.org/gpu: "1"}
+  - id: edge
+    type: edge
+    cluster: c-its
+    capabilities: [gpu]
+    accessDomains:
+      - {name: backend, zenoh: {endpoint: "tcp/edge:7448"}, wan: {host: 192.0.2.2}}
   - {id: cloud, type: cloud, cluster: depot}
 """
 _BROKERS = """
@@ -121,6 +128,7 @@ domains:
     leases: {default: 1h, longest: 2h, slack: 20s, deploymentRequests: true}
     network: namespace
     approval: none
+    whenFull: wait
     podSecurity: privileged
     ros: {domainId: 7}
     brokerCredentials:
@@ -130,7 +138,10 @@ domains:
       - Deployment
       - Secret
       - {kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}
-  - {name: backend, namespace: backend, nodes: [cloud], rules: [{name: all, peers: ["*"]}]}
+  - name: backend
+    namespace: backend
+    nodes: [cloud]
+    rules: [{name: all, nodes: [cloud], peers: ["*"]}]
 """
 _CHARTS = f"""
 apiVersion: demandops/v1
@@ -211,6 +222,7 @@ services:
     outputs: {object_list: "/{instance}_objects"}
     placement: application
     scaling: {max: 3, autoscaler: {cpu: 70, memory: 80}, dividesWork: true}
+    requests: {cpu: 250m, memory: 1Gi, example.org/gpu: "1"}
     chart: object-detection
     images: [object-detection]
     values: values/object-detection.yaml.j2
@@ -228,6 +240,7 @@ services:
     values: values/object-fusion.yaml.j2
   object-tracking:
     prefix: ot
+    place: {role: edge, labels: {node_id: edge}, capabilities: [gpu]}
     inputs: {ego_data: ego_data, object_list: object-detection.object_list}
     outputs:
       raw_objects: "/{instance}_untracked"
@@ -252,7 +265,8 @@ placement: source
 outputs: {points: "/{instance}_points"}
 parameters:
   rate: {description: Highest rate in Hz, default: 10, merge: max}
-scaling: {min: 1, max: 4, per: {topics: 2}, dividesWork: true}
+scaling: {min: 1, max: 4, per: {topics: 2}, dividesWork: true, downAfter: 10m}
+requests: {cpu: 100m}
 chart: by-oci
 images: [object-detection]
 values: values/lidar-driver.yaml.j2
@@ -260,7 +274,7 @@ values: values/lidar-driver.yaml.j2
 _OVERRIDES = {
     "values": override(
         {"services": ["object-d*"], "appdefs": ["*"], "applications": ["edge/*"], "nodes": ["e*"]},
-        {"services": ["object-detection"], "labels": {"node_id": "edge"}, "requesters": ["*"]},
+        {"services": ["object-detection"], "labels": {"node_id": "edge"}},
         priority=3,
         expires="2027-01-31T12:00:00Z",
         values={"podLabels": {"a": "b"}},
@@ -271,7 +285,7 @@ _OVERRIDES = {
         replicas=2,
         node="edge",
     ),
-    "hold": override({"services": ["object-fusion"]}, hold=True),
+    "hold": override({"services": ["object-fusion"], "requesters": ["*"]}, hold=True),
     "deny": override({"connections": ["c*"]}, deny=True),
     "keep": override({"applications": ["main"]}, keep=True),
 }
@@ -328,6 +342,7 @@ request: patrol-1
 requesters: [vehicle00]
 lease: 10m
 answer: pushed
+priority: 3
 positions:
   - {node: edge, x: 1.5, y: 2.0}
 applications:

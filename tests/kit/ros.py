@@ -149,8 +149,12 @@ class Servers:
         self._started: list[Served] = []
 
     def start(self, state_repo: str, *args: str) -> Served:
+        return self.run(state_repo, "serve", "--state-repo", state_repo, *args)
+
+    def run(self, state_repo: str, *words: str) -> Served:
+        """Start another command in the same ROS domain."""
         log = self._folder / f"node-{len(self._started)}.log"
-        command = [sys.executable, "-m", "demandops.cli.main", "serve", "--state-repo", state_repo]
+        command = [sys.executable, "-m", "demandops.cli.main", *words]
         environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self._domain),
@@ -160,7 +164,7 @@ class Servers:
         }
         with log.open("w") as sink:
             process = subprocess.Popen(
-                [*command, *args], env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
+                command, env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
             )
         self._started.append(Served(process, state_repo, log, environment, self._domain))
         return self._started[-1]

@@ -43,17 +43,18 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    for folder, packaged in (
-        ("templates", "templates"),
-        ("appdefs", "appdefs"),
-        ("state-repo-skeleton", "skeleton"),
+    for folder, prefix in (
+        ("templates", "demandops/_data/templates/"),
+        ("appdefs", "demandops/_data/appdefs/"),
+        ("state-repo-skeleton", "demandops/_data/skeleton/"),
+        ("generator/demandops/web/pages", "demandops/web/pages/"),
+        ("generator/demandops/web/static", "demandops/web/static/"),
     ):
         files = {
             p.relative_to(ROOT / folder).as_posix()
             for p in (ROOT / folder).rglob("*")
             if p.is_file()
         }
-        prefix = f"demandops/_data/{packaged}/"
         assert {n.removeprefix(prefix) for n in names if n.startswith(prefix)} == files
     assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
 
@@ -70,10 +71,14 @@ def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_pa
         share = Path(packages.get_package_share_directory("demandops_ros"))
     assert {path.relative_to(share).as_posix() for path in share.rglob("*.*")} == {
         "package.xml",
+        "config/detector_params.yaml",
         "config/params.yaml",
         "launch/demandops.launch.xml",
+        "launch/detector.launch.xml",
+        "launch/parameter_sync.launch.xml",
     }
-    assert os.access(tmp_path / "lib" / "demandops_ros" / "serve", os.X_OK)
+    for program in ("detect", "parameter_sync", "serve"):
+        assert os.access(tmp_path / "lib" / "demandops_ros" / program, os.X_OK)
 
 
 def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Path) -> None:

@@ -137,14 +137,14 @@ def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: De
 def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
     shared: Served, vehicle: DemandClient, before: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known, lost = vehicle._await, [DemandError("timeout", "the response was lost")]
+    known, lost = vehicle._sender._await, [DemandError("timeout", "the response was lost")]
 
     def lose_first(future: Any, deadline: float) -> Any:
         if lost:
             raise lost.pop()
         return known(future, deadline)
 
-    monkeypatch.setattr(vehicle, "_await", lose_first)
+    monkeypatch.setattr(vehicle._sender, "_await", lose_first)
     answer = vehicle.put("again", connections=[link("again")])
     assert answer.outcome == "unchanged", "the first one was booked"
     assert operations(shared, before) == ["put"]

@@ -126,3 +126,22 @@ def test_a_push_that_the_webhook_reports_is_followed_at_once(
     follow = "A person DemandOps generator"
     client.wait(lambda: git(bare, "log", "-1", "--format=%an %cn", "main") == follow)
     assert served.stop() == 0
+
+
+def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, bare: Path) -> None:
+    """The interval is off, so the page can learn of the commit from the node only."""
+    args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
+    served = serve(f"file://{bare}", *args)
+    client.ready()
+    client.wait(lambda: "showing the state repo at " in served.log.read_text())
+    found = re.search(r"state repo at (http://127.0.0.1:[0-9]+/)", served.log.read_text())
+    assert found is not None
+
+    def shown(view: str) -> str:
+        with urllib.request.urlopen(f"{found[1]}{view}", timeout=10) as answer:  # noqa: S310
+            return str(answer.read().decode())
+
+    assert "Nothing is demanded" in shown("")
+    assert client.call(connection(1)).status == "succeeded"
+    client.wait(lambda: "1 in all" in shown("connections"))
+    assert served.stop() == 0

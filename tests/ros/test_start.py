@@ -63,8 +63,8 @@ def test_a_missing_state_repo_is_refused_with_the_remedy(tmp_path: Path, demando
     refused = demandops("serve", "--state-repo", tmp_path / "nowhere")
     assert refused.code == 1
     assert refused.err == (
-        f"error: {tmp_path}/nowhere does not exist; make a state repo with "
-        f"`demandops init {tmp_path}/nowhere --bare`\n"
+        f"error: {tmp_path}/nowhere does not exist; correct the path, or make a state repo there "
+        f"with `demandops init {tmp_path}/nowhere --bare`\n"
     )
 
 

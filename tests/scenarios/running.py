@@ -20,6 +20,10 @@ from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused
 from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations.drain import Drain
+from demandops.ledger.waiting import in_turn
+from demandops.plan.nodes.relocation import following_overrides
+from demandops.plan.override_lifecycle import changed_claim_files
 from demandops.service.timing.expiry import LeaseExpiry
 from demandops.service.timing.rate_limit import RateLimit
 from pydantic import Field, model_validator
@@ -52,7 +56,7 @@ class Told(FrozenModel):
 
 _CHECKS = (
     "gives", "refused", "expires", "runs", "connections", "carries", "desired", "leases", "holds",
-    "warns",
+    "warns", "waiting",
 )  # fmt: skip
 
 
@@ -71,7 +75,8 @@ class Step(FrozenModel):
     restart: bool = False
     config: dict[str, dict[str, Any]] = Field(default_factory=dict)
     send: dict[str, Any] | None = None
-    gives: Literal["booked", "released", "unchanged"] | None = None
+    gives: Literal["booked", "released", "unchanged", "waiting"] | None = None
+    waiting: list[str] | None = None
     refused: list[Told] | None = None
     warns: list[str] | None = None
     expires: list[str] | None = None
@@ -174,10 +179,16 @@ class World(MemoryRepo):
 
     def configure(self, state: State, config: Mapping[str, str]) -> None:
         """Take a configuration in, and write what follows of it."""
+        before = self.state.ledger
         self.state = replace(state, ledger=self.state.ledger)
+        moved = following_overrides(self.state)
+        self.state = replace(self.state, ledger=moved.ledger)
         empty = replace(state, ledger=Ledger())
         self._initial = {**skeleton(), **config, **rendered_files(empty)}
         ledger = {p: text for p, text in self.files.items() if is_booked(p)}
+        moved_files = changed_claim_files(before, moved.ledger, moved.keys)
+        for path, text in moved_files.items():
+            ledger.pop(path) if text is None else ledger.update({path: text})
         self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
@@ -198,7 +209,10 @@ class World(MemoryRepo):
         )
 
     def look(self) -> list[str]:
-        """Release what has expired, one commit for each demand; return the demands."""
+        """Release what has expired, one commit for each demand; return the demands.
+
+        What was placed on drained nodes moves then too, and replicas go whose time is over.
+        """
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
         for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -207,7 +221,22 @@ class World(MemoryRepo):
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"
             done.append(demand)
+        self.scale_down(now)
+        for node in self.config.drained_nodes:
+            if self.state.ledger.applications_on.get(node):
+                self.take(Drain(node))
+        self.book_waiting()
         return done
+
+    def book_waiting(self) -> None:
+        """Try the demands that wait, in turn."""
+        for waiting in in_turn(self.state.ledger.waiting):
+            taken = self.take(dict(waiting.goal))
+            assert isinstance(taken, Decision), taken
+
+    def waiting(self) -> list[str]:
+        """Return the demands that wait, in turn."""
+        return [one.demand for one in in_turn(self.state.ledger.waiting)]
 
     def runs(self) -> dict[str, list[str]]:
         """Return who requests each service, which is told by what it is for."""
@@ -270,10 +299,14 @@ def _take(step: Step, world: World, place: str) -> None:
         world.restart()
     assert world.look() == (step.expires or []), f"{place}: these must expire, and no others"
     if step.send is not None:
-        for problem in _sent(step, world.take(step.send)):
+        taken = world.take(step.send)
+        for problem in _sent(step, taken):
             raise AssertionError(f"{place}: {problem}")
+        if isinstance(taken, Decision) and taken.frees:
+            world.book_waiting()
     compared = {
         "runs": world.runs,
+        "waiting": world.waiting,
         "connections": lambda: _of_connections(world, "requesters"),
         "carries": lambda: _of_connections(world, "topics"),
         "leases": lambda: {d: _since_start(end) for d, end in sorted(world.leases().items())},
@@ -304,7 +337,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
         yield f"is {taken.outcome}, but must be refused"
     elif taken.outcome != step.gives:
         yield f"is {taken.outcome}, but must be {step.gives}"
-    if bool(taken.files) != (taken.outcome != "unchanged"):
+    if bool(taken.files) != (taken.outcome != "unchanged") and taken.outcome != "waiting":
         yield f"is {taken.outcome}, and makes {'a' if taken.files else 'no'} commit"
     signs = {"start": "+", "change": "~", "stop": "-"}
     desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)

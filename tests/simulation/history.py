@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -16,11 +17,13 @@ from tests.kit import repo
 from tests.kit.promises import Maker, name_of
 from tests.kit.repo import POLICY, GitRepo
 from tests.model.leases import Goal
-from tests.simulation.oracle import SLACK_S, VISITOR, Oracle
+from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
 STEPS = 30
 MEMORY = "/dev/shm"
+NODES = "inventory/nodes.yaml"
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 _RULES = [
     {"name": "visitors", "requesters": [f"{VISITOR}*"], "approval": "required"},
     {"name": "residents", "requesters": ["vehicle*", "station*"]},
@@ -30,7 +33,7 @@ kind: Override
 reason: More for a test
 owner: perception-team
 select:
-  - services: ["*"]
+  - nodes: [edge, cloud]
 replicas: 2
 """
 _LONGEST_LEASE_S = 90
@@ -38,11 +41,22 @@ _LONGEST_LEASE_S = 90
 
 @lru_cache(maxsize=1)
 def template() -> Path:
-    """Return a state repo in memory with leases and approval; copy it."""
+    """Return a state repo in memory with leases, approval and nodes that may be full; copy it."""
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
-    policy = yaml.safe_load(GitRepo(path).files()[POLICY])
-    policy["domains"][0] |= {"rules": _RULES, "leases": {"slack": f"{SLACK_S}s"}}
-    GitRepo(path).commit({POLICY: yaml.safe_dump(policy)})
+    files = GitRepo(path).files()
+    policy, nodes, appdef = (yaml.safe_load(files[name]) for name in (POLICY, NODES, APPDEF))
+    policy["domains"][0] |= {
+        "rules": _RULES,
+        "leases": {"slack": f"{SLACK_S}s"},
+        "whenFull": "wait",
+    }
+    nodes["nodes"] += [
+        {"id": id, "type": "rack", "cluster": "c-its", "capacity": {"slots": 1}}
+        for id in sorted(PLACES)
+    ]
+    appdef["services"]["object-fusion"]["requests"] = {"slots": 1}
+    changed = {POLICY: policy, NODES: nodes, APPDEF: appdef}
+    GitRepo(path).commit({name: yaml.safe_dump(data) for name, data in changed.items()})
     repo.git(path, "repack", "-adq")
     return path
 
@@ -89,7 +103,8 @@ class History:
             while self._branches():
                 self.decide()
             self.turns.sleep(30)
-        self.turns.sleep(3 * (_LONGEST_LEASE_S + SLACK_S) + 120)
+        # those that wait follow each other on the places
+        self.turns.sleep(8 * (_LONGEST_LEASE_S + SLACK_S + LONGEST_WAIT_S))
 
     # ---- what happens ----
 
@@ -103,14 +118,35 @@ class History:
             self.oracle.ask(machine, self._sent[-1])
 
     def _goal(self) -> Goal:
-        kind = self.chance.randrange(8)
+        kind = self.chance.randrange(10)
         if kind == 0:
             return self._visitor()
         if kind == 1 and self._sent:  # as who waited in vain for an answer
             return self.chance.choice(self._sent[-6:])
         if kind == 2:
             return self._maker._message(shutdown=bool(self.chance.randrange(2)))
+        if kind < 5:
+            return self._placed()
         return self._maker.any()
+
+    def _placed(self) -> Goal:
+        """Return a demand whose node the generator chooses, if one has room."""
+        number = self.chance.randrange(4)
+        who = [f"vehicle0{one}" for one in self.chance.choice([[0], [1], [0, 1]])]
+        made = {"kind": "Demand", "demand": f"place{number}", "requesters": who}
+        if not self.chance.randrange(3):
+            return made | {"operation": self.chance.choice(["release", "release", "renew"])}
+        app = {
+            "id": f"place{number}",
+            "type": "object-detection-fusion",
+            "place": {"role": "rack"},
+            "connect": "none",
+            "inputs": {"ego_data": [{"topic": "/ego1", "source": "vehicle00"}]},
+        }
+        made |= {"operation": "put", "applications": [app], "connections": []}
+        made["priority"] = self.chance.choice([0, 0, 5])
+        lease = self.chance.choice([None, 10, 60, 90])
+        return made | ({"lease": lease} if lease else {})
 
     def _visitor(self) -> Goal:
         number = self.chance.randrange(3)
@@ -168,7 +204,14 @@ class History:
     # ---- people ----
 
     def edit(self) -> None:
-        edits = (self._override, self._inventory, self._delete_claim, self._delete_claim)
+        edits = (
+            self._override,
+            self._inventory,
+            self._drain,
+            self._stop_waiting,
+            self._delete_claim,
+            self._delete_claim,
+        )
         self.chance.choice((*edits, self._edit_generated))()
 
     def _commit(self, changed: dict[str, str | None]) -> str:
@@ -183,11 +226,28 @@ class History:
         self._commit({path: None if path in self._files("overrides/") else _OVERRIDE})
 
     def _inventory(self) -> None:
-        path = "inventory/nodes.yaml"
-        data = yaml.safe_load(self._files(path)[path])
+        data = yaml.safe_load(self._files(NODES)[NODES])
         added = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
         data["nodes"].append(added)
-        self._commit({path: yaml.safe_dump(data)})
+        self._commit({NODES: yaml.safe_dump(data)})
+
+    def _drain(self) -> None:
+        """Take a node out of service, or back in."""
+        self.oracle.check()
+        data, name = yaml.safe_load(self._files(NODES)[NODES]), self.chance.choice(sorted(PLACES))
+        (node,) = (one for one in data["nodes"] if one["id"] == name)
+        drained = node["drained"] = not node.get("drained", False)
+        commit = self._commit({NODES: yaml.safe_dump(data)})
+        self.oracle.edits[commit] = lambda books: books.drain(name, drained)
+
+    def _stop_waiting(self) -> None:
+        """Delete the file of a demand that waits."""
+        self.oracle.check()
+        if found := sorted(self._files("ledger/waiting").items()):
+            path, text = self.chance.choice(found)
+            demand = yaml.safe_load(text)["demand"]
+            commit = self._commit({path: None})
+            self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
 
     def _delete_claim(self) -> None:
         self.oracle.check()
@@ -228,14 +288,15 @@ class History:
         remote.branches.delete(branch)
 
 
-def play(seed: int, steps: int = STEPS) -> tuple[str, int, int]:
-    """Play a history; return its last commit, and how many demands and commits it had."""
+def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
+    """Play a history; return its last commit, and how many demands, commits and so on it had."""
     with TemporaryDirectory(dir=MEMORY, prefix="simulation-") as folder:
         world = World(seed, template(), Path(folder), machines=1 + seed % 3)
         history = History(world)
         with world.running():
             history.run(steps)
-            return world.tip, len(history.oracle.asked), history.oracle.commits
+            counts = history.oracle.counts | Counter(demands=len(history.oracle.asked))
+            return world.tip, counts
 
 
 def clean_up() -> None:

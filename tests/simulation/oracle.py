@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
+from datetime import timezone
 from typing import Any
 
 import pygit2
+import yaml
 from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
@@ -18,10 +21,13 @@ from demandops.staterepo.git.repository import MAIN
 from demandops.staterepo.history.commit_log import PROPOSAL, entry_of
 
 from tests.kit.promises import claims_of, name_of
-from tests.model.leases import Goal, Promises, Subject
+from tests.model.leases import Goal, Subject
+from tests.model.places import Places
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30
+PLACES = frozenset({"rack0", "rack1"})
+"""The nodes of which each has room for one application that names no node."""
 VISITOR = "visitor"
 """Begins the names of those whose demands need approval."""
 
@@ -57,11 +63,13 @@ class Oracle:
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
-        self.edits: dict[str, Callable[[Promises], object]] = {}
+        self.edits: dict[str, Callable[[Places], object]] = {}
         """What people's commits change of what is booked."""
-        self.commits = 0
+        self.counts = Counter[str]()
         self._seen = world.tip
-        self._books = Promises(SLACK_S)
+        self._books = Places(SLACK_S, nodes=PLACES)
+        self._pushed_at = world.turns.monotonic()
+        """When the last tip of main that was looked at was pushed, or seen."""
         self._models = [deepcopy(self._books)]
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
@@ -113,10 +121,15 @@ class Oracle:
         self._seen = self.world.tip
         for commit, by in reversed(new):
             self._book(commit, by)
+        if new:
+            self._pushed_at = self.world.turns.monotonic()
 
     def _book(self, commit: pygit2.Commit, by: tuple[Machine, float, float] | None) -> None:
-        self.commits += 1
+        self.counts["commits"] += 1
         claims = claims_of(self.claims(str(commit.id)).values())
+        self._books.told = {
+            subject: what["node"] for (_, subject), (what, _) in claims.items() if "node" in what
+        }
         if str(commit.id) in self.edits:
             self.edits[str(commit.id)](self._books)
         for operation, is_proposed in self._operations(commit):
@@ -125,17 +138,48 @@ class Oracle:
             asked = self.asked.get(operation)
             if asked is None:
                 assert by is not None
-                self._end_leases(self._claims.keys() - claims.keys(), *by)
+                self._own_work(claims, *by)
                 continue
             if not asked.needs_approval:
                 self._assert_in_order(asked)
             time = self.world.turns.monotonic() if is_proposed else asked.time
-            outcome = self._books.take(asked.goal, time)  # type: ignore[arg-type]
+            outcome = self._take(self._books, asked, time)
             assert outcome != "refused", f"{operation} is booked, but the model refuses it"
+            self.counts["waited"] += outcome == "waiting"
         expected = self._books.claims()
         assert claims == expected, f"after {commit.message}\n{claims}\nbut expected\n{expected}"
+        told, waiting = self._books.waiting_files(), self._waiting_on(commit)
+        assert waiting == told, f"{waiting} wait, but expected {told}"
+        self._books.told = {}
         self._claims = claims
         self._models.append(deepcopy(self._books))
+
+    def _take(self, books: Places, asked: Asked, time: float) -> str:
+        received = asked.ticket.received.astimezone(timezone.utc).isoformat(timespec="microseconds")
+        return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
+
+    def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
+        """Return who waits in a commit, since when and how urgently."""
+        texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
+        found = [yaml.safe_load(text) for text in texts]
+        return {
+            one["demand"]: (one["priority"], str(one["since"]), frozenset(one["requesters"]))
+            for one in found
+        }
+
+    def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
+        """Book what a generator did by itself: it ended leases, let one in, or emptied a node."""
+        both = self._claims.keys() & claims.keys()
+        moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
+        let_in = {demand for demand, _ in claims.keys() - both}
+        self.counts.update(let_in=len(let_in), moved=len(moved))
+        for demand in let_in:
+            self._books.has_room(demand, self._pushed_at)  # type: ignore[arg-type]
+        for demand, subject in moved:
+            self._books.moved(demand, subject)
+        if gone := self._claims.keys() - both:
+            self._end_leases(gone, machine, started, time)
+        assert moved or gone or let_in, "an operation that nobody asked for"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
         """Return the demands of a commit and of all that it merges, and whether each was proposed.
@@ -157,7 +201,6 @@ class Oracle:
         ]
 
     def _end_leases(self, gone: Any, machine: Machine, started: float, time: float) -> None:
-        assert gone, "an operation that nobody asked for"
         for demand, subject in gone:
             held, jump = self._books.held[demand][subject], self.world.last_jump
             assert held.promised is not None and held.seconds is not None, f"{demand}: no lease"
@@ -201,8 +244,10 @@ class Oracle:
         outcome = asked.ticket.future.result().outcome
         if outcome == "unchanged":
             self._assert_possible(asked, "unchanged")
-            if deepcopy(self._books).take(asked.goal, asked.time) == "unchanged":  # type: ignore[arg-type]
-                self._books.take(asked.goal, asked.time)  # type: ignore[arg-type]
+            if self._take(deepcopy(self._books), asked, asked.time) == "unchanged":
+                self._take(self._books, asked, asked.time)
+        elif outcome == "waiting" and place is None:
+            self._assert_possible(asked, "waits")
         elif asked.needs_approval and place is None:  # taken back, or main had its claims already
             if outcome != "released":
                 self._assert_possible(asked, "unchanged")
@@ -215,11 +260,12 @@ class Oracle:
     def _assert_possible(self, asked: Asked, outcome: str) -> None:
         """Fail unless the model says so in some state between the question and the answer."""
         said = self._possible(asked)
-        assert outcome in said, f"{asked.goal} was answered {outcome}, but the model says {said}"
+        told = f"{asked.goal} was answered {outcome} {asked.ticket.future.exception() or ''}"
+        assert outcome in said, f"{told}, but the model says {said}"
 
     def _possible(self, asked: Asked) -> set[str]:
         states = [*self._models[asked.place :], self._books]
-        return {deepcopy(state).take(asked.goal, asked.time) for state in states}  # type: ignore[arg-type]
+        return {self._take(deepcopy(state), asked, asked.time) for state in states}
 
     # ---- machines ----
 
@@ -239,8 +285,10 @@ class Oracle:
             if asked.ticket.state not in ("arrived", "done"):
                 # at a crash the journal may say already what the requester was not told
                 may_fail = machine.has_rejected or asked.needs_approval
-                may_fail |= not self._possible(asked).isdisjoint({"refused", "unchanged"})
-                assert may_fail or operation in self._place, f"{operation} is forgotten"
+                may_fail |= not self._possible(asked).isdisjoint({"refused", "unchanged", "waits"})
+                assert may_fail or operation in self._place, (
+                    f"{operation} is forgotten: {asked.goal}"
+                )
 
     def check_end(self) -> None:
         """Fail unless all is answered and in effect, long after everything was healed."""
@@ -258,5 +306,13 @@ class Oracle:
             assert not error or operation not in self._place, told
         leased = [name_of(claim) for claim in self.claims().values() if claim.lease]
         assert not leased, f"leases did not end: {leased}"
+        free, drained = self._books.free(), self._books.drained
+        on = {node for what, _ in self._claims.values() if (node := what.get("node"))}
+        assert not free or not self._books.waiting, f"{self._books.waiting} wait, {free} are free"
+        assert not free or not on & drained, f"{on & drained} were not emptied, {free} are free"
         (verdict,) = verification.verify(self.world.remote, [tip])
         assert verdict.holds, verdict
+
+
+def _node(claim: tuple[dict[str, Any], frozenset[str]]) -> object:
+    return claim[0].get("node")

@@ -34,8 +34,8 @@ def main() -> int:
     try:
         while time.monotonic() < end and counts["histories"] < most and counts["failures"] < 10:
             try:
-                tip, demands, commits = play(seed)
-                counts.update(demands=demands, commits=commits)
+                tip, seen = play(seed)
+                counts.update(seen)
             except Exception:
                 traceback.print_exc(limit=-6)
                 print(f"\nfailed; again: make simulate SEED={seed} HISTORIES=1\n", flush=True)
@@ -58,8 +58,8 @@ def main() -> int:
 
 def told(counts: Counter[str]) -> str:
     """Return counts as a person reads them."""
-    names = ("histories", "demands", "commits", "failures")
-    return ", ".join(f"{counts[name]} {name}" for name in names)
+    names = ("histories", "demands", "commits", "waited", "let_in", "moved", "failures")
+    return ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in names)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,15 @@ from demandops.decision import Decision
 from demandops.demand.lease import Lease
 from demandops.ledger import claim_file
 from demandops.ledger.recent_shutdowns import RecentShutdowns
+from demandops.plan.nodes.capacity import Room
+from demandops.plan.nodes.choice import Choice
 from demandops.service import Receipt
 from demandops.service.approvals.approvals import Approvals
 from demandops.service.evaluation import Evaluator
+from demandops.service.timing import waiting_turns
+from demandops.service.timing.draining import Draining
 from demandops.service.timing.expiry import LeaseExpiry
+from demandops.service.timing.waiting_turns import WaitingTurns
 from demandops.service.worker import Worker
 from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.write import journal
@@ -39,9 +44,9 @@ def _cleaned() -> Iterator[None]:
 
 
 def test_a_seed_decides_all_and_the_told_command_plays_it_again(tmp_path: Path) -> None:
-    (tip, demands, commits), other = play(7), play(8)
+    (tip, counts), other = play(7), play(8)
     assert tip != other[0]
-    assert commits > demands // 3 > 3
+    assert counts["commits"] > counts["demands"] // 3 > 3
     environment = {"SEED": "7", "HISTORIES": "1", "PYTHONHASHSEED": "3"}
     paths = os.pathsep.join([str(ROOT), *sys.path])
     ran = subprocess.run(
@@ -148,6 +153,29 @@ def bring_back_what_was_deleted(patch: Patch) -> None:
     patch(CommitBatch, "follow", undo)
 
 
+def let_the_last_in_first(patch: Patch) -> None:
+    in_turn = waiting_turns.in_turn
+    patch(waiting_turns, "in_turn", lambda waiting: in_turn(waiting)[::-1])
+
+
+def forget_those_that_wait(patch: Patch) -> None:
+    patch(WaitingTurns, "is_due", lambda *_: False)
+
+
+def leave_drained_nodes_full(patch: Patch) -> None:
+    patch(Draining, "is_due", lambda *_: False)
+    patch(Draining, "move_due", lambda *_: None)
+
+
+def place_on_drained_nodes(patch: Patch) -> None:
+    patch(Choice, "_closed", lambda *_: "")
+
+
+def count_no_room(patch: Patch) -> None:
+    patch(Choice, "_shortage", lambda *_: [])
+    patch(Room, "is_full", lambda *_: False)
+
+
 FAULTS: dict[Callable[[Patch], None], int] = {
     acknowledge_before_publishing: 3,
     forget_the_journal: 3,
@@ -160,6 +188,11 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     lose_renewals: 4,
     book_again_what_was_approved: 9,
     bring_back_what_was_deleted: 2,
+    let_the_last_in_first: 11,
+    forget_those_that_wait: 5,
+    leave_drained_nodes_full: 14,
+    place_on_drained_nodes: 5,
+    count_no_room: 0,
 }
 """Each with a seed that found it at once when this was written; others are tried if it does not."""
 

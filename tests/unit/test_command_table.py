@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
+from inspect import cleandoc
+from pathlib import Path
 
+import click
 import pytest
 from demandops.cli import main
 
@@ -29,12 +35,51 @@ def test_help_and_version_import_click_alone(option: str) -> None:
 
 @pytest.mark.parametrize("name", main.COMMANDS)
 def test_a_short_help_is_the_first_sentence_of_the_help(name: str) -> None:
-    if name in ("demand", "serve"):
+    if name in ("demand", "parameter-sync", "serve"):
         pytest.importorskip("rclpy")
     command = main.load(name)
     _, short_help = main.COMMANDS[name]
     assert command.name == name
     assert command.get_short_help_str(limit=1000) == short_help
+
+
+def commands_of(command: click.Command, *names: str) -> Iterator[tuple[str, click.Command]]:
+    yield " ".join(names), command
+    if isinstance(command, click.Group):
+        for name, each in command.commands.items():
+            yield from commands_of(each, *names, name)
+
+
+def examples_of(command: click.Command) -> list[list[str]]:
+    """Return the words of each line below Examples; pipes and redirections are the shell's."""
+    _, _, block = cleandoc(command.help or "").partition("\nExamples:\n")
+    lines = re.sub(r"\\\n", " ", block).splitlines()
+    return [shlex.split(re.split(r" [|>] ", line)[0]) for line in lines]
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_every_command_has_examples_that_parse(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if main.COMMANDS[name][0].startswith("demandops_ros"):
+        pytest.importorskip("rclpy")
+    monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    for path, command in commands_of(main.load(name), name):
+        examples = examples_of(command)
+        assert examples, f"{path} has no examples"
+        for program, *words in examples:
+            assert program == "demandops"
+            parse(main.cli, words)
+
+
+def parse(command: click.Command, words: list[str]) -> None:
+    """Parse a command line as the program does, down to the command that would run."""
+    ctx = command.make_context("demandops", words)
+    if isinstance(command, click.Group):
+        _, found, rest = command.resolve_command(ctx, [*ctx._protected_args, *ctx.args])
+        assert found is not None, words
+        parse(found, rest)
 
 
 def test_short_helps_fit_a_terminal() -> None:
@@ -44,8 +89,10 @@ def test_short_helps_fit_a_terminal() -> None:
 def test_a_command_whose_package_is_missing_says_so(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(sys.modules, "rclpy", None)
-    monkeypatch.delitem(sys.modules, "demandops_ros.serve_command", raising=False)
+    for name in [each for each in sys.modules if each.startswith("demandops_ros.")]:
+        monkeypatch.delitem(sys.modules, name)
+    for name in {"rclpy", *(each for each in sys.modules if each.startswith("rclpy."))}:
+        monkeypatch.setitem(sys.modules, name, None)
     assert main.run(["serve"]) == 1
     assert capsys.readouterr().err == (
         "error: serve needs rclpy, which is not installed; see README.md, 'With ROS 2'\n"

@@ -78,7 +78,7 @@ def test_an_answer_that_drips_is_cut_off() -> None:
     head = b"HTTP/1.1 200 OK\r\n\r\n"
     began = time.monotonic()
     with (
-        speaking(head, *[b"x"] * 15, pause=0.1) as url,
+        speaking(head, *[b"x"] * 60, pause=0.1) as url,
         pytest.raises(NoAnswer, match=r"no complete answer within 0\.3 s; check that it runs"),
     ):
         call(url, timeout=0.3)

@@ -32,7 +32,13 @@ Json = dict[str, Any]
 
 
 def commands() -> Json:
-    return {name: parameters(main.load(name)) for name in main.COMMANDS}
+    return {name: command_of(main.load(name)) for name in main.COMMANDS}
+
+
+def command_of(command: click.Command) -> Json | list[str]:
+    if isinstance(command, click.Group):
+        return {name: command_of(each) for name, each in sorted(command.commands.items())}
+    return parameters(command)
 
 
 def parameters(command: click.Command) -> list[str]:

@@ -13,6 +13,7 @@ import pytest
 from demandops.cli import output
 from demandops.cli.json_output import print_json, show
 from demandops.cli.repo import pull_request_comment
+from demandops.cli.table import Column, Table
 from demandops.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.quoting import (
     LONGEST_LINE,
@@ -26,7 +27,6 @@ from demandops.quoting import (
 from demandops.staterepo.load import problem_report
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.table import Table
 
 from tests.kit.chance import examples
 
@@ -85,8 +85,7 @@ def test_a_log_record_is_one_line_and_its_trace_is_indented(caplog: Any) -> None
 def test_commands_print_no_text_that_controls_a_terminal(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    table = Table("Summary", title=HOSTILE[:90])
-    table.add_row(HOSTILE[:90])
+    table = Table([Column("Summary")], [[HOSTILE[:90]], [[HOSTILE[:90]]]])
     show("text", None, [HOSTILE[:90], table])
     output.errors.print(HOSTILE[:90])
     print_json({"summary": HOSTILE[:90]})

@@ -37,10 +37,28 @@ def test_the_parameter_file_has_the_defaults() -> None:
     assert set(parameters.DEFAULTS) - set(named) == {"state_repo", "fetch_interval", "log_level"}
 
 
+def test_the_launch_file_of_the_detector_uses_all_its_arguments() -> None:
+    launch = ElementTree.parse(PACKAGE / "launch" / "detector.launch.xml").getroot()  # noqa: S314
+    arguments = [each.get("name") for each in launch.findall("arg")]
+    assert all(each.get("description") for each in launch.findall("arg"))
+    (node,) = launch.findall("node")
+    assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", "detect")
+    used = re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(node, "unicode"))
+    assert sorted(used) == sorted(arguments)
+
+
+def test_the_parameter_file_of_the_detector_has_the_defaults() -> None:
+    parameters = pytest.importorskip("demandops_ros.detector.detector_parameters").PARAMETERS
+    data = yaml.safe_load((PACKAGE / "config" / "detector_params.yaml").read_text())
+    named = data["/**"]["ros__parameters"]
+    assert named == {name: parameters[name][0] for name in named}
+    assert set(parameters) - set(named) == {"rules", "log_level"}
+
+
 def test_the_package_has_the_version_and_the_needs_of_the_code() -> None:
     manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()  # noqa: S314
     assert manifest.findtext("version") == demandops.__version__
-    code = "".join(path.read_text() for path in PACKAGE.parent.glob("demandops_ros/*.py"))
+    code = "".join(path.read_text() for path in PACKAGE.parent.glob("demandops_ros/**/*.py"))
     imported = set(re.findall(r"^(?:from|import) (\w+(?:_msgs|_interfaces)|rclpy)\b", code, re.M))
     assert {each.text for each in manifest.findall("exec_depend")} >= imported
 

@@ -10,18 +10,19 @@ from functools import wraps
 from typing import Any
 
 import click
-from rich.table import Table
 
-from demandops.cli.output import console
+from demandops.cli.output import painted, print_lines, terminal_width
+from demandops.cli.table import Table
 from demandops.config.override import Override, format_time
 from demandops.config.registry import ImagePin
 from demandops.demand.claim import Claim
+from demandops.demand.lease import Lease
 from demandops.errors import DemandOpsError, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.views.release_causes import versions_asked
-from demandops.quoting import json_escaped
+from demandops.quoting import json_escaped, lines
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.subject import Subject
@@ -36,7 +37,12 @@ def output_formats(*formats: str) -> Callable[[Command], Command]:
     if "markdown" in formats:
         description = "The output format; markdown is for a comment on a pull request."
     option = click.option(
-        "--output", type=click.Choice(formats), default="text", show_default=True, help=description
+        "-o",
+        "--output",
+        type=click.Choice(formats),
+        default="text",
+        show_default=True,
+        help=description,
     )
 
     def add(command: Command) -> Command:
@@ -62,9 +68,13 @@ def show(output: str, data: object, text: Iterable[str | Table]) -> None:
     if output == "json":
         print_json(data)
         return
-    out = console()
-    for each in text:
-        out.print(each, soft_wrap=isinstance(each, str))
+    print_lines([line for each in text for line in _lines_of(each)])
+
+
+def _lines_of(each: str | Table) -> list[str]:
+    if isinstance(each, str):
+        return lines(each).split("\n")
+    return each.lines(terminal_width(), painted)
 
 
 def print_json(data: object) -> None:
@@ -75,7 +85,7 @@ def print_json(data: object) -> None:
 def faults_of(error: DemandOpsError) -> list[Json]:
     """Return the faults of any error of the program."""
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
-    return [asdict(each) for each in faults]
+    return [asdict(each) for each in dict.fromkeys(faults)]
 
 
 def time_data(moment: datetime | None) -> str | None:
@@ -93,23 +103,36 @@ def subject_data(subject: Subject) -> Json:
     return {"kind": subject.kind.value[:-1], "id": subject.id}
 
 
+def lease_data(lease: Lease | None) -> Json | None:
+    """Return a lease as JSON data; one that has not started has no end."""
+    if lease is None:
+        return None
+    return {
+        "seconds": lease.seconds,
+        "slack": lease.slack,
+        "until": time_data(lease.until) if lease.has_started else None,
+    }
+
+
 def claim_data(claim: Claim) -> Json:
     """Return a claim as JSON data."""
-    lease = claim.lease
+    app = claim.application if claim.is_on_application else None
     return {
         "subject": subject_data(claim.subject),
         "demand": claim.demand,
         "request": claim.request,
-        "version": (claim.is_on_application and claim.application.version) or None,
+        "version": (app and app.version) or None,
+        "place": claim_file.place_data(app.place) if app and app.place else None,
+        "services": dict(sorted(app.services.items())) if app and app.services else None,
         "requesters": list(claim.requesters),
         "since": time_data(claim.booked),
-        "lease": {"seconds": lease.seconds, "until": time_data(lease.until)} if lease else None,
+        "lease": lease_data(claim.lease),
         "file": claim_file.path_of(claim.key),
     }
 
 
 def place_data(release: Release) -> Json:
-    """Return what a release is and where it runs, as JSON data."""
+    """Return the description, the namespace and the node of a release as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,

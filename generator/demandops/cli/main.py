@@ -14,32 +14,55 @@ from keyword import iskeyword
 import click
 
 from demandops import __version__
-from demandops.cli.output import errors
+from demandops.cli.output import errors, show_slow
 from demandops.errors import DemandOpsError, InvalidInput, Unsound
 from demandops.quoting import OneLineFormatter
+from demandops.staterepo.git import slow_git
 
 COMMANDS = {
+    "approve": ("actions", "Approve a proposed demand: merge its branch in your own name."),
     "bookkeeping": ("views", "Show who requests which service and connection."),
     "check": ("repo", "Check edits of a state repo and show their consequences."),
+    "completion": (
+        "repo",
+        "Print the code that makes a shell complete commands.",
+    ),
+    "config": ("repo", "List, set and choose contexts: the fleets that you work with."),
     "decommission": ("actions", "Release all claims of a node or a requester."),
     "demand": ("demandops_ros", "Send a demand to a running node."),
+    "detect": ("demandops_ros.detector", "Watch topics and demand by rules."),
     "diff": ("views", "Show the differences between two commits."),
-    "import": ("actions", "Book what the reference runs."),
+    "get": ("views", "List demands, nodes, services, overrides and so on."),
+    "import": ("actions", "Book the reference's applications and connections."),
     "init": ("repo", "Create a state repo."),
     "journal": ("repo", "List the accepted demands that are not published."),
     "log": ("views", "List the commits of the state repo, newest first."),
-    "overrides": ("views", "List the overrides and what each one does."),
-    "proposals": ("views", "List the demands that await approval."),
+    "new": ("repo", "Write a new application, node, access domain or override."),
+    "override": ("actions", "Create and end overrides: deviations that people declare."),
+    "parameter-sync": (
+        "demandops_ros.parameter_sync",
+        "Keep a ROS node's parameters as a ConfigMap has them.",
+    ),
+    "reject": ("actions", "Turn a proposed demand down: delete its branch."),
     "request": ("actions", "Book demand requests from files."),
+    "resume": ("actions", "Run suspended applications and connections again."),
     "rollback": ("actions", "Restore the ledger of an earlier commit, by a new commit."),
     "schema": ("repo", "Print the JSON Schema of a kind of file."),
     "serve": ("demandops_ros", "Run the ROS 2 node that accepts demands."),
     "status": ("views", "Show the state of each release on its cluster."),
+    "suspend": ("actions", "Stop applications and connections without releasing them."),
     "upgrade": ("repo", "Render everything again, in one commit."),
     "verify": ("repo", "Render the ledger of commits again and compare the bytes."),
+    "version": ("repo", "Print the versions of the program and of its formats."),
+    "watch": ("views", "Show releases, demands and the latest commits live."),
+    "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
 """Each command, by name: the room of its module, and its short help."""
+
+
+_LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
+"""They log, or fill the screen, so they do not show what git does meanwhile."""
 
 
 class ExitCode(IntEnum):
@@ -55,16 +78,17 @@ class ExitCode(IntEnum):
 def load(name: str) -> click.Command:
     """Import a command; raise a ClickException if a package that it needs is not installed."""
     room = COMMANDS[name][0]
-    ros = room == "demandops_ros"
-    word = f"{name}_" if iskeyword(name) else name
-    module = f"demandops_ros.{name}_command" if ros else f"demandops.cli.{room}.{word}"
+    ros = room.split(".")[0] == "demandops_ros"
+    word = f"{name}_" if iskeyword(name) else name.replace("-", "_")
+    module = f"{room}.{word}_command" if ros else f"demandops.cli.{room}.{word}"
     try:
         command: click.Command = getattr(import_module(module), word)
     except ModuleNotFoundError as error:
-        if str(error.name).split(".")[0] in ("demandops", "demandops_ros"):
+        missing = str(error.name).split(".")[0]
+        if missing in ("demandops", "demandops_ros"):
             raise
         raise click.ClickException(
-            f"{name} needs {error.name}, which is not installed; see README.md, 'With ROS 2'"
+            f"{name} needs {missing}, which is not installed; see README.md, 'With ROS 2'"
         ) from None
     return command
 
@@ -77,6 +101,8 @@ class _LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Import the command that the arguments name; return its name, it and its arguments."""
         name, command, rest = super().resolve_command(ctx, args)
+        if name and name not in _LONG_RUNNING:
+            slow_git.listen(show_slow)
         return name, load(name) if name else command, rest
 
 
@@ -113,7 +139,7 @@ def run(args: list[str] | None = None) -> int:
         error.show()
         return ExitCode.WRONG_USAGE
     except click.Abort:
-        errors.print("interrupted")
+        errors.print("\ninterrupted" if sys.stderr.isatty() else "interrupted")  # after ^C
         return ExitCode.INTERRUPTED
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")

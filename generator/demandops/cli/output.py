@@ -1,14 +1,15 @@
 """The output of commands: tables for people, JSON for programs, errors and progress on stderr.
 
-`rich` is imported by what needs it, because `demandops --help` imports this module.
+Functions that need `rich` import it themselves, because `demandops --help` imports this module.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 _WIDE = 200
 _PATIENCE_S = 0.5
+_MOST_LISTED = 3
 
 Progress = Callable[[int, int], None]
 
@@ -46,6 +48,33 @@ SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~",
 """The mark of a release or an entry, by its change."""
 
 
+def terminal_width() -> int | None:
+    """Return the width of the terminal, or None if the output is not for one."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+
+
+def painted(text: str, style: str) -> str:
+    """Return text in a style: ``bold``, ``dim`` or a color; plain unless stdout shows colors."""
+    colors = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+    if not colors or not style or os.environ.get("TERM") == "dumb":
+        return text
+    if style in ("bold", "dim"):
+        return click.style(text, **{style: True})
+    return click.style(text, fg=style)
+
+
+def print_lines(found: list[str]) -> None:
+    """Print lines; on a terminal that is too low for them, through the pager ``$PAGER``."""
+    text = "".join(f"{line}\n" for line in found)
+    high = len(found) >= shutil.get_terminal_size().lines
+    pager = os.environ.get("PAGER")
+    if not high or pager in ("", "cat") or not (sys.stdin.isatty() and sys.stdout.isatty()):
+        click.echo(text, nl=False)
+        return
+    os.environ.setdefault("LESS", "FRX")  # as git does: colors, and the text stays afterwards
+    click.echo_via_pager(text)
+
+
 class _Errors:
     """Prints plain lines on stderr, never wrapped."""
 
@@ -62,23 +91,17 @@ def warn_of(problems: Iterable[object]) -> None:
         errors.print(f"warning: {problem}; its last valid version is in effect")
 
 
-state_repo_option = click.option(
-    "--state-repo",
-    required=True,
-    envvar="DEMANDOPS_STATE_REPO",
-    metavar="URL_OR_DIR",
-    help="The state repo: a bare repository's folder, or a URL that git can clone "
-    "[env: DEMANDOPS_STATE_REPO].",
-)
+def warn_of_not_rendered(paths: Collection[str]) -> None:
+    """Warn about generated files that a generator has yet to write or remove."""
+    if paths:
+        files = (
+            "1 generated file waits" if len(paths) == 1 else f"{len(paths)} generated files wait"
+        )
+        listed = ", ".join(sorted(paths)[:_MOST_LISTED]) + (
+            ", …" if len(paths) > _MOST_LISTED else ""
+        )
+        errors.print(f"warning: {files} for a generator to write or remove: {listed}")
 
-signing_option = click.option(
-    "--signing-key",
-    envvar="DEMANDOPS_SIGNING_KEY",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Sign the commits with this SSH key: a private key without a passphrase, or the public "
-    "key of a key in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
-)
 
 at_option = click.option(
     "--at",
@@ -88,15 +111,55 @@ at_option = click.option(
 )
 
 
-def version_text(data: Mapping[str, Any]) -> str:
+def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
+    """Parse an option that is a duration; return its seconds."""
+    from demandops.config.policy import seconds_of  # noqa: PLC0415 - --help must be fast
+
+    try:
+        return seconds_of(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from None
+
+
+def version_lines(data: Mapping[str, Any]) -> list[str]:
     """Return the version that a service runs, and below it the versions that demands name."""
     asked = data["versions_asked"].items()
-    return "\n".join(
-        [
-            data["application_version"] or data["version"] or "",
-            *(f"{version} asked by {', '.join(requesters)}" for version, requesters in asked),
-        ]
-    )
+    return [
+        data["application_version"] or data["version"] or "",
+        *(f"{version} asked by {', '.join(requesters)}" for version, requesters in asked),
+    ]
+
+
+def show_slow(text: str) -> None:
+    """Show on a terminal what takes long, in place of what was shown before; nothing if empty."""
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\x1b[2K{lines(text)}")
+        sys.stderr.flush()
+
+
+@contextmanager
+def busy(title: str) -> Iterator[None]:
+    """Show on a terminal what goes on, and for how long, once it takes a second."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    ended, shown = REAL.event(), REAL.event()
+
+    def tick() -> None:
+        seconds = 0
+        while not ended.wait(1):
+            seconds += 1
+            shown.set()
+            show_slow(f"{title}, {seconds} s")
+
+    thread = REAL.start_thread("busy", tick)
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+        if shown.is_set():
+            show_slow("")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
 from demandops.errors import InvalidInput, fault
+from demandops.field_lines import located_in, with_lines
 from demandops.input_file import read_input, read_secret
 
 
@@ -68,10 +69,13 @@ class ClusterAccess(FrozenModel):
         )
 
 
-def own_cluster_api() -> Any:  # noqa: ANN401 - the library has no types
+def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
     """Return the API of the cluster in which this process is a pod, as its service account.
 
     A call that fails is not tried again.
+
+    Args:
+        wanted_by: the option or command that needs it, for the message.
 
     Raises:
         InvalidInput: if this process is not a pod, or its pod has no token.
@@ -84,7 +88,7 @@ def own_cluster_api() -> Any:  # noqa: ANN401 - the library has no types
         config.load_incluster_config(settings)
     except config.ConfigException as error:
         raise InvalidInput.at(
-            "--leader-lease", f"needs a pod with a service account's token: {error}"
+            wanted_by, f"needs a pod with a service account's token: {error}"
         ) from None
     return client.CustomObjectsApi(client.ApiClient(settings))
 
@@ -103,7 +107,8 @@ def read(path: Path) -> AccessFile:
         InvalidInput: with all faults.
     """
     name, text = read_input(path)
-    content = parse_file(AccessFile, text, name)
+    with located_in(text):
+        content = parse_file(AccessFile, text, name)
     faults = []
     for cluster, access in content.clusters.items():
         try:
@@ -113,5 +118,5 @@ def read(path: Path) -> AccessFile:
             field = f"clusters.{cluster}.secret_file"
             faults.append(fault(field, f"{problem.file} {problem.message}").within(name))
     if faults:
-        raise InvalidInput(faults)
+        raise InvalidInput(with_lines(faults, lambda _: text))
     return content

@@ -33,7 +33,7 @@ _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-
 
 
 class Leadership:
-    """One process's part in the choice of the leader."""
+    """The part of this process in the choice of the leader."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class Leadership:
             "name": found[3],
         }
         self._lease, self._may_lead, self._on_leader = lease, may_lead, on_leader
-        self._api = own_cluster_api() if api is None else api
+        self._api = own_cluster_api("--leader-lease") if api is None else api
         self._runtime = runtime
         self._identity = f"{os.uname().nodename}_{runtime.fresh_id()}"
         self.is_leader = False
@@ -103,7 +103,7 @@ class Leadership:
                 self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
             self._closed.wait(_PAUSE_S)
-            self._require_renewed()  # a renewal must not begin too late
+            self._require_renewed()  # a renewal that begins too late would be no use
 
     def _compete(self) -> None:
         """Renew the Lease, or take it if nobody holds it."""

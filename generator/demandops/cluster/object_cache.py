@@ -51,7 +51,7 @@ class ObjectCache:
         self._client: Any = None
 
     def watch(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Watch these objects too."""
+        """Watch further objects."""
         for selector in wanted:
             with self._lock:
                 if selector in self._watched or self._closed.is_set():
@@ -66,7 +66,7 @@ class ObjectCache:
             return dict(self._objects)
 
     def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
-        """Return why some of these objects are unknown now; empty if all are known."""
+        """Return why some of the objects are unknown now; empty if all are known."""
         with self._lock:
             for selector in wanted:
                 if selector in self._errors:
@@ -83,19 +83,19 @@ class ObjectCache:
         return Health("waiting", f"cannot be read: {reason}", f"cluster {self._name}")
 
     def read_once(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read these objects once, without a watch; :meth:`why_unknown` says what failed."""
+        """Read objects once, without a watch; :meth:`why_unknown` gives the reason of a failure."""
         selectors = list(wanted)
         for selector in selectors:
             try:
                 self.refresh([selector])
             except Exception as error:
-                if not _is_answer(error):  # the cluster is away, so do not wait for the others
+                if not _is_answer(error):  # the cluster does not answer, so do not ask again
                     self._errors |= dict.fromkeys(selectors, _reason(selector, error))
                     return
                 self._errors[selector] = _reason(selector, error)
 
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read these objects again, in this order: one watch may lag behind another.
+        """Read objects again, in the given order, because one watch may lag behind another.
 
         Raises:
             Exception: by the library, if the cluster does not answer.

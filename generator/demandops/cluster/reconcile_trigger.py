@@ -26,7 +26,7 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""Seconds between fetches: two within a second can make source-controller break an artifact."""
+"""Seconds between fetches: two within a second can make source-controller corrupt an artifact."""
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 _REFRESH = "argocd.argoproj.io/refresh"
 
@@ -111,8 +111,8 @@ class ReconcileTrigger:
             before = self._reported.get(name, "")
             commit, paths = self._changes_since(before)
             if paths is not None:
-                # always a file of each domain's folder: an Application that is not refreshed
-                # never reports the new commit
+                # Name a file in each domain's folder too: Argo CD refreshes only Applications
+                # with changed files, and only a refreshed one reports the new commit.
                 paths = [path for path in paths if _concerns(path, name)]
                 folders = [domain_folder(name, domain) for domain in _domains(name, config)]
                 paths += [f"{folder}/_domain.yaml" for folder in folders]
@@ -146,16 +146,16 @@ def _domains(cluster: str, config: Config) -> list[AccessDomain]:
 
 
 def _concerns(path: str, cluster: str) -> bool:
-    """Return whether a changed path may affect a cluster.
+    """Return whether a changed file may affect a cluster.
 
-    The ledger and the files of other clusters do not.
+    Files of the ledger and of other clusters do not.
     """
     first, _, rest = path.partition("/")
     return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"
 
 
 def _refresh_patch(domain: AccessDomain, repository: RepoSettings, now: str) -> dict[str, Any]:
-    """Return the object of a domain that fetches from Git, and the patch that makes it fetch."""
+    """Return the arguments of an API call that makes a domain's object fetch from Git now."""
     if repository.gitops == "argocd" and repository.argocd:
         group, version, plural = "argoproj.io", "v1alpha1", "applications"
         namespace, name = repository.argocd.namespace, project_of(domain, repository)

@@ -31,7 +31,7 @@ from demandops.runtime import REAL, Runtime
 log = logging.getLogger("demandops")
 
 OnProgress = Callable[[str, str], None]
-"""Called once for each new text, with its state (``reconciled``, ``healthy``, ``failing``)."""
+"""Called with a state (``reconciled``, ``healthy``, ``failing``) and each new text about it."""
 
 _PAUSE_S = 0.05
 _LONGEST_WAIT_S = 1.0
@@ -61,7 +61,7 @@ class RolloutWatcher:
         history: History,
         runtime: Runtime = REAL,
     ) -> None:
-        """Start without watches; the watches of a domain start with its first rollout.
+        """Make a watcher; the watches of a domain start with its first rollout.
 
         Args:
             clusters: the access to each cluster; clusters without a kubeconfig are ignored.
@@ -99,7 +99,7 @@ class RolloutWatcher:
             commit: the published commit.
             targets: the releases; :meth:`why_unreachable` must be empty for their domains.
             level: the level that they have to reach.
-            timeout: seconds until the future is resolved in any case.
+            timeout: seconds after which the future is resolved whatever the health.
             on_progress: called with each new state, from the status thread.
 
         Returns:
@@ -173,9 +173,9 @@ class RolloutWatcher:
         rollout.confirmed = True
 
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
-        """Resolve a rollout after its timeout; add the reason of pods that do not run.
+        """Resolve a rollout after its timeout; say also why its pods do not run.
 
-        If the controller is just retrying, add the reason of the earlier failure.
+        If the controller is just retrying, say also why the attempt before failed.
         """
         failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:

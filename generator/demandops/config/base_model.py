@@ -22,7 +22,7 @@ from pydantic.alias_generators import to_camel
 
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput, fault, suggestion
-from demandops.identifiers import control_character
+from demandops.identifiers import PATTERN_WORDS, control_character
 from demandops.quoting import escaped, quoted
 from demandops.settings import API_VERSION
 
@@ -68,7 +68,7 @@ def readable_by(parse: Callable[[str], object]) -> AfterValidator:
 
 def _hidden(value: str) -> str:
     control = control_character(re.sub(r"[\n\t]", " ", value))
-    return control and f"{quoted(value)} holds the control character {control}; remove it"
+    return control and f"{quoted(value)} has the control character {control}; remove it"
 
 
 Visible = without(_hidden)
@@ -147,11 +147,11 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     if kind == "string_type" and isinstance(value, int | float):
         return f"must be text, not {strict_yaml.short_repr(value)}; put it in quotes"
     if kind == "literal_error":
-        return f"is {strict_yaml.short_repr(value)}, but must be {item['ctx']['expected']}"
+        expected = str(item["ctx"]["expected"]).replace("True", "true")
+        return f"is {strict_yaml.short_repr(value)}, but must be {expected}"
     if kind == "string_pattern_mismatch":
-        return (
-            f"{value!r} is not a name that can be used here; it must match {item['ctx']['pattern']}"
-        )
+        pattern = item["ctx"]["pattern"]
+        return f"{value!r} cannot be used here; write {PATTERN_WORDS.get(pattern, pattern)}"
     if kind == "value_error":
         return str(item["ctx"]["error"])
     if kind == "string_too_short":

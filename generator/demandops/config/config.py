@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Service, ServiceDefinition, Services
-from demandops.config.inventory import Broker, Cluster, Node
+from demandops.config.inventory import Broker, Cluster, Node, id_in_domain
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import (
@@ -49,7 +49,7 @@ CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", 
 
 
 def collection_of(path: str) -> str | None:
-    """Return the collection that a file has entries of: itself, or that of its folder.
+    """Return the collection to which a file's entries belong: the file itself, or its folder's.
 
     ``inventory/nodes/berlin.yaml`` has entries of ``inventory/nodes.yaml``.
     """
@@ -60,7 +60,7 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return for messages where the entries of a collection are, which is in ``files``."""
+    """Return where a message says that entries of a collection are; ``files`` have them."""
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
@@ -73,7 +73,8 @@ class Config:
     ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
     ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
     override; :class:`demandops.ledger.world.World` knows which of them have ended. ``entry_files``
-    maps each collection's entries to the files that they are in.
+    maps each collection's entries to the files that they are in. ``hosts`` maps each node in a
+    further access domain (``edge@city``) to the node that it is (``edge``).
     """
 
     repo_settings: RepoSettings
@@ -88,6 +89,7 @@ class Config:
     services: Mapping[str, Services]
     domain_of: Mapping[str, AccessDomain]
     files: Mapping[str, str]
+    hosts: Mapping[str, str] = field(default_factory=dict)
     overrides: Mapping[str, Override] = field(default_factory=dict)
     clients: ClientsFile = DEFAULT_SETTINGS
     versions: Mapping[str, VersionList] = field(default_factory=dict)
@@ -97,18 +99,24 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """The nodes by what their id becomes in names of topics, which several may share."""
+    """Part of a topic's name → the nodes whose ids become this part."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     """The nodes of each type, sorted by id; an empty name stands for all."""
+    drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    """The nodes that are drained, sorted."""
+    limits_capacity: bool = field(init=False, compare=False, repr=False)
+    """Whether a node declares a capacity."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The roles of which a service of any appdef runs once for each topic, sorted."""
+    """The roles for each of whose topics a service runs, in any appdef; sorted."""
+    services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
+    """The names of services that keep replicas for a while, in at least one appdef."""
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """Appdef → version or channel → what it runs; an empty name stands for the default."""
+    """Appdef → version or channel → the version's contents; an empty name is the default."""
 
     def __post_init__(self) -> None:
-        """Set what follows from the other fields."""
+        """Set the fields that are derived from the others."""
         found: dict[str, tuple[str, ...]] = {}
         for id in self.nodes:
             part = naming.topic_part(id)
@@ -120,7 +128,13 @@ class Config:
                 by_role.setdefault(role, []).append(node)
         by_role_sorted = {role: tuple(nodes) for role, nodes in by_role.items()}
         object.__setattr__(self, "nodes_by_role", by_role_sorted)
-        services = (one for services in self.services.values() for one in services.values())
+        drained = tuple(sorted(id for id, node in self.nodes.items() if node.drained))
+        object.__setattr__(self, "drained_nodes", drained)
+        limited = any(node.capacity is not None for node in self.nodes.values())
+        object.__setattr__(self, "limits_capacity", limited)
+        services = [one for services in self.services.values() for one in services.values()]
+        kept = frozenset(one.name for one in services if one.scaling.down_after)
+        object.__setattr__(self, "services_with_down_after", kept)
         roles = tuple(sorted({one.root for one in services if one.root}))
         object.__setattr__(self, "roles_with_services", roles)
         versions = {name: self._versions(name) for name in self.services}
@@ -144,12 +158,22 @@ class Config:
         named = {"": listed.default, **listed.channels}
         return known | {word: known[version] for word, version in named.items()}
 
+    def host_of(self, node: str) -> str:
+        """Return the inventory's name of a node: ``edge`` for ``edge@city``."""
+        return self.hosts.get(node, node)
+
+    def nodes_of(self, host: str) -> tuple[str, ...]:
+        """Return a node's name in each of its access domains: ``edge``, then ``edge@city``."""
+        known = self.nodes.get(host)
+        further = known.access_domains if known else ()
+        return host, *(id_in_domain(host, one.name) for one in further)
+
     def file_of(self, collection: str, name: str) -> str:
         """Return the file that has an entry, or the collection's usual file."""
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return for messages where the entries of a collection are."""
+        """Return where a message says that entries of a collection are."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
@@ -181,10 +205,14 @@ class Config:
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return for messages where the versions of an appdef are."""
+        """Return the file that a message names for the versions of an appdef."""
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
         return self.place_of(CHARTS_FILE)
+
+    def users_of(self, service: str) -> list[str]:
+        """Return the application definitions that have a service of this name."""
+        return [appdef for appdef, services in self.services.items() if service in services]
 
     def parameters_of(self, appdef: str) -> set[str]:
         """Return the parameters that a demand for this appdef may set."""

@@ -90,9 +90,10 @@ class ConfigReader:
     def add_twice(
         self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
     ) -> None:
-        """Add the faults of an entry that is at two places, as (file, field).
+        """Add the faults of an entry that stands twice, at the places ``first`` and ``second``.
 
-        Each file is at fault, so that the one that a person changed is held back.
+        A place is (file, field). Both files get a fault, so that the one that a person changed is
+        held back.
         """
         dot_key = f".{key}" if key else ""
         if first[0] == second[0]:
@@ -118,6 +119,10 @@ class ConfigReader:
     def place_of(self, collection: str, name: str) -> tuple[str, str]:
         """Return the file that has an item, and the field in it: ``nodes[3]``."""
         return self._places[collection][name]
+
+    def add_alias(self, collection: str, name: str, of: str) -> None:
+        """Register ``name`` as a further name of the item ``of``."""
+        self._places[collection][name] = self._places[collection][of]
 
     def is_missing(self, collection: str, name: str) -> bool:
         """Return whether a collection lacks an item; False if any of its items is invalid."""

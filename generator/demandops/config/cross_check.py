@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from demandops import strict_yaml
+from demandops.charts import chart_files
 from demandops.config.appdef import Deployed, ServiceDefinition
 from demandops.config.config import (
     BROKERS_FILE,
@@ -101,7 +102,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
         if closed and config.clients.of(word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
-                "forbids it; leave it out, then each client does as its node"
+                "forbids it; leave it out, so that each client is like its node"
             )
             reader.add_fault(file, f"{word}.hostNetwork", message)
 
@@ -137,6 +138,7 @@ def _check_chart(
             f"{where}.version",
             f"is {chart.version}, but {path} says {version}; make them equal",
         )
+    reader.faults += chart_files.faults(chart.folder, config.files)
 
 
 def _check_services(config: Config, reader: ConfigReader) -> None:
@@ -181,8 +183,17 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Add a fault if appdefs have a shared service run for topics of different origins."""
+    """Add a fault if two appdefs take the topics that a shared service runs for from elsewhere."""
     origins: dict[str, tuple[str, str]] = {}
+    for name, definition in config.definitions.items():
+        file = f"appdefs/{name}/service.yaml"
+        for cluster, node in definition.nodes.items():
+            reader.check_reference(file, f"nodes.{cluster}", cluster, CLUSTERS_FILE)
+            reader.check_reference(file, f"nodes.{cluster}", node, NODES_FILE)
+            known = config.nodes.get(node)
+            if known is not None and known.cluster != cluster:
+                message = f"'{node}' is in cluster '{known.cluster}'; name a node of '{cluster}'"
+                reader.add_fault(file, f"nodes.{cluster}", message)
     for appdef, services in config.services.items():
         for name, service in services.items():
             if not service.shared or service.each is None:
@@ -207,6 +218,8 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
                 f"is {appdef.versions}, but {config.place_of(VERSIONS_FILE)} does not list the "
                 f"versions of '{name}' and their order; add them, or remove this",
             )
+        if appdef.versions == "separate":
+            _check_separate(name, config, reader)
     for name, listed in config.versions.items():
         file, place = reader.place_of(VERSIONS_FILE, name)
         if name not in config.appdefs:
@@ -234,8 +247,24 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
                 _check_used(file, f"{where}.images.{image}", image, images, name, reader)
 
 
+def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
+    """Add a fault if a shared service runs for the output of a service that each version has."""
+    services = config.services.get(appdef, {})
+    for name, service in services.items():
+        origin = service.inputs[service.each] if service.shared and service.each else ""
+        producer = services.get(origin.partition(".")[0])
+        if producer is not None and not producer.shared:
+            reader.add_fault(
+                f"appdefs/{appdef}/appdef.yaml",
+                f"uses.{name}.{service.each}",
+                f"is '{origin}', which each version makes on its own (versions: separate), but "
+                f"'{name}' runs once for all; make it a service of this definition, or share "
+                f"'{producer.name}' too",
+            )
+
+
 def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
-    """Return whether no list of versions is of an appdef, not even an invalid one."""
+    """Return whether an appdef has no list of versions, not even an invalid one."""
     return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
 
 
@@ -276,7 +305,7 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             _check_moved_to(override.node, override, config, reader)
         if override.values and override.patches_clients():
             try:
-                # those of MQTT have every field
+                # MQTT clients have every field that other clients have
                 patched_settings(config.clients.mqtt, override.values, override.path)
             except InvalidInput as error:
                 reader.faults += error.faults
@@ -292,6 +321,19 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_moved_to(node: str, override: Override, config: Config, reader: ConfigReader) -> None:
+    selected = [
+        service
+        for appdef, services in config.services.items()
+        for name, service in services.items()
+        for selector in override.select
+        if selector.takes(name, appdef)
+    ]
+    if selected and not any(service.is_movable for service in selected):
+        message = (
+            f"moves nothing: {selected[0].name} runs at its sources, or at the nodes of its "
+            "definition; change its definition, or remove node"
+        )
+        reader.add_fault(override.path, "node", message)
     if node in config.nodes and node not in config.domain_of and config.domains:
         message = f"'{node}' is not in any access domain; add it to one in "
         message += config.place_of(DOMAINS_FILE)

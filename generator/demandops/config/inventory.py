@@ -7,9 +7,10 @@ belongs to one cluster and one access domain. A node selector identifies it in i
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 from typing import Annotated, Literal
 
-from pydantic import Field, StringConstraints, model_validator
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from demandops.config.base_model import (
     CamelModel,
@@ -19,9 +20,11 @@ from demandops.config.base_model import (
     Text,
     Visible,
     Word,
+    readable_by,
     without,
 )
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
+from demandops.quoting import quoted
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
 """A host name or an IP address."""
@@ -92,6 +95,61 @@ class Wan(CamelModel):
         return self
 
 
+_QUANTITY = re.compile(r"(\d{1,15})(?:\.(\d{1,3}))?(m|k|M|G|T|Ki|Mi|Gi|Ti)?")
+_FACTORS = {"m": 1, "": 1000} | {
+    unit: 1000 * base**power
+    for base, units in ((1000, ("k", "M", "G", "T")), (1024, ("Ki", "Mi", "Gi", "Ti")))
+    for power, unit in enumerate(units, 1)
+}
+
+
+@lru_cache(maxsize=1024)
+def amount_of(text: str) -> int:
+    """Return a quantity of a resource in thousandths: ``500m`` is 500, ``2`` is 2000.
+
+    Raises:
+        ValueError: if the text is not a quantity as Kubernetes writes them.
+    """
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{quoted(text)} is not a quantity; write one like 2, 500m, 1.5 or 16Gi")
+    whole, decimals, unit = match.groups(default="")
+    amount, rest = divmod(int(whole + decimals.ljust(3, "0")) * int(_FACTORS[unit]), 1000)
+    if rest:
+        raise ValueError(f"{quoted(text)} is finer than a thousandth; round it")
+    return amount
+
+
+def amount_text(amount: int, resource: str) -> str:
+    """Return an amount in thousandths as a person writes it: ``1.5``, or ``16Gi`` of memory."""
+    if resource.endswith(("memory", "storage")):
+        for unit in ("Ti", "Gi", "Mi", "Ki"):
+            if amount and amount % _FACTORS[unit] == 0:
+                return f"{amount // _FACTORS[unit]}{unit}"
+    whole, rest = divmod(amount, 1000)
+    return f"{whole}.{rest:03}".rstrip("0") if rest else str(whole)
+
+
+def _plain_number(value: object) -> object:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if is_number else value
+
+
+Quantity = Annotated[
+    str,
+    BeforeValidator(_plain_number, json_schema_input_type=str | int | float),
+    readable_by(amount_of),
+]
+"""A quantity as Kubernetes writes them; a plain number needs no quotes."""
+
+ResourceName = Annotated[
+    str, StringConstraints(pattern=r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$", max_length=120)
+]
+"""A name of a resource: ``cpu``, ``memory``, ``gpu``, ``nvidia.com/gpu``."""
+
+Resources = dict[ResourceName, Quantity]
+"""How much of each resource something has or requests."""
+
 NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
 MessageType = Annotated[str, without(message_type_problem)]
@@ -155,11 +213,25 @@ class Position(CamelModel):
     y: Coordinate
 
 
+class FurtherDomain(CamelModel):
+    """An access domain that a node is in besides the one whose ``nodes`` has it.
+
+    ``zenoh`` and ``wan`` replace the node's own for connections of this domain, because two
+    programs cannot listen on one port.
+    """
+
+    name: DnsLabel
+    zenoh: Zenoh | None = None
+    wan: Wan | None = None
+
+
 class Node(CamelModel):
     """A C-ITS entity that runs services.
 
     ``type`` is its role, any word; ``capabilities`` are words for what it has. A demand may ask for
-    them instead of the node (:mod:`demandops.plan.placement`), but gets no ``drained`` one then.
+    them instead of the node (:mod:`demandops.plan.nodes.placement`), then it gets no ``drained``
+    one.
+    Services request no more than ``capacity`` there (:mod:`demandops.plan.nodes.capacity`).
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
     The access domain's ROS domain replaces that of ``ros``, if it has one.
     ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
@@ -167,6 +239,8 @@ class Node(CamelModel):
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
     message types of topics for which a request gives none. ``bridged`` lists topics that the
     initial deployment already carries to another node under the same name; connections skip them.
+    ``access_domains`` are further ones. In each of them the node is another node of the
+    configuration, called ``<id>@<domain>`` (:func:`in_domain`).
     """
 
     id: NodeId
@@ -185,19 +259,52 @@ class Node(CamelModel):
     capabilities: Items[Word] = ()
     position: Position | None = None
     drained: bool = False
+    capacity: Resources | None = None
+    access_domains: Items[FurtherDomain] = ()
 
     @model_validator(mode="after")
     def _findable(self) -> Node:
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
-                "the id is not a valid label value, so nodes cannot have it as node_id; add a "
-                "selector"
+                "the id is not a valid label value, so no cluster node can have the label node_id "
+                "with it; add a selector"
             )
         return self
 
     def labels(self) -> dict[str, str]:
         """Return the node selector."""
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
+
+    def in_domain(self, further: FurtherDomain) -> Node:
+        """Return the node as it is in a further access domain."""
+        return self.model_copy(
+            update={
+                "id": id_in_domain(self.id, further.name),
+                "selector": self.labels(),
+                "zenoh": further.zenoh,
+                "wan": further.wan,
+                "bridged": {},
+                "access_domains": (),
+            }
+        )
+
+    def most(self, resource: str) -> int | None:
+        """Return its capacity of a resource in thousandths; ``None`` if it is not limited.
+
+        A node without ``capacity`` limits nothing. With it, cpu and memory that it does not list
+        are not limited, and of any other resource it has what it lists.
+        """
+        if self.capacity is None:
+            return None
+        listed = self.capacity.get(resource)
+        if listed is not None:
+            return amount_of(listed)
+        return None if resource in ("cpu", "memory") else 0
+
+
+def id_in_domain(node: str, domain: str) -> str:
+    """Return the name of a node in a further access domain: ``<node>@<domain>``."""
+    return f"{node}@{domain}"
 
 
 class Broker(CamelModel):

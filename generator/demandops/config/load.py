@@ -6,7 +6,7 @@ Pure. If any file has a fault, the whole configuration is rejected, with every f
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import TypeVar
@@ -32,7 +32,15 @@ from demandops.config.config import (
 )
 from demandops.config.config_reader import ConfigReader
 from demandops.config.cross_check import cross_check
-from demandops.config.inventory import Broker, BrokersFile, Cluster, ClustersFile, Node, NodesFile
+from demandops.config.inventory import (
+    Broker,
+    BrokersFile,
+    Cluster,
+    ClustersFile,
+    Node,
+    NodesFile,
+    id_in_domain,
+)
 from demandops.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.config.policy import AccessDomain, AccessDomainsFile, matches
 from demandops.config.registry import (
@@ -47,6 +55,7 @@ from demandops.config.registry import (
 )
 from demandops.config.repo_settings import ROOT_FILE, Flux, RepoSettings
 from demandops.errors import InvalidInput
+from demandops.quoting import quoted
 from demandops.settings import API_VERSION, RENDER_VERSION
 
 Definition = TypeVar("Definition", ApplicationDefinition, ServiceDefinition)
@@ -92,12 +101,14 @@ def load(files: Mapping[str, str]) -> Config:
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     services = {name: _resolve(appdef, definitions, reader) for name, appdef in appdefs.items()}
+    services = {name: _with_nodes(own, nodes.values()) for name, own in services.items()}
     clients, client_files = _read_clients(reader)
     domain_of = _domains_of_nodes(reader, nodes, domains)
+    all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
     config = Config(
         repo_settings=repository or _ANY,
         clusters=reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
-        nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in nodes.items()},
+        nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()},
         brokers=reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
         domains=domains,
         charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
@@ -108,6 +119,7 @@ def load(files: Mapping[str, str]) -> Config:
         definitions=definitions,
         services=MappingProxyType(services),
         domain_of=domain_of,
+        hosts=hosts,
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reader),
         entry_files={**reader.entry_files(), CLIENTS_FILE: client_files},
@@ -116,6 +128,22 @@ def load(files: Mapping[str, str]) -> Config:
     if reader.faults:
         raise InvalidInput(dict.fromkeys(reader.faults))
     return config
+
+
+def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
+    """Return the services; those with one instance for a cluster know it for each node."""
+    found = dict(services)
+    for name, service in services.items():
+        if service.nodes:
+            at = ((node, service.nodes.get(node.cluster)) for node in nodes)
+            by_node = {
+                id: there
+                for node, there in at
+                if there
+                for id in (node.id, *(id_in_domain(node.id, d.name) for d in node.access_domains))
+            }
+            found[name] = service.model_copy(update={"runs_at": by_node})
+    return found
 
 
 def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
@@ -128,7 +156,7 @@ def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
 
 
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the settings of all files, and the file of each connection type's."""
+    """Return the clients' settings from all files, and for each connection type its file."""
     found, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
@@ -199,6 +227,11 @@ def _resolve(
     return services
 
 
+def is_override_name(name: str) -> bool:
+    """Return whether a file ``overrides/<name>.yaml`` would be an override."""
+    return _NAME.fullmatch(name) is not None
+
+
 def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
     overrides = {}
     for path in sorted(reader.files):
@@ -206,7 +239,7 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
         if folder != OVERRIDES_ROOT or name.startswith(".") or name.endswith(".md"):
             continue
         stem = name.removesuffix(".yaml")
-        if stem == name or not _NAME.fullmatch(stem):
+        if stem == name or not is_override_name(stem):
             reader.add_fault(
                 path,
                 "",
@@ -228,6 +261,48 @@ def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:
     return node.model_copy(update={"ros": ros})
 
 
+def _in_further_domains(
+    reader: ConfigReader,
+    nodes: Mapping[str, Node],
+    domains: Mapping[str, AccessDomain],
+    domain_of: Mapping[str, AccessDomain],
+) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
+    """Return nodes, the domain of each, and hosts, with ``<id>@<domain>`` for further domains."""
+    nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
+    for node in [one for one in nodes.values() if one.access_domains]:
+        file, place = reader.place_of(NODES_FILE, node.id)
+        first = domain_of.get(node.id)
+        ros = {_in_ros_domain(node, first).ros.domain_id: first.name} if first else {}
+        for index, further in enumerate(node.access_domains):
+            where, id = f"{place}.accessDomains[{index}]", id_in_domain(node.id, further.name)
+            domain = domains.get(further.name)
+            reader.check_reference(file, f"{where}.name", further.name, DOMAINS_FILE)
+            if first is None:
+                message = f"'{node.id}' is in the nodes of no access domain; add it to one"
+                reader.add_fault(file, where, message)
+            elif domain is first or id in nodes:
+                message = f"'{node.id}' is in '{further.name}' already, or '{id}' is a node"
+                reader.add_fault(file, f"{where}.name", f"{message}; remove one of the two")
+            elif domain is not None:
+                number = _in_ros_domain(node, domain).ros.domain_id
+                other = ros.setdefault(number, domain.name)
+                if other != domain.name:
+                    message = (
+                        f"access domains '{other}' and '{domain.name}' share ROS domain {number}, "
+                        f"so each would read the other's topics on '{node.id}'; give one of them "
+                        "ros: {domainId: …} in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
+                    )
+                    reader.add_fault(file, f"{where}.name", message)
+                nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
+                reader.add_alias(NODES_FILE, id, node.id)
+    return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
+
+
+def _pattern_of(node: str, domain: AccessDomain) -> str:
+    """Return the first pattern of a domain that a node matches."""
+    return next(pattern for pattern in domain.nodes if matches(node, (pattern,)))
+
+
 def _domains_of_nodes(
     reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
 ) -> Mapping[str, AccessDomain]:
@@ -235,13 +310,17 @@ def _domains_of_nodes(
     for node in nodes:
         matching = [d for d in domains.values() if matches(node, d.nodes)]
         if len(matching) > 1:
-            names = " and ".join(f"'{domain.name}'" for domain in matching)
+            by = " and ".join(
+                f"'{domain.name}' by {quoted(_pattern_of(node, domain))} in "
+                f"{reader.place_of(DOMAINS_FILE, domain.name)[0]}"
+                for domain in matching
+            )
             file, place = reader.place_of(NODES_FILE, node)
             reader.add_fault(
                 file,
                 f"{place}.id",
-                f"'{node}' is in the access domains {names}; narrow their patterns so that it is "
-                "in one",
+                f"'{node}' is in the access domains {by}; narrow these patterns so that it is in "
+                "one, and list the others as accessDomains of the node",
             )
         elif matching:
             owner[node] = matching[0]

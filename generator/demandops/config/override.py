@@ -91,13 +91,13 @@ def _patch(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-def _some(items: tuple[Any, ...]) -> tuple[Any, ...]:
+def _not_empty(items: tuple[Any, ...]) -> tuple[Any, ...]:
     if not items or "" in items:
         raise ValueError("is empty or has an empty item; name what to select")
     return items
 
 
-Patterns = Annotated[Items[Text], AfterValidator(_some)]
+Patterns = Annotated[Items[Text], AfterValidator(_not_empty)]
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 
@@ -152,7 +152,7 @@ class OverrideFile(FileModel):
     ]
     priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
     expires: Annotated[str, readable_by(parse_time)] | None = None
-    select: Annotated[Items[Selector], AfterValidator(_some)]
+    select: Annotated[Items[Selector], AfterValidator(_not_empty)]
     values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_patch)] | None = None
     version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
@@ -184,6 +184,11 @@ class OverrideFile(FileModel):
                 yield (
                     f"select[{index}].connections: {wrong[0]} changes services, and connections "
                     "have none; remove one of the two"
+                )
+            if selector.requesters and "node" in effects:
+                yield (
+                    f"select[{index}].requesters: node moves a service for everybody who requests "
+                    "it; select by applications, appdefs, services, nodes or labels"
                 )
             if selector.services and "keep" in effects:
                 yield (

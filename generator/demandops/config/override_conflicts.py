@@ -104,7 +104,7 @@ def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterat
 
 
 def _shared(one: Selector, other: Selector, services: Services) -> bool:
-    """Return whether both may match one of these services that applications share."""
+    """Return whether both selectors may match the same service that applications share."""
     return any(
         service.scope != "application"
         and all(not s.services or matches(name, s.services) for s in (one, other))
@@ -114,7 +114,7 @@ def _shared(one: Selector, other: Selector, services: Services) -> bool:
 
 def patterns_overlap(one: str, other: str) -> bool:
     """Return whether any text matches both patterns (``*`` any characters, ``?`` one)."""
-    # whether what was read of ``one`` overlaps with each beginning of ``other``
+    # row[i]: whether the part of ``one`` that was read overlaps with the first i characters
     row = [not other[:length].strip("*") for length in range(len(other) + 1)]
     for a in one:
         after = [row[0] and a == "*"]

@@ -146,7 +146,7 @@ KINDS = {
 """The kinds that a policy may name by one word."""
 
 NOT_BY_DEFAULT = ("DaemonSet",)
-"""A service runs on the node that its demand names, and a DaemonSet on all that it selects."""
+"""Kinds that a policy must name: a DaemonSet runs on all nodes, not on the demanded one alone."""
 
 NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
 """The kinds of connections' clients, and Secrets, in which Helm keeps its releases."""
@@ -159,7 +159,7 @@ def _by_word(value: object) -> object:
         return value
     if value not in KINDS:
         raise ValueError(
-            f"{quoted(value)} is not a kind that its name alone tells; give kind, group and "
+            f"{quoted(value)} is not a kind that is known by its name; give kind, group and "
             f"resource{suggestion(value, KINDS)}"
         )
     return KINDS[value]
@@ -179,10 +179,12 @@ class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
     Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves it.
-    ``kinds`` are the kinds that
-    its charts may have (:attr:`allowed_kinds`). ``pod_security`` is what its pods may not do:
-    ``baseline`` is that of Kubernetes' Pod Security Standards, ``host-network`` permits the host's
-    network, ``privileged`` everything.
+    ``kinds`` are the kinds that its charts may have (:attr:`allowed_kinds`). ``pod_security``
+    limits what its pods may do: ``baseline`` is that of Kubernetes' Pod Security Standards,
+    ``host-network`` also permits the host's network, ``privileged`` everything.
+
+    ``when_full`` says what happens to a demand if its nodes are suitable but have no room
+    (:mod:`demandops.ledger.waiting`).
 
     ``ros`` replaces the ROS domain of its nodes. ``broker_credentials`` replaces the credentials of
     brokers, by node, for its ends of connections.
@@ -197,6 +199,7 @@ class AccessDomain(CamelModel):
     leases: LeasePolicy = LeasePolicy()
     network: Literal["open", "namespace"] = "open"
     approval: Approval = "none"
+    when_full: Literal["refuse", "wait"] = "refuse"
     kinds: Items[KindByWord] | None = None
     pod_security: Literal["baseline", "host-network", "privileged"] = "host-network"
     ros: DomainRos | None = None

@@ -21,15 +21,38 @@ from demandops.quoting import quoted
 
 ROOT_FILE = "demandops.yaml"
 
-GitUrl = Annotated[
-    str, StringConstraints(pattern=r"^(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+$"), Visible
-]
+_GIT_URL = re.compile(r"(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+")
+_SCP = re.compile(r"(?P<user>[^\s:@/]+)@(?P<host>[^\s:@/]+):(?!\d+/)(?P<path>[^\s/]\S*)")
+
+
+def as_git_url(text: str) -> str:
+    """Return the URL for an address as git also writes it, ``git@host:path``; others unchanged."""
+    scp = _SCP.fullmatch(text)
+    return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
+
+
+def _git_url_problem(text: str) -> str:
+    if _GIT_URL.fullmatch(text):
+        return ""
+    url = as_git_url(text)
+    if url != text:
+        return f"{quoted(text)} is not a URL, which the controllers need; write {url}"
+    return (
+        f"{quoted(text)} is not a URL that clusters can fetch; write https://HOST/PATH or "
+        "ssh://USER@HOST/PATH, without a password or token"
+    )
+
+
+GitUrl = Annotated[str, without(_git_url_problem), Visible]
 
 
 class Flux(FrozenModel):
-    """Flux's access to this repo: the GitRepository of each access domain."""
+    """Flux's access to this repo: the GitRepository of each access domain.
 
-    url: GitUrl
+    Without ``url`` there are no bootstrap files, so no cluster can follow the repo.
+    """
+
+    url: GitUrl | None = None
     interval: Annotated[
         str, StringConstraints(pattern=r"^(\d+h)?(\d+m)?(\d+s)?$", min_length=2)
     ] = "1m"
@@ -113,7 +136,8 @@ class Limits(CamelModel):
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
-    It may also contain the section of the other controller, which is then not used.
+    It may also contain the section of the other controller, which is then not used. ``placement``
+    says which of the nodes that fit an application gets (:mod:`demandops.plan.nodes.placement`).
     """
 
     kind: Literal["StateRepository"]
@@ -124,3 +148,4 @@ class RepoSettings(FileModel):
     argocd: ArgoCd | None = None
     proposals: Proposals = Proposals()
     limits: Limits = Limits()
+    placement: Literal["nearest", "spread", "pack"] = "nearest"

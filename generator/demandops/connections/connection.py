@@ -43,17 +43,17 @@ class Connection:
 
     @property
     def nodes(self) -> tuple[str, str]:
-        """The nodes that selectors of overrides are compared with."""
+        """The nodes that an override's selector may match."""
         return (self.source, self.target)
 
     @property
     def known_type(self) -> ConnectionType:
-        """Its type; only for a connection whose type is chosen."""
+        """Its type; fails if none is chosen yet."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic, or ``None``; only for a claimed connection."""
+        """Return the route of a source topic, or ``None``; works only in a claim."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
         return found[0] if found and found[0].source == source else None
@@ -72,7 +72,7 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed`` in a shutdown fits this connection; empty fields fit any."""
+        """Return whether ``listed``, from a shutdown, means this one; empty fields fit any."""
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -81,7 +81,7 @@ class Connection:
         )
 
     def told_apart_by(self) -> tuple[str, ...]:
-        """Return what a shutdown must list, beside id and topics, to fit this connection."""
+        """Return the values by which a shutdown tells this connection from others of its id."""
         return (self.source, self.target, self.known_type.word)
 
     def topic_keys(self) -> Iterator[TopicKey]:
@@ -90,7 +90,7 @@ class Connection:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each topic of ``listed`` as text, and the keys of the topics here that it fits."""
+        """Yield each topic of ``listed`` as text, and the key of the same topic here, if any."""
         assert isinstance(listed, Connection)  # noqa: S101 - see is_meant_by
         known = {*self.topic_keys()}
         for key in listed.topic_keys():

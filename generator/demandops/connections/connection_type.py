@@ -177,11 +177,6 @@ class ConnectionType(ABC):
         """Its name in small letters."""
         return self.name.lower()
 
-    @property
-    def label(self) -> str:
-        """Its number and name, for messages."""
-        return f"{self.number} ({self.name})"
-
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
         """Yield the faults of a configuration that prevent this type from working."""
         return iter(())
@@ -204,14 +199,14 @@ class ConnectionType(ABC):
         return iter(())
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection as it will be carried, and a note for the requester if it differs.
+        """Return the connection as clients will carry it, and what differs from the request.
 
-        Called for a demand that the inventory can fulfill.
+        Called only for a demand that the inventory can fulfill.
         """
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the fields of access rules, with values, that it needs besides both nodes."""
+        """Return (field of an access rule, needed value) for all but the connection's nodes."""
         return []
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:

@@ -32,9 +32,9 @@ def type_named(word: str) -> ConnectionType:
     return {known.word: known for known in CONNECTION_TYPES}[word]
 
 
-def labels(types: Iterable[ConnectionType]) -> str:
-    """Return types as a message lists them: ``1 (MQTT) or 0 (ROS)``."""
-    return " or ".join(known.label for known in types)
+def listed(types: Iterable[ConnectionType]) -> str:
+    """Return types as a message lists them: ``MQTT or ROS``."""
+    return " or ".join(known.name for known in types)
 
 
 def by_number() -> list[ConnectionType]:
@@ -73,9 +73,10 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
     reasons = []
     for kind in CONNECTION_TYPES:
         reason = next(type_faults(kind, connection, config))
-        field = "" if reason.field == "type" else f"{reason.field} "
-        reasons.append(f"{kind.name}: {field}{reason.message}")
-    message = f"is not given, and no type can carry it. {'; '.join(reasons)}"
+        field = "" if reason.field in ("type", "broker") else f"{reason.field} "
+        text = f"{field}{reason.message}"
+        reasons.append(text if text.startswith(kind.name) else f"{kind.name}: {text}")
+    message = f"no connection type is given, and none can carry it. {'; '.join(reasons)}"
     return fault("type", message, code=UNSUPPORTED)
 
 
@@ -86,16 +87,17 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:
-        message = f"{kind.label} needs an image '{kind.image}'; add it to "
+        message = f"{kind.name} needs an image '{kind.image}'; add it to "
         message += config.place_of(IMAGES_FILE)
         yield fault("type", message, code=UNSUPPORTED)
     if connection.broker and not kind.takes_broker:
-        able = " or ".join(known.name for known in CONNECTION_TYPES if known.takes_broker)
-        yield fault("broker", f"is for {able} only, and the type is {kind.name}; leave it out")
+        able = listed(known for known in CONNECTION_TYPES if known.takes_broker)
+        message = f"a broker is for {able} only, and the type is {kind.name}; leave it out"
+        yield fault("broker", message)
     if kind.speaks_dds and {*ends.values()} <= config.nodes.keys():
         for end, node in ends.items():
             if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
-                able = labels(known for known in CONNECTION_TYPES if not known.speaks_dds)
+                able = listed(known for known in CONNECTION_TYPES if not known.speaks_dds)
                 yield fault(
                     end,
                     f"'{node}' runs rmw_zenoh_cpp, and {kind.name} clients speak DDS; use type "
@@ -116,7 +118,7 @@ def route_faults(
         where = f"topics[{index}]"
         for name in route.options():
             if name not in _ALWAYS and name not in kind.options:
-                able = labels(known for known in CONNECTION_TYPES if name in known.options)
+                able = listed(known for known in CONNECTION_TYPES if name in known.options)
                 yield fault(
                     f"{where}.{name}",
                     f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or "
@@ -124,7 +126,7 @@ def route_faults(
                 )
         yield from kind.route_faults(where, route, route.sender_and_receiver(*ends)[0], config)
         if route.source != route.target and not kind.renames:
-            able = labels(known for known in CONNECTION_TYPES if known.renames)
+            able = listed(known for known in CONNECTION_TYPES if known.renames)
             yield fault(
                 f"{where}.target",
                 f"'{route.source}' cannot become '{route.target}': {kind.name} keeps the name; "

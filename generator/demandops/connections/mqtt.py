@@ -62,16 +62,11 @@ class Mqtt(ConnectionType):
         if choose_broker(connection, config) is not None:
             return
         known = ", ".join(sorted(config.brokers))
-        remedy = (
-            f"name one of: {known}"
-            if known
-            else f"{config.place_of(BROKERS_FILE)} has none; add one there"
-        )
-        message = f"no broker runs on '{connection.target}' or '{connection.source}'"
+        remedy = f"name one of: {known}" if known else f"add one to {config.place_of(BROKERS_FILE)}"
+        ends = f"'{connection.target}' or '{connection.source}'"
+        message = f"no broker is given, and none runs on {ends}"
         if connection.broker:
-            message = f"no broker runs on {quoted(connection.broker)}, and {message}"
-        else:
-            message = f"is not given, and {message}"
+            message = f"no broker runs on {quoted(connection.broker)}, nor on {ends}"
         yield fault("broker", f"{message}; {remedy}", code=_NO_BROKER)
 
     def route_faults(
@@ -133,7 +128,7 @@ def choose_broker(connection: Connection, config: Config) -> Broker | None:
     """
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))
-    for node in (connection.broker, connection.target, connection.source):
+    for node in map(config.host_of, (connection.broker, connection.target, connection.source)):
         if node in config.brokers:
             return config.brokers[node]
     return None

@@ -73,7 +73,7 @@ class Zenoh(ConnectionType):
         if not (source.zenoh.endpoint or target.zenoh.endpoint or shared):
             yield fault(
                 "type",
-                f"{self.label} finds no route between '{source.id}' and '{target.id}'; give one "
+                f"{self.name} finds no route between '{source.id}' and '{target.id}'; give one "
                 f"of them an endpoint under zenoh in {config.place_of(NODES_FILE)}, or add the "
                 "same router to connect of both",
                 code=UNSUPPORTED,

@@ -6,7 +6,7 @@ It uses appdefs, inventory, brokers and access domains, but not the ledger.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 
 from demandops.config.appdef import ApplicationDefinition, Services
@@ -29,7 +29,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
     A shutdown may name nodes that are not in the inventory, so that their claims can be released.
     """
-    if request.id and request.id != request.demand:  # without an id, it is the demand's
+    if request.id and request.id != request.demand:  # a request without an id has the demand's
         yield from _id("id" if request.is_reference else "request", request.id)
     if not request.is_reference:
         yield from _own_fields(request)
@@ -46,8 +46,8 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         found = [*_id("id", one.held.id), *_requesters(one.requesters)]
         if isinstance(one.held, Application):
             of_app = _application(one.held, config, request.adds_claims)
-            # without a node, its placement has a fault of its own
-            placed = one.held.node or one.requirement is None
+            # if no node was found for it, the placement reports that
+            placed = one.held.node or one.held.place is None
             found += [each for each in of_app if placed or each.field != "node"]
         else:
             found += _connection(one.held, config, request.adds_claims)
@@ -63,7 +63,7 @@ def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
         items += len(one.requesters) if request.is_reference else 0
         if isinstance(held, Application):
             items += len(held.all_inputs()) + len(held.deliver)
-            items += one.requirement.size if one.requirement else 0
+            items += held.place.size if held.place else 0
         else:
             items += len(held.topics)
         if isinstance(held, Application) and held.parameters:
@@ -124,8 +124,10 @@ def _application(app: Application, config: Config, claiming: bool) -> Iterator[F
     if not claiming:
         return
     yield from _node("node", app.node, config)
-    for where, topic in inputs:
-        yield from _node(f"{where}.source", topic.source, config)
+    sources = [(f"{where}.source", topic.source) for where, topic in inputs]
+    services = sorted({**app.services, **app.moved}.items())
+    for where, node in (*((f"services.{name}", node) for name, node in services), *sources):
+        yield from _node(where, node, config)
     for index, delivery in enumerate(app.deliver):
         where = f"deliver[{index}]"
         yield from _id(f"{where}.node", delivery.node)
@@ -162,12 +164,39 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
         if name not in parameters:
             known = suggestion(name, parameters)
             yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{known}")
+    for service in config.services[appdef.name].values():
+        if service.nodes and app.node in config.nodes and app.node not in service.runs_at:
+            cluster = config.nodes[app.node].cluster
+            yield fault(
+                "node",
+                f"'{app.node}' is in cluster '{cluster}', where {service.name}, which it needs, "
+                f"has no node; choose a node in {' or '.join(service.nodes)}, or have nodes in "
+                f"{service.file} changed",
+                code="no-node",
+            )
     versions = config.versions_of(appdef.name)
+    yield from _instance(app, appdef, versions)
     if app.version and app.version not in versions:
         yield fault(
             "version",
             f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
             f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
+        )
+
+
+def _instance(
+    app: Application, appdef: ApplicationDefinition, versions: Collection[str]
+) -> Iterator[Fault]:
+    """Yield a fault if a separate instance has the wrong id, or another application has its id."""
+    id, _, named = app.id.rpartition("@")
+    if app.separate and (not id or named != app.version):
+        message = f"{quoted(app.id)} of a separate instance does not end in '@{app.version}'"
+        yield fault("id", f"{message}; book it by a demand")
+    elif not app.separate and appdef.versions == "separate" and id and named in versions:
+        yield fault(
+            "id",
+            f"{quoted(app.id)} is the instance of version {named}; ask for id {quoted(id)} with "
+            f"version: {named}, or choose an id that does not end in '@{named}'",
         )
 
 
@@ -267,6 +296,6 @@ def with_chosen_types(
         if connection.type is None or id_problem(connection.broker or "none"):
             return replace(one, held=connection)
         held, note = connection.type.settled(connection, config)
-        return replace(one, held=held, note=note)
+        return replace(one, held=held, note=note or one.note)
 
     return replace(request, demanded=tuple(map(chosen, request.demanded)))

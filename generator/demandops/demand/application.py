@@ -29,7 +29,17 @@ class InputTopic(NamedTuple):
     @property
     def part(self) -> str:
         """Its source as part of a topic name, with the topic if it is a further one."""
-        return naming.topic_part(self.source, self.topic if self.further else "")
+        return self.part_in("")
+
+    def part_in(self, version: str) -> str:
+        """Return :attr:`part` for a separate instance of ``version``; empty: not separate."""
+        return naming.topic_part(self.source, self.told_apart_by(self.further, version))
+
+    def told_apart_by(self, further: bool, version: str) -> str:
+        """Return what a name has beside the source; empty for a usual topic in no own version."""
+        if not further:
+            return version
+        return f"{self.topic} {version}" if version else self.topic
 
 
 class Delivery(NamedTuple):
@@ -44,11 +54,37 @@ class Delivery(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class Requirement:
+    """What the node of an application must have: its type, labels as pairs, capabilities."""
+
+    role: str = ""
+    labels: tuple[tuple[str, str], ...] = ()
+    capabilities: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """How many labels and capabilities it has."""
+        return len(self.labels) + len(self.capabilities)
+
+    def united(self, other: Requirement) -> Requirement:
+        """Return the requirement that includes both requirements."""
+        return Requirement(
+            self.role or other.role,
+            tuple(sorted({*self.labels, *other.labels})),
+            tuple(sorted({*self.capabilities, *other.capabilities})),
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: an appdef at a node with inputs by role.
 
     ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
-    are sorted by topic (:meth:`booked`).
+    are sorted by topic (:meth:`booked`). ``place`` is what its node must have; it is ``None`` if
+    the demand names the node. ``separate`` says that this version runs beside others, and that the
+    id names it (:mod:`demandops.demand.separate_instance`). ``services`` has the nodes of the
+    services that the generator placed one by one, ``moved`` the nodes to which overrides move
+    services.
     """
 
     id: str
@@ -58,6 +94,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     version: str = ""
     deliver: tuple[Delivery, ...] = ()
+    place: Requirement | None = None
+    separate: bool = False
+    services: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    moved: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     _further: dict[tuple[str, str], list[InputTopic]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -76,13 +116,18 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return Subject(SubjectKind.APPLICATION, self.id)
 
     @property
+    def own_version(self) -> str:
+        """The version that its services and topics have in their names; empty if not separate."""
+        return self.version if self.separate else ""
+
+    @property
     def home(self) -> str:
         """The node whose access domain sets leases and quotas."""
         return self.node
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The nodes that selectors of overrides are compared with."""
+        """The nodes that an override's selector may match."""
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
@@ -99,14 +144,16 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further topics in a role that are called ``part`` in names of topics.
+        """Return the topics of a role that topic names call ``part``, if it is not just a node's.
 
-        The names are made once, because each service for a further topic asks for one.
+        These are further topics, and all topics of a separate instance. Their parts are computed
+        once, because each service for a further topic asks for one.
         """
         if not self._further:
             for known, topic in self.all_inputs():
-                if topic.further:
-                    self._further.setdefault((known, topic.part), []).append(topic)
+                if topic.further or self.separate:
+                    called = topic.part_in(self.own_version)
+                    self._further.setdefault((known, called), []).append(topic)
         return self._further.get((role, part), [])
 
     def needs(self, node: str) -> bool:
@@ -116,12 +163,35 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def needed_nodes(self) -> set[str]:
         """Return the nodes at which services may run: its own and those of its inputs."""
-        return {self.node, *(topic.source for _, topic in self.all_inputs())}
+        sources = (topic.source for _, topic in self.all_inputs())
+        return {*self.chosen_nodes, *self.moved.values(), *sources}
+
+    def chosen_node(self, service: str) -> str:
+        """Return the node of a service, unless an override moves it or it runs at its sources."""
+        return self.services.get(service, self.node)
+
+    @property
+    def chosen_nodes(self) -> set[str]:
+        """Its node, and those of the services that are placed one by one."""
+        return {self.node, *self.services.values()}
+
+    def decided_like(self, other: Application) -> bool:
+        """Return whether both are of one type and run on the same nodes."""
+        one, two = ((app.appdef, app.node, app.services, app.moved) for app in (self, other))
+        return one == two
+
+    def placed_as(self, first: Application) -> Application:
+        """Return the application on the nodes of ``first``, which is the same application."""
+        if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
+            return self
+        return replace(self, node=first.node, services=first.services, moved=first.moved)
 
     def booked(self) -> Application:
         """Return the application as a claim holds it: inputs sorted, each once."""
         inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
-        return replace(self, deliver=tuple(sorted({*self.deliver}))).with_inputs(inputs)
+        place = self.place and self.place.united(self.place)
+        deliver = tuple(sorted({*self.deliver}))
+        return replace(self, deliver=deliver, place=place).with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
         """Return the application with other inputs, without roles that have no topic."""
@@ -129,7 +199,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, inputs=MappingProxyType(kept))
 
     def extended(self, more: Application) -> Application:
-        """Return ``more`` with what this application has of inputs, parameters and deliveries."""
+        """Return ``more`` with this application's inputs, parameters and deliveries added."""
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
         parameters = MappingProxyType({**self.parameters, **more.parameters})
@@ -139,7 +209,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed`` in a shutdown fits this application; an empty node fits any."""
+        """Return whether ``listed``, from a shutdown, means this one; an empty node fits any."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -147,7 +217,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def told_apart_by(self) -> tuple[str, ...]:
-        """Return what a shutdown must list, beside id and topics, to fit this application."""
+        """Return the values by which a shutdown tells this application from others of its id."""
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
@@ -158,7 +228,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each input of ``listed`` as text, and the keys of the inputs here that it fits."""
+        """Yield each input of ``listed`` as text, and the keys of the inputs here that it means."""
         assert isinstance(listed, Application)  # noqa: S101 - see is_meant_by
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():
@@ -177,11 +247,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return self.with_inputs(left) if any(left.values()) else None
 
     def without_node(self, node: str) -> Application | None:
-        """Return the application without a node's inputs and what is delivered to the node.
+        """Return the application without inputs from a node and deliveries to it.
 
         ``None`` if it has no other inputs, or runs there.
         """
-        if self.node == node:
+        if node in self.chosen_nodes or node in self.moved.values():
             return None
         deliver = tuple(one for one in self.deliver if one.node != node)
         left = {
@@ -193,12 +263,17 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def index_entries(self) -> Iterator[tuple[str, ...]]:
         """Yield the entries by which the ledger's index finds it."""
         yield ("node", self.node)
+        yield ("definition", self.appdef)
+        for node in (*self.services.values(), *self.moved.values()):
+            yield ("node", node)
+        if self.moved:
+            yield ("moved",)
         for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
             yield ("node", topic.source)
-            if topic.further:
-                yield ("further", topic.part)
-            else:
+            if topic.further or self.separate:
+                yield ("further", topic.part_in(self.own_version))
+            if not topic.further:
                 yield ("usual", topic.source, role)
         if self.version:
             yield ("version", self.id, self.version)

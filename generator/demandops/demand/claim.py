@@ -30,7 +30,7 @@ class Claim:
     """One demand's hold on an application or a connection.
 
     ``joined`` is true if a goal of the reference's action booked it: only goals of that action shut
-    it down. ``partial`` are the topics that not all ``requesters`` hold any longer, and who does.
+    it down. ``partial`` has the topics that only some of the ``requesters`` still hold, and those.
     """
 
     held: Application | Connection
@@ -131,7 +131,7 @@ class Claim:
         return None if held is None else self.with_holders(held, holders)
 
     def without_node(self, node: str) -> Claim | None:
-        """Return the claim without what needs a node; ``None`` if nothing is left."""
+        """Return the claim without the inputs or ends at a node; ``None`` if nothing is left."""
         held = self.held.without_node(node)
         if held is None:
             return None

@@ -22,14 +22,13 @@ from demandops.config.policy import seconds_of
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
-from demandops.demand.application import Application, Delivery, InputTopic
+from demandops.demand.application import Application, Delivery, InputTopic, Requirement
 from demandops.demand.demand_request import (
     Demanded,
     DemandRequest,
     Put,
     Release,
     Renew,
-    Requirement,
 )
 from demandops.demand.goal_validation import is_unicode, parse_valid_part
 from demandops.errors import Fault, fault
@@ -117,7 +116,7 @@ def _lease_form(value: object) -> object:
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""A duration or seconds; for a union, pydantic would report one fault for each member."""
+"""A duration or seconds; no union, for which pydantic would report a fault for each member."""
 
 
 class DemandGoal(FrozenModel):
@@ -132,7 +131,7 @@ class DemandGoal(FrozenModel):
     lease: Lease = None
     applications: list[GoalApplication] = Field(default_factory=list)
     connections: list[GoalConnection] = Field(default_factory=list)
-    priority: int = 0
+    priority: Annotated[int, Field(ge=-(2**31), lt=2**31)] = 0
     positions: list[GoalPosition] = Field(default_factory=list)
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
@@ -163,8 +162,6 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         "own_requesters": requesters,
     }
     lease_s = _lease(goal.lease, faults)
-    if goal.priority:
-        faults.append(fault("priority", "is not supported: no demand waits; leave it out"))
     if goal.operation != "put":
         faults += _not_of_a_put(goal, lease_s)
         return (Release if goal.operation == "release" else Renew)(**head), faults
@@ -174,7 +171,6 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
             requesters,
             partial(_field, f"applications[{index}]"),
             connect=app.connect,
-            requirement=_requirement(f"applications[{index}].place", app.place, faults),
         )
         for index, app in enumerate(goal.applications)
     )
@@ -184,18 +180,19 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     )
     positions = _positions(goal.positions, faults)
     demanded = (*applications, *connections)
-    return Put(**head, demanded=demanded, lease_s=lease_s, positions=positions), faults
+    more: dict[str, Any] = {"positions": positions, "priority": goal.priority}
+    return Put(**head, demanded=demanded, lease_s=lease_s, **more), faults
 
 
 def _field(item: str, path: str) -> str:
-    """Return the goal's field for the field ``path`` of an item; all items share the requesters."""
+    """Return the goal's field for ``path`` of an item; the requesters are those of the goal."""
     if path.startswith("requesters"):
         return path
     return f"{item}.{'type' if path == 'appdef' else path}"
 
 
 def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield a fault for each field that only a put may have."""
+    """Yield a fault for each given field that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:
@@ -204,6 +201,8 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
             f"a {goal.operation} names only its demand; to release a part, put the demand without "
             "it",
         )
+    if goal.priority:
+        yield fault("priority", f"a {goal.operation} does not wait; leave it out")
     if goal.positions:
         yield fault("positions", f"a {goal.operation} places nothing; leave them out")
 
@@ -283,6 +282,7 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
             Delivery(one.output, one.node, absolute_topic(one.topic) if one.topic else "")
             for one in app.deliver
         ),
+        place=_requirement(f"{where}.place", app.place, faults),
     )
 
 

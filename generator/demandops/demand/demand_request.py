@@ -19,26 +19,12 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""Maps a field of an application or connection (``inputs.ego_data[2].source``) to the goal's."""
+"""Maps a field of an item (``inputs.ego_data[2].source``) to the goal's field that gave it."""
 
 
 def place_in(field: str) -> Place:
-    """Return the place of an item at the goal's ``field``: its ``path`` is ``<field>.<path>``."""
+    """Return the map for an item at the goal's ``field``: ``path`` becomes ``<field>.<path>``."""
     return lambda path: f"{field}.{path}"
-
-
-@dataclass(frozen=True, slots=True)
-class Requirement:
-    """What the node of an application must have: its type, labels as pairs, capabilities."""
-
-    role: str = ""
-    labels: tuple[tuple[str, str], ...] = ()
-    capabilities: tuple[str, ...] = ()
-
-    @property
-    def size(self) -> int:
-        """How many labels and capabilities it has."""
-        return len(self.labels) + len(self.capabilities)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +39,8 @@ class Demanded:
     """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
     note: str = ""
     """How it is carried, if not as the request says; a warning of the receipt."""
-    requirement: Requirement | None = None
-    """What the node of an application must have; it may be named as well."""
-    placed: str = ""
-    """Where the generator placed it and why, if the request names no node."""
+    placed: tuple[str, ...] = ()
+    """Where the generator placed it and its services and why, as far as it names no node."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault of a field of this item."""
@@ -99,7 +83,7 @@ AnyRequest = TypeVar("AnyRequest", bound=DemandRequest)
 
 @dataclass(frozen=True, slots=True)
 class Join(DemandRequest):
-    """The reference's goal: adds to what its requesters hold."""
+    """The reference's goal: its requesters hold more, in addition to their earlier claims."""
 
     operation = "join"
     adds_claims = True
@@ -108,7 +92,7 @@ class Join(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Shutdown(DemandRequest):
-    """The reference's goal with ``shutdown``: removes from what its requesters hold."""
+    """The reference's goal with ``shutdown``: its requesters give up holds."""
 
     operation = "shutdown"
     is_reference = True
@@ -116,14 +100,15 @@ class Shutdown(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Put(DemandRequest):
-    """Our own goal: sets what its demand holds.
+    """Our own goal: its demand then holds exactly the listed applications and connections.
 
     ``lease_s`` is the wanted lease in seconds. ``positions`` says where nodes are that have no
-    position in the inventory.
+    position in the inventory. ``priority`` is its priority among demands that wait for room.
     """
 
     lease_s: int | None = None
     positions: Mapping[str, Position] = field(default_factory=dict)
+    priority: int = 0
 
     operation = "put"
     adds_claims = True
@@ -154,12 +139,15 @@ class Expire(DemandRequest):
 class Decommission(DemandRequest):
     """An operator removes a node or a requester, named by ``id``, for good.
 
-    ``kinds`` are ``node``, ``requester`` or both. ``by`` is the operator, ``name <email>``. The
-    request is plain data in the journal only; neither an action nor a demand file contains it.
+    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` are the node in each of its access
+    domains. ``by`` is the operator, ``name <email>``, who may give a ``reason``. The request is
+    plain data in the journal only; neither an action nor a demand file contains it.
     """
 
     kinds: frozenset[str] = frozenset()
     by: str = ""
+    reason: str = ""
+    nodes: tuple[str, ...] = ()
 
     operation = "decommission"
 
@@ -170,7 +158,8 @@ class Decommission(DemandRequest):
 
     def goal(self) -> dict[str, Any]:
         """Return the request as plain data."""
-        return {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
+        data = {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
+        return data | ({"reason": self.reason} if self.reason else {})
 
     @classmethod
     def parse(cls, data: dict[str, Any]) -> Decommission:
@@ -184,4 +173,5 @@ class Decommission(DemandRequest):
         if problem:
             raise Refused.at("name", problem)
         kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
-        return cls(id=str(name), kinds=kinds, by=str(data.get("by") or ""))
+        by, reason = (str(data.get(key) or "") for key in ("by", "reason"))
+        return cls(id=str(name), kinds=kinds, by=by, reason=reason)

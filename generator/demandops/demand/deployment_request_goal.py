@@ -142,7 +142,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
         demanded.append(_connection(where, connection, kind))
         if kind is None and f"{where}.type" not in faulty:
-            known = ", ".join(known.label for known in by_number())
+            known = ", ".join(f"{known.number} ({known.name})" for known in by_number())
             message = f"{connection.type} is not a connection type; known: {known}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
         sources, targets = len(connection.source_topics), len(connection.target_topics)
@@ -152,7 +152,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
                 "target topic i, so list as many of each"
             )
             faults.append(fault(f"{where}.target_topics", message))
-    # without a valid "shutdown", only the rules of both operations apply, which are a shutdown's
+    # if "shutdown" is invalid, check as a shutdown: its rules apply to a join too
     operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
     return operation(id=goal.id, demanded=tuple(demanded)), faults
 
@@ -201,7 +201,7 @@ def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
 
 def _connection(where: str, connection: WireConnection, kind: ConnectionType | None) -> Demanded:
     sources, targets = connection.source_topics, connection.target_topics
-    # the caller reports lists of unequal length; names of the longer fill the shorter
+    # the caller reports lists of unequal length; here the longer list fills up the shorter
     pairs = zip(
         [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
     )

@@ -48,7 +48,7 @@ class Lease:
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease with its full term from ``now``, as a renewal of the one ``before``."""
+        """Return the lease with its full term from ``now``; it ends no sooner than ``before``."""
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)
 

@@ -1,4 +1,4 @@
-"""Permission: the check that requesters may demand this, on these nodes, for this long.
+"""Permission: the check that requesters may demand these applications, nodes and leases.
 
 The access domains of the nodes decide. Every refusal names the rule. A connection between two
 domains needs a rule of each that names the other. A domain, one of its rules or an application
@@ -25,7 +25,7 @@ Access = list[tuple[str, str]]
 PEERS = "peers"
 """The field of a rule with the access domains at the other ends of connections."""
 _NO_RULES = (Rule(name="everything"),)
-"""What a domain without rules lets everybody do."""
+"""The rules of a domain that has none: everybody may do everything."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -46,7 +46,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield the access that an application or connection needs to the domain of each node."""
+    """Yield each access domain of an application or connection, and the access needed there."""
     more: Access = []
     if isinstance(held, Application):
         nodes, first = _service_nodes(held, config), [("applications", held.appdef)]
@@ -55,7 +55,7 @@ def needed_access(
         more = held.type.access(held, config) if held.type else []
     domains = {node: config.domain_of[node] for node in nodes if node in config.domain_of}
     for node, domain in domains.items():
-        access = [*first, ("nodes", node), *more]
+        access = [*first, ("nodes", config.host_of(node)), *more]
         if isinstance(held, Connection):
             others = {other.name for other in domains.values()} - {domain.name}
             access += [(PEERS, other) for other in others]
@@ -63,16 +63,30 @@ def needed_access(
 
 
 def _service_nodes(app: Application, config: Config) -> Iterable[str]:
-    """Return the nodes on which services of an application run: its node, and sources."""
+    """Return the nodes on which services of an application run.
+
+    These are its node, sources of inputs, and the nodes of services that run once for a cluster or
+    are placed one by one. A node to which an override moves a service is its owner's decision.
+    """
     services = config.services.get(app.appdef, {}).values()
     roles = {role for one in services if one.at_source for role in one.roots}
-    return app.node, *(one.source for role in sorted(roles) for one in app.inputs.get(role, ()))
+    others = (one.runs_at[app.node] for one in services if app.node in one.runs_at)
+    return (
+        app.node,
+        *app.services.values(),
+        *others,
+        *(one.source for role in sorted(roles) for one in app.inputs.get(role, ())),
+    )
 
 
 def may_place(one: Demanded, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may have an application of this type on a node."""
+    """Return whether the requesters may have an application of this type on a node.
+
+    If ``appdef`` is empty: whether they may have a connection to the node.
+    """
     domain = config.domain_of.get(node)
-    access: Access = [("applications", appdef), ("nodes", node)]
+    access: Access = [("applications", appdef)] if appdef else []
+    access.append(("nodes", config.host_of(node)))
     return domain is not None and not any(_not_allowed(one, domain, access))
 
 
@@ -100,11 +114,11 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
 
 
 def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
-    """Return what a rule does not let a requester have."""
+    """Return the sentence that says what a rule does not let a requester have."""
     where = f"access domain '{domain.name}'"
     if kind == PEERS:
         whose = f"rule '{rule.name}' of {where}" if domain.rules else where
-        return f"{whose} lets '{requester}' connect its nodes with no node of '{value}' (peers)"
+        return f"{whose} does not let '{requester}' connect its nodes to nodes of '{value}' (peers)"
     return (
         f"rule '{rule.name}' of {where} lets '{requester}' have {kind} "
         f"{' '.join(getattr(rule, kind))}, not '{value}'"
@@ -135,12 +149,13 @@ def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
 
     def with_term(one: Demanded) -> Demanded:
         domain = config.domain_of.get(one.held.home)
-        return replace(one, term=_term(request, domain) if domain else None)
+        return replace(one, term=term(request, domain) if domain else None)
 
     return replace(request, demanded=tuple(map(with_term, request.demanded)))
 
 
-def _term(request: DemandRequest, domain: AccessDomain) -> Term | None:
+def term(request: DemandRequest, domain: AccessDomain) -> Term | None:
+    """Return the lease that a request gets in an access domain; ``None`` without one."""
     policy = domain.leases
     if request.is_reference and not policy.deployment_requests:
         return None

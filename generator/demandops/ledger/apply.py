@@ -5,6 +5,7 @@ What each operation means: ``docs/demand.md``, "How a demand is booked".
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 
 from demandops.demand.demand_request import (
@@ -17,15 +18,18 @@ from demandops.demand.demand_request import (
     Renew,
     Shutdown,
 )
-from demandops.ledger.ledger import Changes, Ledger
+from demandops.ledger.claim_changes import Changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.decommission import decommission
 from demandops.ledger.operations.demand_release import release_demand
+from demandops.ledger.operations.drain import Drain, drain
 from demandops.ledger.operations.expire import expire
 from demandops.ledger.operations.join import join
 from demandops.ledger.operations.lease_renewal import renew_leases
 from demandops.ledger.operations.put import put
 from demandops.ledger.operations.restoration import Restoration, restore
 from demandops.ledger.operations.shutdown import shut_down
+from demandops.ledger.waiting import Wait
 
 
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
@@ -58,6 +62,14 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
             return expire(ledger, request, now)
         case Decommission():
             return decommission(ledger, request, now)
+        case Wait():
+            assert request.waiting is not None  # noqa: S101 - decided so
+            waiting = ledger.waiting.insert(request.demand, request.waiting)
+            is_new = ledger.waiting.get(request.demand) != request.waiting
+            changes = Changes(waiting=(request.demand,) * is_new)
+            return replace(ledger, waiting=waiting), changes
+        case Drain():
+            return drain(ledger, request)
         case Restoration():
             return restore(ledger, request, now)
     raise TypeError(f"{type(request).__name__} cannot be applied")

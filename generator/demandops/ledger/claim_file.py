@@ -21,7 +21,7 @@ from demandops.config.base_model import FrozenModel, parse
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import Route, RouteOptions
-from demandops.demand.application import Application, Delivery, InputTopic
+from demandops.demand.application import Application, Delivery, InputTopic, Requirement
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
 from demandops.errors import Fault, InvalidInput, fault
@@ -31,10 +31,10 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 LEDGER_ROOT = "ledger"
 
-RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements", f"{LEDGER_ROOT}/waiting")
-"""Folders that only a later version writes: for the nodes of services, and for waiting demands."""
+RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
+"""Folders that only a later version writes: for the nodes of services."""
 
-_JOINED = re.compile(r"[0-9a-f]{20}")  # what demandops.demand.claim.demand_id makes
+_JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
 
 
@@ -95,6 +95,16 @@ class _Topic(FrozenModel):
     type: str = ""
     further: bool = False
     requesters: _Requesters = Field(default=(), strict=False)
+
+
+class _Place(FrozenModel):
+    role: str = ""
+    labels: dict[str, str] = Field(default_factory=dict)
+    capabilities: tuple[str, ...] = Field(default=(), strict=False)
+
+    def requirement(self) -> Requirement:
+        labels = tuple(sorted(self.labels.items()))
+        return Requirement(self.role, labels, tuple(sorted({*self.capabilities})))
 
 
 class _Delivery(FrozenModel):
@@ -167,7 +177,7 @@ class _Claim(FrozenModel):
         return claim.with_holders(held, holders)
 
     def _is_old_join(self) -> bool:
-        """Return whether a join booked it before there was the field ``action``."""
+        """Return whether a join booked it when claim files had no field ``action`` yet."""
         return self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))
 
 
@@ -180,6 +190,10 @@ class _ApplicationFile(_Claim):
     parameters: dict[str, Any] = Field(default_factory=dict)
     version: str = ""
     deliver: tuple[_Delivery, ...] = Field(default=(), strict=False)
+    place: _Place | None = None
+    separate: bool = False
+    services: dict[str, str] = Field(default_factory=dict)
+    moved: dict[str, str] = Field(default_factory=dict)
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for role, topics in self.inputs.items():
@@ -202,6 +216,10 @@ class _ApplicationFile(_Claim):
             MappingProxyType(self.parameters),
             self.version,
             tuple(sorted(Delivery(one.output, one.node, one.topic) for one in self.deliver)),
+            self.place.requirement() if self.place else None,
+            self.separate,
+            MappingProxyType(self.services),
+            MappingProxyType(self.moved),
         )
 
 
@@ -270,8 +288,18 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
     if app.parameters:
         data["parameters"] = dict(sorted(app.parameters.items()))
     data |= {"version": app.version} if app.version else {}
+    data |= {"separate": True} if app.separate else {}
     deliver = [{k: v for k, v in one._asdict().items() if v} for one in app.deliver]
-    return data | {"deliver": deliver} if deliver else data
+    data |= {"deliver": deliver} if deliver else {}
+    data |= {"services": dict(sorted(app.services.items()))} if app.services else {}
+    data |= {"moved": dict(sorted(app.moved.items()))} if app.moved else {}
+    return data | {"place": place_data(app.place)} if app.place else data
+
+
+def place_data(place: Requirement) -> dict[str, Any]:
+    """Return the requirement on a node in the form that a claim's file has it in."""
+    listed = {"labels": dict(place.labels), "capabilities": list(place.capabilities)}
+    return {name: value for name, value in ({"role": place.role} | listed).items() if value}
 
 
 def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:

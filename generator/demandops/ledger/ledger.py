@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from operator import attrgetter
 from typing import TypeAlias
@@ -20,47 +20,10 @@ from demandops.connections.connection_type import ConnectionType
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
-from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
+from demandops.ledger.kept_replicas import KeptReplicas
+from demandops.ledger.recent_shutdowns import RecentShutdowns
+from demandops.ledger.waiting import WaitingDemands
 from demandops.subject import Subject, SubjectKind
-
-
-@dataclass(frozen=True, slots=True)
-class ClaimChange:
-    """One claim before and after: ``None`` before it is booked and after it is released."""
-
-    before: Claim | None
-    after: Claim | None
-
-    @property
-    def key(self) -> ClaimKey:
-        """The key of the changed claim."""
-        claim = self.after or self.before
-        assert claim is not None  # noqa: S101 - a change has at least one side
-        return claim.key
-
-    @property
-    def only_renews(self) -> bool:
-        """Whether a demand that adds claims changed at most the lease of this one."""
-        return bool(self.before and self.after and self.before.booked == self.after.booked)
-
-
-@dataclass(frozen=True, slots=True)
-class Changes:
-    """The claims that a request changed.
-
-    ``not_held``: listed by a shutdown, but not held. ``shutdowns``: the digests of the shutdowns
-    that the ledger now records or forgets. ``repeats``: the same shutdown, if it came before.
-    """
-
-    claims: tuple[ClaimChange, ...] = ()
-    not_held: tuple[str, ...] = ()
-    shutdowns: tuple[str, ...] = ()
-    repeats: RecentShutdown | None = None
-
-    def subjects(self) -> tuple[Subject, ...]:
-        """Return the subjects whose claims changed, each once."""
-        return tuple(dict.fromkeys(change.key.subject for change in self.claims))
-
 
 _ENDS = "ends"
 _DEMAND = attrgetter("demand")
@@ -74,12 +37,15 @@ class Ledger:
     """All claims, and an index of them.
 
     ``claims`` has those on each subject, sorted by demand id, because the planner asks for all of
-    them. They agree on where and what it is. If a person writes one that does not, the first one
-    decides.
+    them. All claims on a subject agree on its type and nodes. If a person writes one that does not,
+    the first one decides.
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
-    ``minutes`` are those in which a lease ends. They give the next end without a full scan.
+    ``minutes`` are those in which a lease ends, so that the next end is found without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
-    ``shutdowns`` are the recent ones. ``applications_on`` counts the applications of each node.
+    ``shutdowns`` are the recent ones. ``applications_on`` counts the applications that
+    each node was chosen for, as a whole or for a service.
+    ``kept`` are the replicas that services keep for a while.
+    ``waiting`` are the demands that wait for room.
     """
 
     claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
@@ -88,6 +54,8 @@ class Ledger:
     ended: Mapping[str, str] = field(default_factory=dict)
     shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
     applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
+    waiting: WaitingDemands = field(default_factory=HashTrieMap)
+    kept: KeptReplicas = field(default_factory=KeptReplicas)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         """Return the claims on ``subject``, sorted by demand id."""
@@ -97,6 +65,11 @@ class Ledger:
         """Return the claim on ``subject`` with the lowest demand id, or ``None``."""
         held = self.claims.get(subject)
         return held[0] if held else None
+
+    def held(self, subject: Subject) -> Application | Connection | None:
+        """Return the application or connection that ``subject`` names, from its first claim."""
+        first = self.first_claim(subject)
+        return first.held if first else None
 
     def application_claims(self, application: str) -> tuple[Claim, ...]:
         """Return the claims on an application."""
@@ -119,7 +92,7 @@ class Ledger:
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions that claims on an application ask for.
 
-        An empty one stands for claims that ask for none, or for one that is not known.
+        An empty text stands for claims that ask for no version, or for an unknown one.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         found = {word: len(keys) for word, keys in by_version.items() if keys}
@@ -142,7 +115,7 @@ class Ledger:
                 yield claim
 
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
-        """Return ``topic`` of ``source`` as a claim has it in ``role``."""
+        """Return ``topic`` of ``source`` in ``role`` from any claim that has it, or ``None``."""
         for claim in self.each_taking(source, topic):
             if found := claim.application.inputs_from(role, source, topic):
                 return found[0]
@@ -160,16 +133,20 @@ class Ledger:
         """Yield the usual topics of ``source`` in ``role`` that claims have, except ``but``."""
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("takes", source, but)) or ()):
-            return  # all of them take that one
+            return  # they all take ``but``
         found = (claim for key in keys if (claim := self.get(key)))
         topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
         usual = {one.topic for one in topics if one.source == source and not one.further}
         yield from sorted(usual - {but})
 
-    def further_topics(self, role: str, part: str) -> Iterator[InputTopic]:
-        """Yield the further topics of sources that are called ``part`` in names of topics."""
+    def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
+        """Yield the further inputs in ``role`` that names of topics call ``part``.
+
+        With each comes the version of its application if that is a separate instance, else "".
+        """
         for claim in self._claims("further", part):
-            yield from claim.application.further_inputs(role, part)
+            app = claim.application
+            yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         """Return the connections that bring ``topic`` to the node ``target``, sorted."""
@@ -187,6 +164,10 @@ class Ledger:
         """Return the claims that overrides keep, on one subject or on all."""
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
+    def moved_applications(self) -> tuple[str, ...]:
+        """Return the applications of which overrides move a service, sorted."""
+        return self._ids("moved")
+
     def is_only_kept(self, subject: Subject) -> bool:
         """Return whether no demand holds ``subject``: at most overrides keep it."""
         return len(self.claims.get(subject) or ()) == len(self.kept_claims(subject))
@@ -203,6 +184,10 @@ class Ledger:
         """Return how many claims a requester has."""
         return len(self.index.get(("requester", requester)) or ())
 
+    def claims_of_definition(self, appdef: str) -> tuple[Claim, ...]:
+        """Return the claims on applications of a definition, sorted by subject and demand."""
+        return self._claims("definition", appdef)
+
     def claims_at(self, node: str) -> tuple[Claim, ...]:
         """Return the claims on applications that run on a node or have an input from it, sorted."""
         return self._claims("node", node)
@@ -217,10 +202,15 @@ class Ledger:
 
     def next_lease_end(self) -> datetime | None:
         """Return when the first lease ends, or ``None`` if there is no lease."""
-        if not self.minutes:
-            return None
-        first = self._claims(_ENDS, min(self.minutes))
-        return min(claim.lease.expires_at for claim in first if claim.lease)
+        found = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
+        return min((claim.lease.expires_at for claim in found if claim.lease), default=None)
+
+    def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
+        """Return the claims whose leases end first, in the same minute.
+
+        It is the same object while none of them comes, goes or gets another end.
+        """
+        return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 
     def unstarted_claims(self) -> tuple[Claim, ...]:
         """Return the approved claims whose lease the generator has not started yet."""
@@ -286,14 +276,19 @@ class Ledger:
             index = index.insert(entry, others) if others else index.remove(entry)
             if not others and entry[0] == _ENDS:
                 minutes = minutes.remove(entry[1])
-        for entry in after - before:
+        added = after - before
+        if old and claim and old.lease != claim.lease:  # perhaps by less than a minute
+            added |= {entry for entry in after if entry[0] == _ENDS}
+        for entry in added:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
             if entry[0] == _ENDS:
                 minutes = minutes.insert(entry[1])
         counts = self.applications_on
         if key.subject.kind is SubjectKind.APPLICATION:
             counts = _counted(counts, self.first_claim(key.subject), held[0] if held else None)
-        return Ledger(claims, index, minutes, self.ended, self.shutdowns, counts)
+        return Ledger(
+            claims, index, minutes, self.ended, self.shutdowns, counts, self.waiting, self.kept
+        )
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
         """Return the ledger without these claims."""
@@ -301,6 +296,13 @@ class Ledger:
         for claim in claims:
             ledger = ledger.replace(claim.key, None)
         return ledger
+
+    def without_waiting(self, demands: Iterable[str]) -> Ledger:
+        """Return the ledger in which these demands do not wait."""
+        waiting = self.waiting
+        for demand in demands:
+            waiting = waiting.discard(demand)
+        return replace(self, waiting=waiting)
 
     def with_claims_from(self, subject: Subject, other: Ledger) -> Ledger:
         """Return the ledger with the claims on ``subject`` as they are in ``other``."""
@@ -323,9 +325,9 @@ def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
     """Return how many applications each node has, after the first claim on one changed."""
-    old, new = (claim.application.node if claim else None for claim in (before, after))
-    for node, change in ((old, -1), (new, 1)) if old != new else ():
-        if node is not None:
+    old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
+    for nodes, change in ((old - new, -1), (new - old, 1)):
+        for node in nodes:
             count = (counts.get(node) or 0) + change
             counts = counts.insert(node, count) if count else counts.remove(node)
     return counts
@@ -346,24 +348,3 @@ def _order(key: ClaimKey) -> tuple[str, str, str]:
 def _minute(moment: datetime) -> str:
     """Return the minute of a time, in UTC, as a text that sorts like the time."""
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
-
-
-def changes_on(
-    before: Ledger, after: Ledger, subjects: Iterable[Subject]
-) -> tuple[ClaimChange, ...]:
-    """Return the claims on these subjects that differ between two ledgers."""
-    claims = (
-        claim
-        for subject in subjects
-        for ledger in (before, after)
-        for claim in ledger.claims_on(subject)
-    )
-    return claim_changes(before, after, (claim.key for claim in claims))
-
-
-def claim_changes(
-    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
-) -> tuple[ClaimChange, ...]:
-    """Return the claims at ``keys`` that differ between two ledgers."""
-    changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
-    return tuple(change for change in changes if change.before != change.after)

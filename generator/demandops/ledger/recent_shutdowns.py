@@ -1,4 +1,4 @@
-"""Recent shutdowns, so that one that is sent again within 15 minutes is recognized.
+"""Recent shutdowns, so that a shutdown that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
 record the repeat would release another demand of the same requesters. A join that adds something
@@ -30,13 +30,13 @@ from demandops.settings import LEDGER_API_VERSION
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
 REMEMBERED = timedelta(minutes=15)
-"""For how long the same shutdown is a repeat."""
+"""For how long the same shutdown counts as a repeat, not as a new one."""
 
 _KEPT = timedelta(hours=1)
-"""For how long its file is kept, because a repeat may wait in a journal while others are booked."""
+"""How long a record is kept: longer, because a repeat may wait in a journal meanwhile."""
 
 _FORGOTTEN = 10
-"""How many old shutdowns one booking forgets at most."""
+"""The most old records of shutdowns that one booking removes."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
@@ -102,9 +102,9 @@ class RecentShutdowns:
     def forget(
         self, now: datetime, requesters: Iterable[str] = ()
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the shutdowns without the forgotten ones, and the digests of these.
+        """Return the shutdowns without those to forget, and the digests of the forgotten ones.
 
-        Forgotten are those of ``requesters`` and some that are older than an hour.
+        It forgets those of ``requesters``, and some that are older than an hour.
         """
         first = _minute(now - _KEPT)
         ended = sorted(one for one in self.by_minute if one < first)

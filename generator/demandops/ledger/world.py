@@ -21,6 +21,6 @@ class World:
     overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Set the overrides that apply."""
+        """Set ``overrides`` from the configuration and the ledger."""
         active = by_rank(still_active(self.config.overrides, self.ledger.ended))
         object.__setattr__(self, "overrides", active)

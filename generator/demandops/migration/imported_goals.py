@@ -1,4 +1,4 @@
-"""Goals of the reference's action that book what the reference still holds."""
+"""Goals of the reference's action that book everything that is held there."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # numbers in the messages
 def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
     """Return the joins that are still held, by resource, and warnings.
 
-    A detection has no joins of its own: the applications that use its object list hold it.
+    A detection has no joins: it is held by the applications that use its object list.
 
     Raises:
         InvalidInput: if the files do not say who holds a resource.
@@ -34,7 +34,7 @@ def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
             continue
         book = files.books.get(name)
         if book is None and any(name.startswith(prefix) for prefix in files.booked) and not spec:
-            continue  # its operator forgot it when it was deleted, but never its requests
+            continue  # it was deleted: its operator has removed the bookkeeping, but no request
         if book is None and requests:
             if name.startswith(CONNECTION) and len(requests) > 1:
                 faults.append(_rewritten(name))
@@ -84,8 +84,8 @@ def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
 def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list[dict[str, Any]]:
     """Return goals, oldest first: one for each set of requesters, with all that they hold.
 
-    What the same requesters hold a second time gets a goal with another id, because the ledger
-    counts a repeated goal once.
+    If requesters hold the same thing twice, they get a second goal with another id, because the
+    ledger counts a repeated goal once.
 
     Raises:
         InvalidInput: if the map, which is in ``file``, has no entry for a resource or a topic.

@@ -54,7 +54,7 @@ class Request(_Part):
     topics_objectlist: list[str] = Field(default_factory=list, alias="topicsObjectlist")
 
     def holds(self) -> Counter[Hold]:
-        """Return the holds that it gives or takes."""
+        """Return the holds that the request adds, or removes if it is a shutdown."""
         topics = [*self.topics_ego_data, *self.topics_objectlist] or [""]
         return Counter((topic, who) for who in self.requester for topic in topics)
 
@@ -76,7 +76,7 @@ class _Ros2Mqtt(_Part):
 
 
 class _Mqtt2Ros(_Part):
-    """The target's bridge: the same, with the topics of MQTT."""
+    """The target's bridge: the same fields, for topics of MQTT."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _RosTopic] = Field(init=False)
@@ -165,7 +165,7 @@ class _FusionBook(_Part):
 
 @dataclass
 class ReferenceFiles:
-    """What all files together say: the spec, the bookkeeping and the requests of each resource."""
+    """The content of all files: the spec, the bookkeeping and the requests of each resource."""
 
     specs: dict[str, Spec] = field(default_factory=dict)
     books: dict[str, Counter[Hold]] = field(default_factory=dict)
@@ -183,7 +183,7 @@ class ReferenceFiles:
 
 
 def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
-    """Return what documents say; each comes with the name of its file.
+    """Return the content of all documents; each comes with the name of its file.
 
     Raises:
         InvalidInput: with the faults of all files.

@@ -68,7 +68,7 @@ class MappedConnection(CamelModel):
 
 
 class ReferenceMap(FileModel):
-    """What each resource is. ``request`` is the id of the demands, which the reference forgets."""
+    """The meaning of each resource. ``request`` is the demands' id, which the reference forgets."""
 
     kind: Literal["ReferenceMap"]
     request: _Filled
@@ -112,7 +112,7 @@ def propose(
 
 
 class _Inventory:
-    """Finds what the resources say, and guesses the rest from the inventory."""
+    """Reads nodes and brokers from the resources, and guesses the rest from the inventory."""
 
     def __init__(self, files: ReferenceFiles, config: Config) -> None:
         self._connections = files.specs_of(MqttConnection)

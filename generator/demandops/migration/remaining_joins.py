@@ -1,9 +1,9 @@
 """The joins that are still held, from what the reference's operators recorded.
 
-The bookkeeping says who holds what, and how often. The versioning file says which requests led to
-it. But in the files of connections and detections the first request is not what was asked: the
-operator adds later requesters to the same list, and removes them. So the counts are always those of
-the bookkeeping, and the requests only tell which requesters joined together.
+The bookkeeping says who holds what, and how often. The versioning file has the requests that led
+to it. But in the files of connections and detections the first request is not the original one:
+the operator adds later requesters to its list, and removes them. So the counts always come from
+the bookkeeping, and the requests only show which requesters joined together.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ class Join:
 def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join]:
     """Return the joins whose holds add up to ``book``, oldest first.
 
-    The requests are undone, from the newest back to the one that created the resource. What is left
-    is what that first request asked for. Then the others are done again, and each join stays a join
-    of its own.
+    The requests are undone, from the newest back to the one that created the resource. The rest is
+    what this first request asked for. Then the other requests are applied again, and each join
+    stays separate.
 
     Args:
-        book: how often each hold is held.
+        book: the bookkeeping: how many times each hold counts.
         requests: the requests by version, in order; they may be incomplete.
     """
     left, undone, created = Counter(book), list[tuple[int, Request]](), 0
@@ -82,7 +82,7 @@ def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
 
 
 def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
-    """Return the bookkeeping that results from requests; wrong if an operator rewrote one."""
+    """Return the bookkeeping that requests result in; it is wrong if an operator changed one."""
     book = Counter[Hold]()
     for request in requests.values():
         if request.shutdown:

@@ -1,7 +1,7 @@
 """The flow of topics through an application: what its services read, and where that is made.
 
-An instance of a service depends on one demanded topic, on those of one source, or on its
-application alone. So the flows of a demand follow from the demand itself, whatever others hold.
+An instance of a service depends on one demanded topic, on the topics of one source, or only on its
+application. So the flows of a demand do not depend on other demands.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from demandops import naming
 from demandops.config.appdef import Service
 from demandops.config.config import Config
 from demandops.demand.application import Application, InputTopic
-from demandops.plan.output_topics import instance_of, named
+from demandops.plan.output_topics import named, published, told_apart_by
 from demandops.plan.release import ServiceKey
 from demandops.subject import TopicKey
 
@@ -22,7 +22,8 @@ from demandops.subject import TopicKey
 class Made(NamedTuple):
     """A topic that a service reads and the node where it is made.
 
-    ``root`` is the demanded topic that it is, or is made from; empty if the application has one.
+    ``root`` is the demanded topic itself, or the one that the topic is made from; empty if the
+    topic is made for the whole application.
     """
 
     topic: InputTopic
@@ -35,7 +36,8 @@ class Flow:
     """A topic that is made on one node and needed on another.
 
     ``name`` is the role, or ``<service>.<output>``. ``target`` is the topic's name at the receiver.
-    ``root`` is the demanded topic that needs it, ``delivery`` the index of what is delivered.
+    ``root`` is the demanded topic that needs it; ``delivery`` is its index in ``deliver``, if it is
+    delivered.
     """
 
     name: str
@@ -48,8 +50,16 @@ class Flow:
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
-    """Return the node of the instance that an application has of a service, for a source."""
-    return source if service.at_source else app.node
+    """Return the node on which an application's service runs for the inputs of ``source``.
+
+    Empty if the service runs once for each cluster, but not in the application's cluster, or if it
+    has no node yet.
+    """
+    if service.nodes:
+        return service.runs_at.get(app.node, "")
+    if service.at_source:
+        return source
+    return app.moved.get(service.name) or app.chosen_node(service.name)
 
 
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
@@ -59,10 +69,17 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
     elif service.root is not None:
         for topic in app.inputs.get(service.root, ()):
             node = node_of(app, service, topic.source)
-            yield ServiceKey(service.name, node, source=topic.source, topic=topic.topic)
+            version = version_of_instance(app, service)
+            yield ServiceKey(service.name, node, None, topic.source, topic.topic, version)
     else:
         for node, _ in _parts(app, service):
-            yield ServiceKey(service.name, node)
+            if node:
+                yield ServiceKey(service.name, node, for_cluster=service.scope == "cluster")
+
+
+def version_of_instance(app: Application, service: Service) -> str:
+    """Return the version in the key of a service's instance; empty unless it is separate."""
+    return "" if service.shared else app.own_version
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
@@ -88,18 +105,16 @@ def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
         instance = naming.topic_part(app.id if producer.scope == "application" else node)
         yield Made(InputTopic(named(pattern, instance), node), node)
         return
+    version = version_of_instance(app, producer)
     for role in producer.roots:
         for one in app.inputs.get(role, ()):
-            instance = (
-                instance_of(config, role, one) if producer.root else naming.topic_part(one.source)
-            )
-            topic = InputTopic(named(pattern, instance), one.source)
-            node = node_of(app, producer, one.source)
-            yield Made(topic, node, (role, one.topic, one.source))
+            told = told_apart_by(config, role, one, version) if producer.root else ""
+            node = one.source if producer.at_source else node_of(app, producer, one.source)
+            yield Made(published(pattern, one.source, told), node, (role, one.topic, one.source))
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
-    """Return what must be carried between nodes for an application, sorted by name."""
+    """Return the flows between nodes that an application needs, sorted by name."""
     found: dict[tuple[str, str, str, str], Flow] = {}
     for service in config.services.get(app.appdef, {}).values():
         for node, part in _parts(app, service):
@@ -116,7 +131,7 @@ def flows(config: Config, app: Application) -> list[Flow]:
 
 
 def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
-    """Yield what must be carried so that the application's outputs are delivered."""
+    """Yield the flows that deliver the application's outputs."""
     for index, delivery in enumerate(app.deliver):
         name, _, output = delivery.output.partition(".")
         service = config.services.get(app.appdef, {}).get(name)
@@ -130,7 +145,7 @@ def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
-    """Yield the node of each instance of a service, and the part of the application it sees."""
+    """Yield the node of each instance of a service, and the application with its inputs only."""
     if service.root is not None:
         for one in app.inputs.get(service.root, ()):
             yield node_of(app, service, one.source), app.with_inputs({service.root: (one,)})

@@ -19,7 +19,8 @@ from demandops.demand.application import Application
 from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import AnyRequest, Demanded
 from demandops.identifiers import topic_problem
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.flows import Flow, flows
 from demandops.subject import Subject, SubjectKind, TopicKey
@@ -33,8 +34,8 @@ def _input_field(field: str, path: str) -> str:
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request with a connection for each flow that no listed connection carries.
 
-    A connection that already carries it is joined. Otherwise the two nodes get a connection of
-    their own. A faulty input adds none; admission reports it.
+    If a claimed connection carries the flow, the demand joins it. Otherwise it gets a derived
+    connection between the two nodes. An invalid input adds none; admission reports it.
     """
     first: dict[_Ends, Demanded] = {}
     routes: dict[_Ends, dict[Route, None]] = {}
@@ -56,13 +57,14 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         for flow in flows(config, app):
             if (flow.receiver, flow.target) in brought or not _is_valid(flow, config):
                 continue
-            needed = _connection(flow, one.connect, ledger)
+            needed = carrying(flow, one.connect, ledger)
             field = places.get(flow.root, "node")
             if flow.delivery is not None:
                 field = f"deliver[{flow.delivery}]"
             place = partial(_input_field, one.place(field))
             ends = (needed.id, *needed.nodes)
-            first.setdefault(ends, Demanded(needed, one.requesters, place, one.term))
+            note = _note(needed, one.connect)
+            first.setdefault(ends, Demanded(needed, one.requesters, place, one.term, note=note))
             routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
     demanded = []
     for one in request.demanded:
@@ -73,6 +75,17 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
             demanded.append(one)
     implied = (_with_topics(first[ends], topics) for ends, topics in routes.items())
     return replace(request, demanded=(*demanded, *implied))
+
+
+def _note(needed: Connection, type: str) -> str:
+    """Return what to tell of a connection that others demanded with another type."""
+    if needed.type is None or type in ("auto", needed.type.word):
+        return ""
+    topic = needed.topics[0].source
+    return (
+        f"carries {topic} already and is {needed.type.name}, so there is no {type.upper()} "
+        "connection for it"
+    )
 
 
 _Ends: TypeAlias = "tuple[str, ...]"
@@ -86,10 +99,10 @@ def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
 def without_idle_deliveries(
     before: Ledger, after: World, changes: Changes
 ) -> tuple[Ledger, Changes]:
-    """Return a booking without the deliveries of what reduced claims no longer have made.
+    """Return the booking without connections that deliver outputs which are no longer made.
 
-    A demand gives its connections back itself. Only one that a decommissioned node has reduced
-    still holds connections between other nodes.
+    A demand releases its connections itself. But if a decommissioned node reduces a demand, the
+    demand may still hold connections between other nodes.
     """
     ledger, keys = after.ledger, [change.key for change in changes.claims]
     for change in changes.claims:
@@ -114,8 +127,12 @@ def _is_valid(flow: Flow, config: Config) -> bool:
     return known and not topic_problem(flow.topic) and not topic_problem(flow.target)
 
 
-def _connection(flow: Flow, type: str, ledger: Ledger) -> Connection:
-    """Return the connection that carries a flow, with only its topic."""
+def carrying(flow: Flow, type: str, ledger: Ledger) -> Connection:
+    """Return the connection that carries a flow, with only the flow's topic.
+
+    It is a claimed connection that already carries the flow, else a derived one of ``type``, which
+    may be ``auto``.
+    """
     ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         for claim in ledger.connection_claims(id):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 
 from demandops import naming
 from demandops.config.appdef import Service
@@ -26,25 +27,39 @@ def outputs(
 ) -> dict[str, str]:
     """Return the topics that a service instance publishes, by the names of the appdef's outputs.
 
-    ``further`` is that of the instance's input in the claims.
+    ``further`` says whether the instance's input is a further topic of its source.
     """
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
     else:
         input = InputTopic(str(key.topic), str(key.source), further=further)
-        instance = instance_of(config, service.root, input)
+        instance = instance_of(config, service.root, input, key.version)
     return {name: named(pattern, instance) for name, pattern in sorted(service.outputs.items())}
 
 
-def instance_of(config: Config, role: str, topic: InputTopic) -> str:
-    """Return what ``{instance}`` is for the service that has ``topic`` as its input."""
+def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
+    """Return the text for ``{instance}`` of the service that has ``topic`` as its input.
+
+    ``version`` is that of a separate instance, else empty.
+    """
+    return naming.topic_part(topic.source, told_apart_by(config, role, topic, version))
+
+
+def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) -> str:
+    """Return what the names of a service's topics have beside the source of its input."""
     usual = usual_topic(config, topic.source, role)
-    is_usual = topic.topic == usual or (usual is None and not topic.further)
-    return topic._replace(further=not is_usual).part
+    further = topic.further if usual is None else topic.topic != usual
+    return topic.told_apart_by(further, version)
+
+
+@lru_cache(maxsize=65_536)
+def published(pattern: str, source: str, told: str) -> InputTopic:
+    """Return a topic that a service publishes for a source; a fusion reads hundreds each time."""
+    return InputTopic(named(pattern, naming.topic_part(source, told)), source)
 
 
 def named(pattern: str, instance: str) -> str:
-    """Return the topic of an instance."""
+    """Return the name of an instance's topic, by the pattern of the appdef."""
     return pattern.replace("{instance}", instance)
 
 
@@ -58,7 +73,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
     """Return the request with every input marked that is a further topic of its source."""
     if not request.adds_claims:
         return request
-    own = request.demand if isinstance(request, Put) else None  # what it holds now may end
+    own = request.demand if isinstance(request, Put) else None  # a put may release what it holds
     first: dict[tuple[str, str], str] = {}
 
     def is_further(role: str, topic: InputTopic) -> bool:
@@ -88,7 +103,10 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return the ledger of an earlier version with the marks; the oldest topic is the usual one."""
+    """Return the ledger of an earlier format with further topics marked as such.
+
+    The topic of a source that was booked first is its usual one.
+    """
     first: dict[tuple[str, str], str] = {}
 
     def is_further(role: str, topic: InputTopic) -> bool:
@@ -103,7 +121,7 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
 
 
 def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
-    """Yield the inputs of which any service runs once for each topic, with their roles."""
+    """Yield the role and the topic of each input that may have a service of its own."""
     for role in config.roles_with_services:
         for topic in app.inputs.get(role, ()):
             yield role, topic

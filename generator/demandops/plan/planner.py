@@ -29,7 +29,7 @@ from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, claims_needing, services_of
-from demandops.plan.replicas import replicas_of
+from demandops.plan.replicas import replicas_of, with_kept
 from demandops.plan.running_version import version_of_service
 from demandops.subject import TopicKey
 
@@ -44,6 +44,17 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
     world = without_suspended(world)
     release = _unshaped(world, key)
     return release_overrides.apply_overrides(release, world) if release else None
+
+
+def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
+    """Return a service with the replicas that its demands need, without effects of overrides.
+
+    Raises:
+        Refused: as :func:`plan`.
+    """
+    world = without_suspended(world)
+    kept = world.ledger.kept.replace(key.instance, ())
+    return _service(replace(world, ledger=replace(world.ledger, kept=kept)), key)
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
@@ -65,7 +76,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     if not claims:
         return None
     apps = [claim.application for claim in claims]
-    service = services_of(config, _first(world, apps[0]).appdef)[key.service]
+    service = services_of(config, _as_claimed(world, apps[0]).appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
     parts = list(_parts(world, service, key, apps))
     inputs = {role: _inputs(config, key, role, parts) for role in sorted(service.inputs)}
@@ -75,6 +86,9 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     further = service.root is not None and parts[0].inputs[service.root][0].further
     applications = tuple(dict.fromkeys(app.id for app in apps))
     version = version_of_service(world, service, applications)
+    needed = replicas_of(service.scaling, parameters, topics, claims, requesters)
+    kept = world.ledger.kept.steps.get(key.instance)
+    replicas, keeps = with_kept(needed, service.scaling, kept or ())
     return ServiceRelease(
         key=key,
         name=service_name(config, service, key),
@@ -86,19 +100,20 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(parameters),
-        replicas=replicas_of(service.scaling, parameters, topics, claims, requesters),
+        replicas=replicas,
+        keeps=keeps,
         applications=applications,
         requesters=requesters,
     )
 
 
-def _first(world: World, app: Application) -> Application:
-    """Return an application as its first claim has it, which decides what and where it is."""
+def _as_claimed(world: World, app: Application) -> Application:
+    """Return an application as its first claim has it, which decides its appdef and node."""
     return world.ledger.application(app.id) or app
 
 
 def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
-    """Return who requests a service; if topics need it, who still holds one of them."""
+    """Return the requesters of a service; if topics need it, only those who still hold one."""
     if not service.roots:
         return requesters_of(claims)
     holders = (
@@ -112,17 +127,17 @@ def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> t
 def _parts(
     world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
 ) -> Iterator[Application]:
-    """Yield of each application what an instance sees of it."""
+    """Yield each application with only the inputs that concern one instance of a service."""
     by_id: dict[str, list[Application]] = {}
     for app in apps:
         by_id.setdefault(app.id, []).append(app)
     shared = service.root and {service.root: (_shared_input(apps, service.root, key),)}
     for same in by_id.values():
-        first = _first(world, same[0])
+        first = _as_claimed(world, same[0])
         if shared:
             yield first.with_inputs(shared)
             if len(service.inputs) == 1:
-                return  # whatever application: it reads nothing else
+                return  # one application is enough: the instance reads nothing else
             continue
         roles = service.roots or {role for app in same for role in app.inputs}
         united = {role: {one for app in same for one in app.inputs.get(role, ())} for role in roles}
@@ -141,7 +156,7 @@ def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> In
 def _inputs(
     config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
 ) -> tuple[InputTopic, ...]:
-    """Return what an instance reads in a role, sorted; a known type replaces a missing one."""
+    """Return the topics that an instance reads in a role, sorted; a known type fills a gap."""
     found: set[InputTopic] = set()
     for part in parts:
         origin = _origin(config, key, role, part)
@@ -164,7 +179,7 @@ def demanded_inputs(
     The root is the demanded topic that the input is or is made from; it may be empty.
     """
     service, key = release.service, release.key
-    app = _first(world, app).with_inputs(app.inputs)
+    app = _as_claimed(world, app).with_inputs(app.inputs)
     if service.roots:
         kept = {*roots_of(app, service, key)}
         left = {
@@ -186,9 +201,9 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)
     source, topic = str(key.source), str(key.topic)
-    if topic == usual_topic(config, source, service.root):
-        return naming.object_name(service.prefix, key.node, source)
-    return naming.object_name(service.prefix, key.node, source, topic)
+    further = [] if topic == usual_topic(config, source, service.root) else [topic]
+    version = [key.version] if key.version else []
+    return naming.object_name(service.prefix, key.node, source, *further, *version)
 
 
 def _merged_parameters(

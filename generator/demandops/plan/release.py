@@ -8,23 +8,26 @@ from dataclasses import dataclass
 from demandops.config.appdef import Scope, Service
 from demandops.config.config import CHARTS_FILE, VERSIONS_FILE, Config
 from demandops.config.inventory import Node
-from demandops.config.override import UNSHAPED, Shaping
+from demandops.config.override import UNSHAPED, Shaping, format_time
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ApplicationVersion, ChartSource, Image
 from demandops.connections.connection_type import Client
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
+from demandops.ledger import kept_replicas
+from demandops.ledger.kept_replicas import Instance, Kept
 from demandops.ledger.ledger import Ledger
 from demandops.plan.replicas import Autoscaler
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceKey:
-    """One instance of a service.
+    """The identity of one instance of a service.
 
     ``application`` is set if the service runs once for each application. ``source`` and ``topic``
-    are set if it runs once for each topic. All applications that use the topic, or without either
-    the node, share it.
+    are set if it runs once for each topic, which all applications with this topic share. If none of
+    these is set, all applications on the node share it; with ``for_cluster`` all applications in
+    the node's cluster. ``version`` is set for a separate instance of an application.
     """
 
     service: str
@@ -32,20 +35,39 @@ class ServiceKey:
     application: str | None = None
     source: str | None = None
     topic: str | None = None
+    version: str = ""
+    for_cluster: bool = False
 
     @property
     def scope(self) -> Scope:
-        """What it is one instance for."""
+        """What the service has one instance for: a topic, a node, a cluster or an application."""
         if self.application is not None:
             return "application"
+        if self.for_cluster:
+            return "cluster"
         return "node" if self.source is None else "topic"
+
+    @property
+    def instance(self) -> Instance:
+        """Its key among the replicas that the ledger keeps."""
+        named = (self.service, self.node, self.application, self.source, self.topic, self.version)
+        scope = "cluster" if self.for_cluster else ""
+        return ("replicas", *(name or "" for name in named), scope)
+
+    @classmethod
+    def of(cls, instance: Instance) -> ServiceKey:
+        """Return the key of an instance."""
+        service, node, *others, version, scope = instance[1:]
+        application, source, topic = (name or None for name in others)
+        return cls(service, node, application, source, topic, version, scope == "cluster")
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceRelease:
     """The desired state of one service: one Helm release.
 
-    ``chart`` is that of ``version``, unless an override pins another.
+    ``chart`` is that of ``version``, unless an override pins another. ``keeps`` says until when it
+    has more replicas than its demands need.
     """
 
     key: ServiceKey
@@ -59,6 +81,7 @@ class ServiceRelease:
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]
     replicas: int | Autoscaler
+    keeps: Kept | None
     applications: tuple[str, ...]
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
@@ -81,14 +104,19 @@ class ServiceRelease:
     def description(self) -> str:
         """Its description in commit messages."""
         for_whom = self.key.source or self.key.application
-        return f"{self.key.service} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
+        what = f"{self.key.service} {self.key.version}".rstrip()
+        return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
+
+    @property
+    def _until(self) -> str:
+        return f" until {format_time(self.keeps.until)}" if self.keeps else ""
 
     def facts(self) -> list[str]:
         """Return the service's properties as lines; commit messages show the changed ones."""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
-            f"replicas {self.replicas}",
+            f"replicas {self.replicas}{self._until}",
             *([f"version {self.version.name}"] if self.version.name else []),
             f"chart {self.chart.version}",
             *(
@@ -102,11 +130,16 @@ class ServiceRelease:
         """Yield (file, entry, what it decides) for each configuration entry that shapes it."""
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
-        yield self.service.file, entry, "what it is"
+        yield self.service.file, entry, "its definition"
+        if self.service.place:
+            yield self.service.file, f"{entry}.place".lstrip("."), "what its node must have"
         yield config.values_template(self.service), "", "its Helm values"
         if self.version.name:
             entry = f"applications.{self.version.appdef}.versions.{self.version.name}"
             yield config.file_of(VERSIONS_FILE, self.version.appdef), entry, "its version"
+        if self.keeps:
+            what = f"{self.replicas} replicas until {format_time(self.keeps.until)}"
+            yield kept_replicas.path_of(self.key.instance), "keeps", what
         chart, name = self.chart, self.service.chart
         where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
         file = config.file_of(CHARTS_FILE, name)

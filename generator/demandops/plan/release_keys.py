@@ -15,9 +15,9 @@ from demandops.connections.connection_type import ClientKey
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
 from demandops.errors import Refused
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.world import World
-from demandops.plan.flows import instances, node_of, roots_of
+from demandops.plan.flows import instances, node_of, roots_of, version_of_instance
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import ServiceKey
 from demandops.plan.running_version import running_version, same_version
@@ -29,8 +29,8 @@ ReleaseKey = ServiceKey | ClientKey
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
 
-    If an application's definition is missing, yield none. With ``strict``, refuse it instead,
-    because a deleted file must not stop what runs.
+    If an application's definition is missing, yield none. With ``strict``, raise ``Refused``
+    instead: a deleted definition must not stop running services.
     """
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
@@ -61,7 +61,7 @@ def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceK
     app = claim.application
     first = world.ledger.application(app.id) or app
     known = strict or first.appdef in world.config.services
-    app = app if app.node == first.node else replace(app, node=first.node)
+    app = app.placed_as(first)
     for service in services_of(world.config, first.appdef).values() if known else ():
         yield from instances(app, service)
 
@@ -73,7 +73,11 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
         needed = _service(world, key.application, key) is not None
         return ledger.application_claims(key.application) if needed else ()
     topic = (str(key.source), str(key.topic))
-    claims = ledger.claims_at(key.node) if key.scope == "node" else ledger.claims_taking(*topic)
+    if key.for_cluster:
+        users = world.config.users_of(key.service)
+        claims = tuple(one for name in users for one in ledger.claims_of_definition(name))
+    else:
+        claims = ledger.claims_at(key.node) if key.scope == "node" else ledger.claims_taking(*topic)
     services = {id: _service(world, id, key) for id in {one.subject.id for one in claims}}
     return tuple(
         one
@@ -86,7 +90,7 @@ def is_needed(world: World, key: ServiceKey) -> bool:
     """Return whether a claim needs a service instance."""
     if key.application is not None:
         return _service(world, key.application, key) is not None
-    if key.scope == "node":
+    if key.scope in ("node", "cluster"):
         return bool(claims_needing(world, key))
     return any(
         service is not None and takes(one.application, service, key)
@@ -101,14 +105,16 @@ def takes(app: Application, service: Service, key: ServiceKey) -> bool:
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the service of an application that may have ``key`` as an instance.
+    """Return the application's service that ``key`` may be an instance of.
 
-    ``None``, for example, if it moved or changed its definition.
+    ``None`` if there is none, for example because the application moved.
     """
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}
     service = services.get(key.service)
     if first is None or service is None or service.scope != key.scope:
+        return None
+    if key.scope == "topic" and version_of_instance(first, service) != key.version:
         return None
     return service if node_of(first, service, key.source or key.node) == key.node else None
 
@@ -139,14 +145,14 @@ def affected_keys(
 def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
     """Return a claim before and after a change; if only inputs differ, with only these inputs.
 
-    Who requests it counts only where a definition or an override looks at requesters.
+    Other requesters count as a difference only if a definition or an override depends on them.
     """
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
     old, new = before.application, after.application
     same = replace(new, inputs=old.inputs) == old
-    if not same or old.parameters:  # the latest booking decides some of them
+    if not same or old.parameters:  # the latest booking may decide a parameter
         return before, after
     others = (before.requesters, before.partial) != (after.requesters, after.partial)
     if others and _looks_at_requesters(new.appdef, world):
@@ -181,7 +187,7 @@ def _decided_alike(before: World, after: World, subject: Subject) -> bool:
     if not one or not other:
         return True
     versions = (running_version(world, subject.id) for world in (before, after))
-    return (one.appdef, one.node) == (other.appdef, other.node) and same_version(*versions)
+    return one.decided_like(other) and same_version(*versions)
 
 
 def all_keys(world: World) -> tuple[ReleaseKey, ...]:

@@ -1,4 +1,4 @@
-"""The number of replicas of a service, as the definition derives it from what is demanded."""
+"""The number of replicas of a service, which its definition derives from the demands."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from demandops.config.appdef import Resource, Scaling
 from demandops.demand.application import InputTopic
 from demandops.demand.claim import Claim
 from demandops.errors import Refused, suggestion
+from demandops.ledger.kept_replicas import Kept, Steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,7 @@ class Autoscaler:
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
     def values(self) -> dict[str, int]:
-        """Return what a values template gets."""
+        """Return the variables for a values template."""
         targets = {str(name): percent for name, percent in self.targets.items()}
         return {"min": self.min, "max": self.max} | targets
 
@@ -63,6 +64,21 @@ def replicas_of(
     return scaling.min
 
 
+def with_kept(
+    needed: int | Autoscaler, scaling: Scaling, steps: Steps
+) -> tuple[int | Autoscaler, Kept | None]:
+    """Return the replicas of a service that may keep some, and the step that keeps them, if any."""
+    if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
+        return needed, None
+    kept = min(steps[0].replicas, scaling.most)  # the definition may have been changed since
+    return (kept, steps[0]) if kept > needed else (needed, None)
+
+
 def overridden(replicas: int | Autoscaler, by: int) -> int | Autoscaler:
-    """Return the replicas that an override sets; an autoscaler gets no choice."""
+    """Return the replicas that an override sets; an autoscaler gets ``by`` as both bounds."""
     return Autoscaler(by, by, replicas.targets) if isinstance(replicas, Autoscaler) else by
+
+
+def most_replicas(replicas: int | Autoscaler) -> int:
+    """Return the number of replicas, or the highest that an autoscaler may choose."""
+    return replicas.max if isinstance(replicas, Autoscaler) else replicas

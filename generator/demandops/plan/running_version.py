@@ -1,9 +1,9 @@
 """The version that runs: the newest one that is asked for.
 
 A claim on an application asks for a version, or else for the default. The application runs the
-newest of them. A service that applications share runs the newest that one of them runs. So what
-runs follows from the claims that are there, whatever their order. Whether a demand may ask is
-decided before, in :mod:`demandops.plan.checks.version_difference`.
+newest of them. A service that applications share runs the newest version of these applications. So
+the order of the claims does not matter. Whether a demand may ask for a version is decided before,
+in :mod:`demandops.plan.checks.version_difference`.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def same_version(one: ApplicationVersion | None, other: ApplicationVersion | Non
 def version_of_service(
     world: World, service: Service, applications: Iterable[str]
 ) -> ApplicationVersion:
-    """Return the version in which a service runs that these applications share.
+    """Return the version of a service that these applications share.
 
-    Of several appdefs that define the service, the one with the newest chart counts.
+    If the applications have several appdefs, the one with the newest chart decides.
 
     Raises:
         Refused: if two appdefs have the same chart with different images.
@@ -69,6 +69,6 @@ def version_of_service(
 
 
 def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
-    """Return what a version says about a service: the chart's version and the images' pins."""
+    """Return a version's contents for a service: the chart's version and the images' pins."""
     pins = (version.images.get(name) for name in service.images)
     return version.charts[service.chart].version, *pins

@@ -40,7 +40,7 @@ _TEMPLATE_FAULTS = (
     RecursionError,
     SyntaxError,
     MemoryError,
-)  # errors that a template can cause; its author has to fix them
+)  # errors that a template can cause, so that its author must fix them
 
 _MAX_LENGTH = 100_000
 """The most characters of a values template."""
@@ -80,7 +80,7 @@ class _CompiledTemplates(BytecodeCache):
         bucket.code = self._kept.get((bucket.key, bucket.checksum))
 
     def dump_bytecode(self, bucket: Bucket) -> None:
-        """Keep the template's code, and no more than the limit: a text may have many versions."""
+        """Keep the template's code; drop old code above the limit, because texts change often."""
         if len(self._kept) >= self._LIMIT:
             self._kept.clear()
         if bucket.code:
@@ -165,7 +165,7 @@ class Engine:
         try:
             with budget():
                 compiled: Template = self._config.get_template(template)
-            with budget():  # a full one, whether or not the template was compiled before
+            with budget():  # a new budget, so that an earlier compilation makes no difference
                 text = compiled.render(**context)
             values = strict_yaml.load(text)
         except InvalidInput as error:

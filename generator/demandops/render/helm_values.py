@@ -63,8 +63,13 @@ def _context(release: ServiceRelease, config: Config) -> dict[str, object]:
             ]
             for role, topics in release.inputs.items()
         },
+        "topics": {
+            role: list(dict.fromkeys(topic.topic for topic in topics))
+            for role, topics in release.inputs.items()
+        },
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
+        "requests": dict(release.service.requests),
         "images": {name: release.image(name, config).parts() for name in release.service.images},
     }
     if release.autoscaler:

@@ -18,6 +18,7 @@ from typing import Any
 import jsonschema_rs
 
 from demandops import strict_yaml
+from demandops.charts import chart_files
 from demandops.config.base_model import field_path
 from demandops.config.config import Config
 from demandops.config.override import OVERRIDES_ROOT
@@ -64,19 +65,14 @@ def check_values(
         return
     file = f"{chart.folder}/values.schema.json"
     validator = values_schema.validator(schema, file)
-    file = f"{chart.folder}/values.yaml"
-    try:
-        defaults = _defaults(config.files.get(file, ""))
-    except InvalidInput as error:
-        raise InvalidInput(strict_yaml.faults_in(error, file)) from None
-    merged = _merge_values(defaults, values)
+    defaults = chart_files.defaults(str(chart.folder), config.files)
     origin = "the override" if template.startswith(f"{OVERRIDES_ROOT}/") else "the template"
     faults = [
         fault(
             f"values.{path}" if path else "values",
             f"{message}; fix {origin} or {chart.folder}",
         ).within(template)
-        for path, message in _problems(validator, merged)
+        for path, message in _problems(validator, chart_files.merged(defaults, values))
     ]
     if faults:
         raise InvalidInput(faults)
@@ -103,9 +99,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield the documents of a file; those of Flux's and Argo CD's kinds without their ``spec``.
+    """Yield the documents of a file; objects of Flux and Argo CD come without their ``spec``.
 
-    Such a ``spec`` is the program's own template around values that are checked already.
+    The program's own template writes such a ``spec``, and its values are checked elsewhere.
     """
     for part in text.split("\n---\n"):
         api = _API.search(part)
@@ -144,25 +140,6 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
         (field_path(tuple(error.instance_path)), error.message)
         for error in validator.iter_errors(instance)
     ]
-
-
-def _merge_values(defaults: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge values into defaults by Helm's rules: mappings merge, null removes, others replace."""
-    merged = dict(defaults)
-    for key, value in values.items():
-        if value is None:
-            merged.pop(key, None)
-        elif isinstance(value, dict) and isinstance(merged.get(key), dict):
-            merged[key] = _merge_values(merged[key], value)
-        else:
-            merged[key] = value
-    return merged
-
-
-@lru_cache(maxsize=256)
-def _defaults(text: str) -> dict[str, Any]:
-    values = strict_yaml.load(text)
-    return values if isinstance(values, dict) else {}
 
 
 @lru_cache(maxsize=64)

@@ -19,7 +19,7 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
-"""Effects that do not change the body, so their comments are updated even if it is held."""
+"""Effects that do not change the body; their comments are updated even if the body is held."""
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
@@ -78,8 +78,8 @@ def kept_charts(
 ) -> dict[str, str]:
     """Return the chart sources to keep because a held release may still use them.
 
-    Sources of charts in this repo are not kept: under its old name such a source would fetch the
-    new chart.
+    Sources of charts in this repo are not kept, because such a source would fetch the new chart
+    under its old name.
 
     Args:
         files: the generated files as they will be.

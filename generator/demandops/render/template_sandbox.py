@@ -50,7 +50,7 @@ _FILTERS = re.findall(
     "wordcount",
 )
 _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
-"""Filters that take a step whatever the size: they only look at a value or return a part of it."""
+"""Filters that take one step for any size: they only look at a value or return a part of it."""
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
 """Filters that call a filter or test for each item; these calls take the steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
@@ -69,7 +69,7 @@ _METHODS: dict[type, list[str]] = {
     list: ["count", "index"],
     tuple: ["count", "index"],
 }
-_MAPPING = (dict, Mapping)  # the first is told at once
+_MAPPING = (dict, Mapping)  # ``dict`` first, because that check is quick
 _PLAIN = (str, int, float, type(None), Undefined)
 
 
@@ -100,7 +100,7 @@ def budget() -> Iterator[None]:
 
 
 def _size(value: object, *, data: bool = True) -> int:
-    """Return the size of a value with all that it contains; what it contains twice counts twice.
+    """Return the size of a value with all its parts; a part that occurs twice counts twice.
 
     With ``data``, any other object is refused, because its text would hold an address in memory.
     """
@@ -133,7 +133,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Return a new value, and take steps for its size; an iterator or a view becomes a list."""
+    """Take steps for the size of a new value and return it; iterators and views become lists."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:

@@ -31,11 +31,21 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     Raises:
         Refused: if one cannot be planned.
     """
-    node = next(iter(sorted(config.domain_of)), None)
-    if node is None:
+    if not config.domain_of:
         return {}
     plain = replace(config, overrides={})
-    return {appdef.name: list(_services(appdef, node, plain)) for appdef in config.appdefs.values()}
+    return {
+        name: list(_services(appdef, _trial_node(name, config), plain))
+        for name, appdef in config.appdefs.items()
+    }
+
+
+def _trial_node(appdef: str, config: Config) -> str:
+    """Return the first node on which all services of an appdef can run, else the first node."""
+    services = config.services.get(appdef, {}).values()
+    nodes = sorted(config.domain_of)
+    fitting = (n for n in nodes if all(n in one.runs_at for one in services if one.nodes))
+    return next(fitting, nodes[0])
 
 
 def _other_versions(
@@ -44,7 +54,7 @@ def _other_versions(
     """Yield the services of a trial demand for each listed version that is not the default."""
     plain = replace(config, overrides={})
     for name, listed in config.versions.items() if trials else ():
-        node = trials[name][0].node.id
+        node = _trial_node(name, config)
         for version in listed.versions:
             if version != listed.default:
                 yield from _services(config.appdefs[name], node, plain, version)
@@ -86,7 +96,7 @@ def render_trial_demands(world: World, engine: Engine) -> None:
 
     A service is rendered once for each version that ``registry/versions.yaml`` lists. This checks
     an appdef before its first demand, without overrides and with each override that is
-    in effect. An override fails only if no appdef that it applies to renders with it.
+    in effect. An override is at fault only if none of its appdefs renders with it.
 
     Raises:
         Refused, InvalidInput: naming the template, the values or the override that does not work.

@@ -16,7 +16,7 @@ from demandops.quoting import quoted
 _MAX_WORK = 100_000
 _MAX_VISITS = 1_000_000
 _MAX_DEPTH = 100
-"""The greatest depth of values; strict YAML is not deeper."""
+"""The greatest depth of values; strict YAML allows no deeper nesting."""
 
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 _SAME_VALUE = ("allOf", "anyOf", "oneOf", "not", "if", "then", "else")
@@ -76,7 +76,7 @@ def _outside(schema: object, place: tuple[int | str, ...]) -> Iterator[tuple[Any
 
 
 class _Work:
-    """Counts how many schemas are applied, at most, along one path into the values."""
+    """Computes the most schemas that a validation may apply along one path into the values."""
 
     def __init__(self, document: object) -> None:
         self._document = document
@@ -86,16 +86,17 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return how many schemas a schema applies, at most, to values of a depth.
+        """Return the most schemas that a schema applies to values of this depth.
 
         Raises:
-            RecursionError: it refers to itself for the same value, or there is too much to count.
+            RecursionError: if a schema applies itself to the same value, or applies too many.
         """
         if not isinstance(schema, dict) or depth < 0:
             return 1
         key = (id(schema), depth)
         if key not in self._known:
-            self._known[key] = _MAX_WORK + 1  # until it is known: a schema that contains itself
+            # while it is being counted, it is too much: so a schema that contains itself is found
+            self._known[key] = _MAX_WORK + 1
             self._known[key] = self._counted(schema, depth)
         work = self._known[key]
         if work > _MAX_WORK or len(self._known) > _MAX_VISITS:
@@ -118,7 +119,7 @@ class _Work:
         )
 
     def _target(self, reference: object) -> object:
-        """Return the schema that a reference names; the whole document if that is not known."""
+        """Return the schema that a reference names; the whole document for an unknown name."""
         found = self._anchors.get(str(reference), self._document)
         if not isinstance(reference, str) or not reference.startswith("#/"):
             return found

@@ -53,8 +53,8 @@ _NEXT: dict[State, tuple[State, ...]] = {
 class Demands:
     """The demands without an answer, and the journal.
 
-    ``blocked`` is why no demand can be published now, or empty; a :class:`QueueFull` contains
-    it.
+    ``blocked`` is why no demand can be published now, or empty; the text of a
+    :class:`QueueFull` includes it.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Demands:
     # ---- waiting for demands ----
 
     def close(self) -> None:
-        """Accept no more demands than those that arrived before."""
+        """Accept no further demands; those that have arrived are still carried out."""
         self._take_in()
         with self._changed:
             self._closed = True
@@ -150,7 +150,7 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Take in what arrived, and fill ``batch`` with up to ``limit`` demands.
+        """Journal the demands that arrived, and fill ``batch`` with up to ``limit`` demands.
 
         Raises:
             Unsound: nobody knows what is in the journal.
@@ -183,7 +183,7 @@ class Demands:
             self._take_in()
 
     def _take_in(self) -> None:
-        """Journal what arrived, and refuse what cannot be accepted or journaled."""
+        """Journal the demands that arrived; refuse those that cannot be accepted or journaled."""
         if not self._arrived:
             return
         taken, refused = list[Ticket](), list[tuple[Ticket, DemandOpsError]]()
@@ -274,7 +274,7 @@ class Demands:
                 return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
-            except (StateRepoError, Unsound) as error:  # the worker ends the process, if it must
+            except (StateRepoError, Unsound) as error:  # if unsound, the worker ends the process
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 self.wake()
                 return False
@@ -292,7 +292,7 @@ class Demands:
             # a restart must not resume it
             self._journal.mark_done([ticket.operation], durably=True)
             self._taken_back.append(ticket)
-        else:  # it stays in the journal until its branch is deleted, so that none merges it
+        else:  # it stays in the journal until its branch is deleted and nobody can merge it
             record = replace(ticket.proposal, withdrawn=reason)
             self._journal.append([ticket.journal_entry(record)])
             ticket.proposal = record
@@ -327,7 +327,7 @@ class Demands:
         for ticket, result in results if not keep else ():
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
-            if str(result) != TAKEN_BACK:  # nobody but its client wanted that
+            if str(result) != TAKEN_BACK:  # the client itself took it back, so it knows
                 ticket.notify("refused", reason_of(result))
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
@@ -345,13 +345,16 @@ class Demands:
                 ticket.future.set_exception(result)
 
     def _mark_done(self, results: list[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Remove demands from the journal, durably if no commit shows what became of one of them.
+        """Remove demands from the journal; durably if no commit shows the outcome of one of them.
 
-        After a crash such a demand would be decided again: what was refused could be booked.
+        Otherwise such a demand would be decided again after a crash, so a refused one could be
+        booked.
         """
         operations = [ticket.operation for ticket, _ in results]
         durably = any(
-            not isinstance(result, Receipt) or result.outcome == "unchanged" or ticket.has_released
+            not isinstance(result, Receipt)
+            or result.outcome in ("unchanged", "waiting")
+            or ticket.has_released
             for ticket, result in results
         )
         try:
@@ -376,7 +379,7 @@ class Demands:
         self._waiting.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
-        """No longer count a demand, now answered or proposed, towards its requester's limit."""
+        """Stop counting a demand towards its requester's limit; it is answered or proposed now."""
         if ticket.proposal is None:
             self._of_requester -= Counter([requester_of(ticket.goal)])
 

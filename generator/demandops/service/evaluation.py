@@ -71,6 +71,8 @@ class Evaluator:
             self._approvals.withdraw_replaced(decision.request)
             before = commits.head.state
             targets = targets_of_decision(before, decision) if self._with_targets else ()
+            if decision.outcome == "waiting":
+                ticket.notify("waiting", f"waiting for room: {'; '.join(decision.warnings)}")
             if decision.files:
                 now = self._repository.runtime.now()
                 commit = commits.commit(decision, ticket.operation, ticket.received, now)
@@ -80,7 +82,7 @@ class Evaluator:
                 commit = str(commits.head.commit)
             return receipt_of(ticket, decision, commit, targets)
         except InvalidInput as error:
-            if ticket.has_released:  # a proposal, which held no claims yet
+            if ticket.has_released:  # it released a proposal, which held no claims yet
                 commits.note_settled(ticket.operation, "Unchanged")
                 commit = str(commits.head.commit)
                 return Receipt(ticket.operation, ticket.name, "released", commit)
@@ -90,22 +92,22 @@ class Evaluator:
             return error
         except Exception as error:  # a bug that one demand triggers must not stop the others
             reason = disk_error(error, self._repository.address)
-            if reason is not None:  # it stops them all
+            if reason is not None:  # the state repo fails, so no demand can be evaluated
                 raise reason from None
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of the demands that ``tip`` has, in the order of their commits.
+        """Return the results of demands that are already published at ``tip``, in that order.
 
         Such a demand was not answered because the connection or the process ended after the remote
         accepted the push, or because a sync failed. So the commits since its base are written
-        again.
+        again, durably.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
         found = [(base, operations_since(self._repository.objects, tip, base)) for base in bases]
-        # they are on one line, so what was recorded since one of them has the rest
+        # all bases are ancestors of the tip, so the oldest one's outcomes include the others'
         since, recorded = max(found, key=lambda each: len(each[1]), default=("", {}))
         published = [operation for operation in reversed(recorded) if operation in sought]
         if published:
@@ -123,8 +125,8 @@ def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt |
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
     outcome: Outcome = "booked"
-    if arrival.outcome == "unchanged":
-        outcome = "unchanged"
+    if arrival.outcome in ("unchanged", "waiting"):
+        outcome = arrival.outcome
     elif rollback_goal.is_rollback(goal):
         outcome = "restored"
     elif is_release(goal) or Decommission.is_goal(goal):

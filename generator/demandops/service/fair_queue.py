@@ -1,10 +1,10 @@
-"""The queue of waiting demands: requesters take turns, and what belongs together keeps its order.
+"""The queue of waiting demands: requesters take turns, and related demands keep their order.
 
-A demand belongs to its first requester. Demands that share an application, a connection or a demand
-id keep their order, and so do goals of the reference's action that share a requester: whether a
-shutdown repeats another depends on what was joined in between. If the turn comes to a demand that
-must follow another one, that one is taken in its place. A rollback or a decommission may touch
-anything: nothing overtakes it, and it overtakes nothing.
+A demand counts for its first requester. Demands that share an application, a connection or a demand
+id keep their order. So do goals of the reference's action that share a requester: whether a
+shutdown repeats another depends on what was joined in between. If the next demand must follow
+another one, the queue returns that one instead. A rollback or a decommission may touch anything:
+nothing overtakes it, and it overtakes nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from demandops.service.ticket import Ticket
 
 _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
-"""Each goal that lists its subjects has one of these fields."""
+"""Fields of ordinary goals: a goal with one of them lists the subjects that it touches."""
 
 
 @dataclass(eq=False)
@@ -46,7 +46,7 @@ class FairQueue:
         return len(self._places)
 
     def append(self, ticket: Ticket) -> None:
-        """Add a demand at the end."""
+        """Add a demand at the end of the queue."""
         self._arrived += 1
         place = _Place(self._arrived, ticket, subjects_of(ticket.goal))
         self._places[ticket] = place
@@ -73,7 +73,7 @@ class FairQueue:
         while True:
             requester = next(iter(self._lanes))
             lane = self._lanes.pop(requester)
-            first = _first(lane)
+            first = _next_in(lane)
             if first is not None:
                 self._lanes[requester] = lane  # at the end: the others come first
                 break
@@ -86,27 +86,27 @@ class FairQueue:
             first = before
 
     def _before(self, place: _Place) -> _Place | None:
-        """Return a demand that this one must follow, or None."""
-        barrier = _first(self._barriers)
+        """Return another demand that must be taken before this one, or None."""
+        barrier = _next_in(self._barriers)
         if barrier is not None and barrier.number < place.number:
             return barrier
         if place.subjects is None:
             oldest = next(iter(self._places.values()))
             return oldest if oldest is not place else None
         for subject in place.subjects:
-            first = _first(self._subjects[subject])
+            first = _next_in(self._subjects[subject])
             if first is not None and first is not place:
                 return first
         return None
 
     def _forget(self, place: _Place) -> None:
-        """Forget subjects that no demand in the queue has."""
+        """Forget those subjects of a removed demand that no other demand has."""
         for subject in place.subjects or ():
-            if _first(self._subjects[subject]) is None:
+            if _next_in(self._subjects[subject]) is None:
                 del self._subjects[subject]
 
 
-def _first(places: deque[_Place]) -> _Place | None:
+def _next_in(places: deque[_Place]) -> _Place | None:
     while places and places[0].is_left:
         places.popleft()
     return places[0] if places else None
@@ -129,7 +129,7 @@ def _requesters(goal: dict[str, Any]) -> Iterator[Any]:
 
 
 def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401 - plain data
-    """Return what a goal, which may be invalid, is about; None if it may be anything."""
+    """Return the subjects that a goal, even an invalid one, touches; None if it may touch any."""
     if not isinstance(goal, dict) or _ORDINARY.isdisjoint(goal):
         return None
     headers = (app.get("header") for app in _items(goal, "apps"))

@@ -30,7 +30,7 @@ log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
 _LAST_S = 5.0
-"""How long to wait for the worker's end after the timeout; it stops git and ssh-keygen sooner."""
+"""How long to wait for the worker to end after the timeout; git and ssh-keygen end sooner."""
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
@@ -57,8 +57,8 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many of them may be of one requester. None is for a single client:
-                there is no such limit, and demands keep their order.
+            requester_limit: how many of them one requester may have. With None, for a single
+                client, there is no such limit, and all demands keep their order.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
             fetch_interval: seconds between two fetches while no demand comes; 0: never, except
@@ -116,9 +116,9 @@ class Generator:
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time, as far as it is fetched.
+        """Return the state in effect at a commit or a time; does not fetch.
 
-        From any thread; it may take seconds.
+        Any thread may call it; it may take seconds.
 
         Raises:
             InvalidInput, StateRepoError: if there is no such commit, or it is not valid.
@@ -146,7 +146,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Why threads failed that did not recover since, by their names; from any thread."""
+        """Name of each thread that failed and has not recovered → the reason; from any thread."""
         return self._runtime.failures
 
     def fetch_now(self) -> None:

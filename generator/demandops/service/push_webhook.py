@@ -10,11 +10,8 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import hmac
-import ipaddress
 import logging
-import socket
 from collections.abc import Callable
-from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -23,8 +20,9 @@ from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from demandops.errors import InvalidInput, fault
+from demandops.errors import InvalidInput
 from demandops.runtime import REAL
+from demandops.service import listener
 
 log = logging.getLogger("demandops")
 
@@ -57,9 +55,15 @@ class PushWebhook:
         """
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
-        self._socket = _listening(address, local_only=not secret)
-        host, port = self._socket.getsockname()[:2]
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}{_PATH}"
+        self._socket = listener.bound(address, "--webhook")
+        if not (secret or listener.is_local(self._socket)):
+            self._socket.close()
+            raise InvalidInput.at(
+                "--webhook",
+                f"'{address}' can be reached from other machines, so notifications must be "
+                "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1",
+            )
+        self.url = listener.url_of(self._socket) + _PATH
         app = Starlette(routes=[Route("/", _health), Route(_PATH, self._handle, methods=["POST"])])
         app.router.redirect_slashes = False
         config = uvicorn.Config(
@@ -68,7 +72,7 @@ class PushWebhook:
             ws="none",
             lifespan="off",
             log_config=None,
-            log_level="error",  # whoever connects could fill the log with warnings
+            log_level="error",  # anybody who connects could fill the log with warnings
             access_log=False,  # paths and headers may hold secrets
             proxy_headers=False,  # anyone may write them
             server_header=False,
@@ -84,7 +88,7 @@ class PushWebhook:
         self._thread.join()
 
     async def _handle(self, request: Request) -> PlainTextResponse:
-        """Check a notification and report the push."""
+        """Answer a request; if it is a valid notification, report the push."""
         digest, length = hmac.new(self._secret, digestmod=hashlib.sha256), 0
         too_long = PlainTextResponse("the body is too long\n", 413)
         if int(request.headers.get("Content-Length", "0")) > _MAX_BODY:
@@ -134,48 +138,10 @@ class _BoundedConnection(H11Protocol):
 
 
 async def _health(request: Request) -> PlainTextResponse:
-    failures = REAL.failures  # only the names: errors may quote what must stay secret
+    failures = REAL.failures  # answer only the names, because errors may quote secrets
     if failures:
         return PlainTextResponse(f"failing: {', '.join(failures)}\n", 503)
     return PlainTextResponse("ok\n")
-
-
-def _listening(address: str, *, local_only: bool) -> socket.socket:
-    host, colon, port = address.rpartition(":")
-    if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 0xFFFF:
-        raise _invalid(f"'{address}' is not an address to listen on; write one like 127.0.0.1:8090")
-    host = host.removeprefix("[").removesuffix("]")
-    family, bound = _resolved(host, int(port), address)
-    if local_only and not ipaddress.ip_address(bound[0].partition("%")[0]).is_loopback:
-        raise _invalid(
-            f"'{address}' can be reached from other machines, so notifications must be "
-            "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"
-        )
-    listener = socket.socket(family)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listener.bind(bound)
-        listener.listen()
-    except OSError as error:
-        listener.close()
-        raise _invalid(
-            f"cannot listen on '{address}': {error.strerror}; choose another port"
-        ) from None
-    return listener
-
-
-def _resolved(host: str, port: int, address: str) -> tuple[socket.AddressFamily, Any]:
-    try:
-        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    except (OSError, UnicodeError):
-        raise _invalid(
-            f"'{address}': host '{host}' cannot be resolved; write an address of this machine"
-        ) from None
-    return addresses[0][0], addresses[0][4]
-
-
-def _invalid(message: str) -> InvalidInput:
-    return InvalidInput([fault("--webhook", message)])
 
 
 def _bytes(text: str) -> bytes:

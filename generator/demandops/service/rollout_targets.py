@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from demandops.cluster.health.release_health import ClusterDomain, ObjectName, Target
+from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
 from demandops.decision import Decision, State
 from demandops.errors import Refused
@@ -12,12 +13,13 @@ from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import affected_keys, all_keys, keys_of_claims
 from demandops.render.gitops.argocd import project_of
+from demandops.render.gitops.paths import domains_in_use
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
     """Return the releases that a demand needs, and those that it changes or removes.
 
-    What other demands on the same subjects need beside it does not count.
+    Releases that only other demands on the same subjects need are left out.
     """
     after, request = decision.state, decision.request
     active = without_suspended(after)
@@ -34,7 +36,7 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
         except Refused:
             continue
         if release is not None:
-            targets.append(_target(release, after.config.repo_settings, wanted=new is not None))
+            targets.append(target_of(release, after.config.repo_settings, wanted=new is not None))
     return tuple(dict.fromkeys(targets))
 
 
@@ -44,14 +46,26 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
     for key in all_keys(state):
         release = plan(state, key)
         if release is not None:
-            target = _target(release, state.config.repo_settings, wanted=True)
+            target = target_of(release, state.config.repo_settings)
             releases.append((release, target))
     return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
-def _target(release: Release, repository: RepoSettings, *, wanted: bool) -> Target:
-    domain, application = release.domain, None
+def domains_of_state(state: State) -> list[ClusterDomain]:
+    """Return every access domain on each cluster, also those without releases."""
+    settings = state.config.repo_settings
+    return [place_of(cluster, domain, settings) for cluster, domain in domains_in_use(state.config)]
+
+
+def place_of(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
+    """Return an access domain on a cluster, with what applies its folder there."""
+    application = None
     if repository.gitops == "argocd" and repository.argocd:
         application = ObjectName(repository.argocd.namespace, project_of(domain, repository))
-    place = ClusterDomain(release.node.cluster, domain.name, domain.namespace, application)
+    return ClusterDomain(cluster, domain.name, domain.namespace, application)
+
+
+def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True) -> Target:
+    """Return the target of a release: what its cluster should run, or should no longer run."""
+    place = place_of(release.node.cluster, release.domain, repository)
     return Target(place, release.name, isinstance(release, ServiceRelease), wanted)

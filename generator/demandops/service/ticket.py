@@ -10,23 +10,27 @@ from datetime import datetime
 from typing import Any, Literal
 
 from demandops.cluster.health.release_health import Target
-from demandops.decision import Decision, Outcome, refusal_text
+from demandops.decision import Decision, Outcome
 from demandops.errors import DemandOpsError, InvalidInput
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.claim_changes import ClaimChange
 from demandops.quoting import quoted
 from demandops.staterepo.write.journal import JournalEntry, ProposalRecord
 
 log = logging.getLogger("demandops")
 
-Stage = Literal["away", "admitted", "booked", "committed", "proposed", "pushed", "refused"]
+Stage = Literal[
+    "away", "admitted", "booked", "waiting", "committed", "proposed", "pushed", "refused"
+]
 """``away``: the state repo cannot be reached or written; the text says why.
+
+``waiting``: no node has room for the demand, so it will be booked later.
 
 ``refused``: the demand gets an error as its answer, with this text.
 """
 Listener = Callable[[Stage, str], None]
 
 State = Literal["arrived", "waiting", "committed", "proposed", "withdrawn", "done"]
-"""See :mod:`demandops.service.demand_lifecycle`, which alone changes it."""
+"""The state of a demand; only :mod:`demandops.service.demand_lifecycle` changes it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +59,8 @@ class Receipt:
 class Ticket:
     """A demand under way. ``future`` returns its receipt or raises its error.
 
-    ``journaled`` returns whether the demand is in the journal, so that a crash does not lose it;
-    False if it was refused before. Then ``future`` raises why.
+    ``journaled`` returns whether the demand is in the journal, so that a crash does not lose it. It
+    returns False if the demand was refused before; then ``future`` raises the reason.
 
     ``base`` is the tip that was known when it arrived. ``maybe_published``: the remote may have
     accepted a push of it although no answer arrived. ``has_released``: it released a demand that
@@ -107,12 +111,12 @@ class Ticket:
             log.exception("a listener failed")
 
     def mark_maybe_published(self, base: str) -> None:
-        """Note that a push on top of ``base`` may have succeeded although it seemed to fail."""
+        """Record that a push on top of ``base`` may have succeeded although it seemed to fail."""
         if not self.maybe_published:
             self.base, self.maybe_published = base, True
 
     def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
-        """Return what the journal keeps of the demand."""
+        """Return the demand's entry for the journal."""
         received = self.received.isoformat()
         return JournalEntry(self.operation, self.goal, received, self.base, proposal)
 
@@ -120,7 +124,7 @@ class Ticket:
 def receipt_of(
     ticket: Ticket, decision: Decision, commit: str, targets: tuple[Target, ...]
 ) -> Receipt:
-    """Return the receipt of a demand for what was decided on it."""
+    """Return the receipt of a demand for the decision on it."""
     return Receipt(
         operation=ticket.operation,
         request_id=decision.request.id,
@@ -137,11 +141,11 @@ def receipt_of(
 
 def reason_of(error: DemandOpsError) -> str:
     """Return why a demand was refused, for people."""
-    return refusal_text(error) if isinstance(error, InvalidInput) else str(error)
+    return error.text_with_codes() if isinstance(error, InvalidInput) else str(error)
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket for a demand that an earlier run left in the journal; the log tells of it."""
+    """Return a ticket for a demand that an earlier run left in the journal, and log that."""
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
 

@@ -7,19 +7,22 @@ when a demand arrives, because the demand's push finds new commits too.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from demandops.config.config import Config
 from demandops.decision import Decision
-from demandops.errors import DemandOpsError, Fault, ShuttingDown, StateRepoError, Unsound
+from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError, Unsound
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
+from demandops.service.fault_log import FaultLog
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Receipt, Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
-from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry, OverrideExpiry
+from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
+from demandops.service.timing.own_work import OwnWork
 from demandops.service.timing.polling import PollTimer
+from demandops.service.timing.rest import Rest
 from demandops.staterepo.git.repository import (
     FetchInterrupted,
     PushDenied,
@@ -27,18 +30,15 @@ from demandops.staterepo.git.repository import (
     Unavailable,
     access_error,
 )
-from demandops.staterepo.history import allowed_signers
 from demandops.staterepo.load.snapshot import ReadAhead, Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
 _TIDY_EVERY = 50
-"""After how many new packs to join them; a publication adds one, and a fetch too."""
+"""How many new packs to collect before joining them; each publication or fetch adds one."""
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
-_FIRST_REST_S, _LONGEST_REST_S = 1.0, 60.0
-"""How long not to follow the state repo after an unexpected error; demands are still taken."""
 _NAME = "writer"
 
 
@@ -68,16 +68,15 @@ class Worker:
             fetch_interval, repository.runtime, embedded=repository.always_current
         )
         self._lease_expiry = LeaseExpiry(repository.runtime)
-        self._override_expiry = OverrideExpiry()
+        self._own_work = OwnWork(repository.runtime)
         self._ahead = ReadAhead()
         self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
-        self._logged: frozenset[Fault] = frozenset()
+        self._log = FaultLog(repository)
         self._ends_soon = self._runtime.event()
-        self._warned_of_signers = False
-        self._rest, self._rests_until = _FIRST_REST_S, self._runtime.monotonic()
-        self._warn_if_unsigned()
+        self._rest = Rest(repository.runtime)
+        self._log.warn_if_unsigned(snapshot)
 
     # ---- from any thread ----
 
@@ -87,7 +86,7 @@ class Worker:
         self._demands.wake()
 
     def end_soon(self) -> None:
-        """Publish only what is evaluated already; the other demands stay in the journal."""
+        """Publish only demands that are evaluated already; the others stay in the journal."""
         self._ends_soon.set()
         self._repository.abort()
         self._demands.wake()
@@ -96,33 +95,34 @@ class Worker:
 
     def run(self) -> None:
         """Publish demands until no more are accepted and none waits."""
-        if self._demands.proposed:  # they may be decided already; stopping at once must not skip it
+        # people may have decided proposals before the start; a stop must not skip these answers
+        if self._demands.proposed:
             self._work()
         while self._demands.wait(self._seconds_until_due()):
             self._work()
         self._approvals.suspend()
 
     def _work(self) -> None:
-        """Publish the demands that wait, or follow the state repo; then check the proposals."""
+        """Publish waiting demands; if none waits, follow the state repo; then check proposals."""
         batch: list[Ticket] = []
         try:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                if self.snapshot.problems:  # a release may have made a change possible
+                if self.snapshot.problems:  # a released demand may have made a change valid
                     self._try_to_carry_out_changes()
-            elif not self._rests:
+            elif not self._rest:
                 self._follow()
             if self._packs_since_tidy >= _TIDY_EVERY:
                 self._packs_since_tidy = 0
                 self._repository.tidy()
-            if not self._rests:
+            if not self._rest:
                 self._check_proposals()
         except Exception as error:
             self._fail(batch, access_error(error, self._repository.address))
         else:
-            if not self._rests:
-                self._rest = _FIRST_REST_S
+            if not self._rest:
+                self._rest.succeeded()
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
@@ -137,7 +137,8 @@ class Worker:
         if isinstance(error, ShuttingDown):
             self._demands.fail(batch, error, keep=True)
             return
-        if not batch or not isinstance(error, DemandOpsError):  # else the answers tell it
+        # the demands' answers contain an expected error, so only others are recorded
+        if not batch or not isinstance(error, DemandOpsError):
             self._runtime.failed(_NAME, error)
         if not batch:
             self._take_a_rest()
@@ -145,16 +146,11 @@ class Worker:
             error = StateRepoError(f"internal error of the generator: {error!r}; see its log")
         self._demands.fail(batch, error)
 
-    @property
-    def _rests(self) -> bool:
-        return self._runtime.monotonic() < self._rests_until
-
     def _take_a_rest(self) -> None:
-        """Do not follow the state repo for a while, because that failed."""
-        if self._rest == _FIRST_REST_S:
+        """Stop following the state repo for a while, because that failed."""
+        if self._rest.follows_success:
             self._renew_clone_if_damaged()
-        self._rests_until = self._runtime.monotonic() + self._rest
-        self._rest = min(2 * self._rest, _LONGEST_REST_S)
+        self._rest.begin()
         self._timer.finished(reached=False)
 
     def _renew_clone_if_damaged(self) -> None:
@@ -164,13 +160,13 @@ class Worker:
             log.warning("%s", error)
 
     def _seconds_until_due(self) -> float:
-        """Return the seconds until a lease, override, proposal or fetch is due."""
-        if self._rests:
-            return self._rests_until - self._runtime.monotonic()
+        """Return the seconds until a lease, override, scale-down, proposal or fetch is due."""
+        if self._rest:
+            return self._rest.seconds_left()
         state, tip = self.snapshot.state, str(self.snapshot.commit)
         seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._override_expiry.seconds_until_due(state, self._runtime.now(), seconds)
+        seconds = self._own_work.seconds_until_due(state, seconds)
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
@@ -245,10 +241,10 @@ class Worker:
         for ticket in part:
             self._require_time()
             self._approvals.withdraw_released(results, ticket, commits.head.state)
-            results.append((ticket, self._evaluator.evaluate(commits, ticket)))
+            results.append(self._evaluated(commits, ticket))
         if not left:
             for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
-                results.append((ticket, self._evaluator.evaluate(commits, ticket)))
+                results.append(self._evaluated(commits, ticket))
         evaluated = self._runtime.monotonic()
         if commits.is_empty and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
@@ -267,9 +263,16 @@ class Worker:
             len(results), evaluated - began, self._runtime.monotonic() - evaluated
         )
 
+    def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
+        """Evaluate a demand; if it frees room, book demands that wait for room next."""
+        before = commits.head.state
+        result = ticket, self._evaluator.evaluate(commits, ticket)
+        self._own_work.follow(commits, before)
+        return result
+
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
         """Return tickets that end leases; none while a demand waits, which may renew one."""
-        if self._rests or self._demands.has_waiting:
+        if self._rest or self._demands.has_waiting:
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
@@ -312,23 +315,24 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out the commits of others, and end overrides.
+        """Fetch if a fetch is due, carry out the commits of others, and do what time makes due.
 
-        A repository on this disk is read each time, because that is cheap.
+        That is ending overrides, draining nodes, scaling down, and booking demands that wait. A
+        repository on this disk is read each time, because that is cheap.
         """
-        override_is_due = self._override_expiry.is_due(self.snapshot.state, self._runtime.now())
+        is_due = self._own_work.is_due(self.snapshot.state)
         try:
             if self._timer.start_if_due():
                 self._repository.refresh(lambda: self._demands.must_not_wait)
-            elif not (self._repository.always_current or override_is_due):
+            elif not (self._repository.always_current or is_due):
                 return
-            new = override_is_due or self._repository.tip() != self.snapshot.commit
+            new = is_due or self._repository.tip() != self.snapshot.commit
             self._record_reached(pushed=new and self._carry_out_changes())
         except FetchInterrupted:
-            self._timer.request()  # it is still due
+            self._timer.request()  # the fetch is still due
         except StateRepoError as error:
             self._record_unreachable(error)
-            self._override_expiry.postpone(self._runtime.now())
+            self._own_work.postpone()
 
     def _check_proposals(self) -> None:
         """Check the demands that await approval against the newest main, if a check is due."""
@@ -339,7 +343,7 @@ class Worker:
             if heads.main != str(self.snapshot.commit):
                 self._repository.refresh()
                 self._try_to_carry_out_changes()
-            # a deleted branch may have been merged: only a main at least as new shows that
+            # a deleted branch may have been merged; only a main as new as ``heads`` shows that
             if self._repository.includes(str(self.snapshot.commit), heads.main):
                 self._approvals.check(self.snapshot, heads)
         except (Unavailable, PushDenied) as error:
@@ -352,7 +356,7 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish what follows from people's changes up to the fetched tip; return whether any did.
+        """Publish the effects of people's changes up to the fetched tip; return if there were any.
 
         It does not fetch first.
         """
@@ -375,40 +379,18 @@ class Worker:
             advance = self._ahead.advance(self._repository.objects, before, tip)
             commits = CommitBatch(self._repository, advance.snapshot)
             commits.follow(advance, before, self._runtime.now())
-            self._log_problems(commits.head.problems)
-        self._override_expiry.end_due(commits, self._runtime.now())
+            self._log.tell(commits.head.problems)
+        self._own_work.commit_due(commits)
         return commits
-
-    def _log_problems(self, problems: Iterable[Fault]) -> None:
-        """Log each fault once; log each file once when it is valid again."""
-        current = list(dict.fromkeys(problems))
-        for problem in current:
-            if problem not in self._logged:
-                log.error("%s (its last valid version stays in effect)", problem)
-        for file in sorted({old.file for old in self._logged} - {new.file for new in current}):
-            log.info("%s is valid again", file or "the state repo")
-        self._logged = frozenset(current)
 
     def _set_snapshot(self, snapshot: Snapshot) -> None:
         before, self.snapshot = self.snapshot, snapshot
-        if snapshot.commit != before.commit:  # a merge may need no commit of the generator
+        # also true after a person's merge that needs no commit of the generator
+        if snapshot.commit != before.commit:
             self._packs_since_tidy += 1
-            self._warn_if_unsigned()
+            self._log.warn_if_unsigned(snapshot)
             for listener in self.listeners:
                 listener(snapshot.state.config)
-
-    def _warn_if_unsigned(self) -> None:
-        """Warn, once, if people list signing keys and this generator has none."""
-        if self._repository.signer is not None or self._warned_of_signers:
-            return
-        if allowed_signers.are_listed(self._repository.objects, self.snapshot.commit):
-            self._warned_of_signers = True
-            log.warning(
-                "%s lists who may sign, but this generator has no key; `verify` will refuse its "
-                "commits, and generators will take them for a person's: start it with "
-                "--signing-key",
-                allowed_signers.ALLOWED_SIGNERS,
-            )
 
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""

@@ -10,7 +10,7 @@ from pathlib import Path
 import pygit2
 
 from demandops.errors import StateRepoError
-from demandops.settings import MAIN_BRANCH, RENDER_VERSION
+from demandops.settings import MAIN_BRANCH, RENDER_VERSION, SCHEMAS_ROOT
 from demandops.staterepo import skeleton
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
@@ -19,13 +19,15 @@ from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import commit_message, message_format
 
 
-def init(
+def init(  # noqa: PLR0913 - what a state repo begins with
     target: Path,
     now: datetime,
     *,
     bare: bool,
     gitops: str,
-    url: str = "",
+    url: str = skeleton.EXAMPLE_URL,
+    example: bool = True,
+    schemas: Mapping[str, str] | None = None,
     signer: Signer | None = None,
 ) -> str:
     """Make a state repo and return its first commit.
@@ -34,17 +36,22 @@ def init(
         target: a folder that does not exist or is empty; else nothing is written.
         bare: make a bare repository, which the generator can use in place.
         gitops: the GitOps controller, ``flux`` or ``argocd``.
-        url: the URL that the clusters fetch from; by default the skeleton's example.
+        url: the URL that the clusters fetch from; without one, no cluster can follow it yet.
+        example: whether it has the fleet and the application of the paper's experiment.
+        schemas: name → JSON Schema of a kind of file that people write; ``schemas/`` gets them.
+        signer: signs the first commit.
 
     Raises:
         StateRepoError: the folder cannot be used.
+        InvalidInput: clusters cannot fetch from ``url``.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise StateRepoError(
             f"{target} exists and is not empty; name a new folder (nothing was changed)"
         )
-    content = skeleton.files(gitops=gitops, url=url)
+    content = skeleton.files(gitops, url, example=example)
+    content |= {f"{SCHEMAS_ROOT}/{name}.json": text for name, text in (schemas or {}).items()}
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         partial = target.with_name(f".{target.name}.partial")

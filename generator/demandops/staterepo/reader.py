@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from pygit2 import Tree
+import pygit2
+from pygit2 import Oid, Tree
 
 from demandops import settings
 from demandops.config.config import Config
+from demandops.decision import rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
+from demandops.field_lines import FieldLines, with_lines
 from demandops.ledger.operations.restoration import Restoration
 from demandops.render.changes.changeset import FileReader
 from demandops.runtime import REAL
@@ -19,6 +23,8 @@ from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.address import connect, is_url
+from demandops.staterepo.git.checkout import LastFetch
+from demandops.staterepo.git.repository import StateRepository
 from demandops.staterepo.history import authorship, commit_log, revisions
 from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.history.commit_log import LogEntry, PathHistory
@@ -33,26 +39,47 @@ from demandops.staterepo.write.slot import Slot
 
 
 class Reader:
-    """An open state repo, at its newest commit."""
+    """An open state repo at its newest commit; a checkout is read at its checked-out commit."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
+        """Read from ``repository`` at ``tip``; if it is a clone, ``slot`` is the clone's slot."""
+        self.repository, self._tip, self._slot = repository, tip, slot
+        self._objects = repository.objects
+
+    @classmethod
+    def of(cls, address: str, *, only_read: bool = True) -> Reader:
         """Open the state repo; a URL is fetched into a clone that is kept."""
-        self._slot: Slot | None = None
-        folder = Path()
-        if is_url(address):
-            self._slot = Slot(settings.data_home(address) / "reader")
-            folder = self._slot.folder
+        slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         try:
-            self.repository = connect(address, folder)
-            self._objects, self._tip = self.repository.objects, self.repository.refresh()
+            repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
+            return cls(repository, repository.refresh(), slot)
         except BaseException:
-            self.close()
+            if slot is not None:
+                slot.close()
             raise
 
     def close(self) -> None:
         """Release the clone."""
         if self._slot is not None:
             self._slot.close()
+
+    def refresh(self) -> str:
+        """Fetch, read from the newest commit from now on, and return it.
+
+        Raises:
+            StateRepoError: if the state repo cannot be reached or read.
+        """
+        try:
+            self._tip = self.repository.refresh()
+        except (pygit2.GitError, KeyError, OSError) as error:
+            raise StateRepoError(f"{self.repository.address} cannot be read: {error}") from None
+        return str(self._tip)
+
+    def beside(self) -> Reader:
+        """Return another reader of the same fetched commits, for another thread."""
+        other = Reader(self.repository, self._tip)
+        other._objects = self.repository.reopened()
+        return other
 
     def refuse_other_render_version(self) -> None:
         """Raise a StateRepoError with the remedy if the repo has another render version."""
@@ -68,27 +95,62 @@ class Reader:
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
         """Load the state in effect at a commit (:func:`state_in_effect.snapshot_at`)."""
-        return state_in_effect.snapshot_at(self._objects, self.commit(revision), progress)
+        commit = self.commit(revision)
+        try:
+            return state_in_effect.snapshot_at(self._objects, commit, progress)
+        except InvalidInput as error:
+            raise InvalidInput(with_lines(error.faults, self.file_reader(commit))) from None
 
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load a commit, with last valid versions of files that are not valid.
+        """Load a commit, with the last valid versions of invalid files.
 
-        Unlike :meth:`snapshot` it does so even if no generator has quarantined them yet.
+        Unlike :meth:`snapshot`, it does not need a generator to have quarantined the files.
         """
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
             return state_in_effect.state_at(self._objects, revision, progress)
 
+    def snapshot_after(self, before: Snapshot) -> Snapshot:
+        """Load the newest commit like :meth:`last_valid_snapshot`, if possible from ``before``."""
+        is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
+        if before.problems or is_recorded:
+            return self.last_valid_snapshot(str(self._tip))
+        return state_in_effect.state_after(self._objects, before, self._tip)
+
     def problems(self, revision: str | None = None) -> tuple[problem_report.Problem, ...]:
-        """Return the problems that the generator reports at a commit."""
-        return problem_report.read(self.file_reader(revision)(problem_report.PATH))
+        """Return the problems that the generator reports at a commit, each with its line."""
+        read = self.file_reader(revision)
+        lines = FieldLines(read)
+        return tuple(
+            replace(one, line=lines.of(one.file, one.field))
+            for one in problem_report.read(read(problem_report.PATH))
+        )
 
     def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
         """Return the problems reported at a commit, else the problems found by loading it."""
         return self.problems(str(snapshot.commit)) or snapshot.problems
+
+    def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
+        """Return the generated files that a generator has yet to write or remove.
+
+        That may be so only after a commit by a person. Files that cannot be rendered do not count:
+        they are problems.
+        """
+        commit = trees.commit_of(self._objects, snapshot.commit)
+        if commit_log.is_by_generator(self._objects, commit):
+            return frozenset()
+        texts = trees.texts(commit.tree, settings.GENERATED_ROOTS)
+        current = {path: text for path, text in texts.items() if not trees.is_readme(path)}
+        try:
+            wanted = rendered_files(snapshot.state, current)
+        except InvalidInput:
+            return frozenset()
+        return frozenset(
+            path for path in {*current, *wanted} if current.get(path) != wanted.get(path)
+        )
 
     def _tree(self, revision: str | None = None) -> Tree:
         return trees.commit_of(self._objects, self.commit(revision)).tree
@@ -137,9 +199,9 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on each commit, oldest first: its files, byte by byte, and signature.
+        """Return a verdict on each commit, oldest first: on its files and its signature.
 
-        With ``whole``, each commit is loaded whole, rather than what differs from the one before.
+        With ``whole``, each commit is loaded whole, not only the differences from the one before.
         """
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
@@ -164,6 +226,20 @@ class Reader:
         changed = trees.differences(self._tree(before), self._tree(after), roots)
         return sorted(path for path, _ in changed)
 
+    def changed_roots(self, commit: str) -> tuple[str, ...]:
+        """Return the top-level files and folders that a commit changed, sorted."""
+        made = trees.commit_of(self._objects, commit)
+        before = {entry.name: entry.id for entry in trees.parent_tree(made) or ()}
+        after = {entry.name: entry.id for entry in made.tree}
+        return tuple(
+            sorted(str(name) for name in {*before, *after} if before.get(name) != after.get(name))
+        )
+
+    def files_changed_by(self, commit: str) -> list[str]:
+        """Return the files that a commit changed, sorted."""
+        made = trees.commit_of(self._objects, commit)
+        return sorted(path for path, _ in trees.differences(trees.parent_tree(made), made.tree))
+
     def changes_node(self, commit: str, node: str) -> bool:
         """Return whether a commit changed a release on a node, or a claim that names the node."""
         return ledger_files.changes_node(self._objects, commit, node)
@@ -186,7 +262,22 @@ class Reader:
 
 
 @contextmanager
-def opened(address: str) -> Iterator[Reader]:
-    """Open a state repo for reading, and close it at the end."""
-    with closing(Reader(address)) as reader:
+def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
+    """Open a state repo, and close it at the end; ``only_read`` also allows a checkout."""
+    with closing(Reader.of(address, only_read=only_read)) as reader:
         yield reader
+
+
+@contextmanager
+def opened_offline(address: str) -> Iterator[Reader | None]:
+    """Open a state repo without the network; None if its URL was never fetched."""
+    if not is_url(address):
+        with opened(address) as found:
+            yield found
+        return
+    clones = sorted((settings.data_home(address) / "reader").glob("slot-*/clone.git"))
+    if not clones:
+        yield None
+        return
+    repository = LastFetch(clones[0])
+    yield Reader(repository, repository.tip())

@@ -3,28 +3,77 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from demandops import strict_yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
-from demandops.config.repo_settings import ROOT_FILE
+from demandops.config.repo_settings import ROOT_FILE, as_git_url
 from demandops.decision import State, rendered_files
 from demandops.ledger.ledger import Ledger
 from demandops.settings import RENDER_VERSION, data_folder
 
+EXAMPLE_URL = "https://git.example/fleet/state-repo.git"
 
-def files(gitops: str = "flux", url: str = "") -> dict[str, str]:
-    """Return path → text of a new state repo; raise if clusters cannot fetch from ``url``."""
+_ENTRIES = re.compile(r"(?ms)^(clusters|nodes|brokers|charts):\n.*")
+_EXPERIMENT = "appdefs/object-detection-fusion/"
+_FIRST_STEP = (
+    " `init` created an example with four vehicles, a station, an edge and a cloud server."
+)
+
+
+def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True) -> dict[str, str]:
+    """Return path → text of a new state repo.
+
+    Args:
+        gitops: the GitOps controller, ``flux`` or ``argocd``.
+        url: the URL that clusters fetch from. Without one no cluster can follow it yet.
+        example: whether it has the fleet and the application of the paper's experiment.
+
+    Raises:
+        InvalidInput: clusters cannot fetch from ``url``.
+    """
     contents = _read(data_folder("skeleton"), "")
     contents |= _read(data_folder("appdefs"), "appdefs/")
+    if not example:
+        contents = _without_example(contents)
     roots = {"flux": contents.pop(ROOT_FILE), "argocd": contents.pop("demandops.argocd.yaml")}
     root = strict_yaml.set_key(roots[gitops], "renderVersion", RENDER_VERSION)
     if url:
-        root = re.sub(r"(?m)^  url: .*$", lambda _: f"  url: {strict_yaml.to_json(url)}", root)
+        line = f"  url: {url if url == EXAMPLE_URL else strict_yaml.to_json(as_git_url(url))}"
+        root = re.sub(r"(?m)^  url: .*$", lambda _: line, root)
+    else:
+        root = re.sub(r"(?m)^flux:\n  url: (.*)$", r"flux:\n  interval: 1m\n  # url: \1", root)
     contents[ROOT_FILE] = root
     config = load({p: text for p, text in contents.items() if p.split("/")[0] in CONFIG_ROOTS})
     return contents | rendered_files(State.of(config, Ledger()))
+
+
+def files_of_library(folder: str) -> dict[str, str]:
+    """Return path → text of a chart of the skeleton that others depend on."""
+    appdefs = _read(data_folder("appdefs"), "appdefs/")
+    return {path: text for path, text in appdefs.items() if path.startswith(f"{folder}/")}
+
+
+def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
+    """Return the skeleton with an empty fleet, without the experiment's application."""
+    found = {
+        path: _ENTRIES.sub(r"\1: []\n", text).replace("charts: []", "charts: {}")
+        if path.startswith(("inventory/", "registry/charts"))
+        else text
+        for path, text in contents.items()
+        if not path.startswith(_EXPERIMENT)
+    }
+    images = found["registry/images.yaml"]
+    start, end = images.index("  object-detection:"), images.index("  # Zenoh connections")
+    found["registry/images.yaml"] = images[:start] + images[end:]
+    policy = "policy/access-domains.yaml"
+    found[policy] = found[policy].replace("perception", "fleet")
+    nodes, example = "inventory/nodes.yaml", " These are examples; replace them\n# with yours."
+    found[nodes] = found[nodes].replace(example, "\n#")
+    found["README.md"] = found["README.md"].replace(_FIRST_STEP, "")
+    return found
 
 
 def _read(folder: Path, prefix: str) -> dict[str, str]:

@@ -23,7 +23,7 @@ from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.ledger.ledger import Ledger
 from demandops.plan.output_topics import with_booked_topics_marked
-from demandops.plan.overrides.lifecycle import update_ledger
+from demandops.plan.override_lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
 from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
@@ -58,7 +58,7 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """The files that an upgrade changes, none if nothing changed; ``commit`` is the newest."""
+    """The files that an upgrade changes; ``commit`` is the newest commit after it."""
 
     commit: str
     old: Config
@@ -87,7 +87,7 @@ def plan(
     now: datetime,
     progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return what an upgrade would change, without writing.
+    """Return the files that an upgrade would change, without writing.
 
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
@@ -151,7 +151,7 @@ def _plan(
     files[ROOT_FILE] = _root(before, old, request)
     config = load(files)
     state = State.of(config, snapshot.state.ledger)
-    # what people changed since the generator's last commit is carried out too
+    # people's changes since the generator's last commit are applied too
     start = state_in_effect.start_at(objects, tip)
     known = start.state
     edited = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, known.ledger)
@@ -245,6 +245,7 @@ def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         ("From-Gitops", old.gitops if switched else ""),
         ("Gitops", new.gitops),
         *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
+        *commit_message.demand_trailers(keys),
         ("Render-Version", str(new.render_version)),
     ]
     files = [f"  {count} in {folder}" for folder, count in sorted(counts.items())]

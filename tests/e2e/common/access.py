@@ -61,6 +61,15 @@ def limited(
     def token() -> str:
         return str(((kube.get("Secret", _ACCOUNT, home) or {}).get("data") or {}).get("token", ""))
 
+    def in_force() -> bool:  # the API server notices new roles a moment later
+        return all(
+            any({*rule["resources"]} <= {*found["resources"]} for found in granted)
+            for namespace, rules in rights.items()
+            for granted in [kube.rules(_ACCOUNT, namespace, home)]
+            for rule in rules
+        )
+
+    kube.wait("the rights", in_force)
     token_text = base64.b64decode(kube.wait("a token", token)).decode()
     config = yaml.safe_load(administrator.read_text())
     config["users"] = [{"name": _ACCOUNT, "user": {"token": token_text}}]

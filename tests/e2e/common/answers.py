@@ -24,7 +24,7 @@ from tests.e2e.rig.cluster import Rig
 TIMEOUT_S = 60.0
 SHORT_S = 6.0
 CHARTS = "appdefs/object-detection-fusion/charts"
-CHART = f"{CHARTS}/object-detection/templates/deployment.yaml"
+CHART = f"{CHARTS}/object-detection/templates/service.yaml"
 _VERSIONS = {
     f"{CHARTS}/object-detection/Chart.yaml": "version: ",
     "registry/charts.yaml": "charts/object-detection\n    version: ",
@@ -120,6 +120,7 @@ class Answers:
         assert {row["health"] for row in status["releases"]} == {"healthy"}
         assert {row["seen"] for row in status["releases"]} == {status["commit"]} == {answer.commit}
         assert all(row["since"] for row in status["releases"]) and len(status["releases"]) == 4
+        assert status["old_bootstraps"] == []
         gone = requester.send({"operation": "release", "demand": "d", "answer": "healthy"})
         assert gone.reached == "healthy"
         assert domain.find(domain.RELEASE) == [] and domain.find("Deployment") == []

@@ -12,7 +12,6 @@ root file system in that folder (``deploy/fresh-root``).
 
 from __future__ import annotations
 
-import base64
 import os
 import signal
 import subprocess
@@ -22,6 +21,8 @@ from typing import Any
 
 from tests.e2e.rig import launch
 from tests.e2e.rig.kube import Kube, Manifest
+
+from .volumes import files
 
 ROOT = Path(__file__).parents[3]
 IMAGE_VARIABLE = "E2E_IMAGE_ROOT"
@@ -175,38 +176,11 @@ class Pod:
         mode = 0o644
         if secret := volume.get("secret"):
             mode = secret["defaultMode"] | 0o440
-        for name, content in self._files(volume):
+        account = self.manifest["spec"]["serviceAccountName"]
+        for name, content in files(self._kube, self._namespace, account, volume).items():
             file = folder / name
             file.unlink(missing_ok=True)
             file.write_bytes(content)
             file.chmod(mode)
             os.chown(file, 0, group)
         return folder
-
-    def _files(self, volume: dict[str, Any]) -> list[tuple[str, bytes]]:
-        if secret := volume.get("secret"):
-            data = self._data("Secret", secret["secretName"])
-            return [(key, base64.b64decode(value)) for key, value in data.items()]
-        if config := volume.get("configMap"):
-            data = self._data("ConfigMap", config["name"])
-            return [(key, value.encode()) for key, value in data.items()]
-        if projected := volume.get("projected"):
-            return [file for source in projected["sources"] for file in self._projected(source)]
-        assert volume.keys() == {"name", "emptyDir"} or "persistentVolumeClaim" in volume, volume
-        return []
-
-    def _projected(self, source: dict[str, Any]) -> list[tuple[str, bytes]]:
-        if wanted := source.get("serviceAccountToken"):
-            account = self.manifest["spec"]["serviceAccountName"]
-            return [(wanted["path"], self._kube.token(account, self._namespace).encode())]
-        if config := source.get("configMap"):
-            data = self._data("ConfigMap", config["name"])
-            return [(item["path"], data[item["key"]].encode()) for item in config["items"]]
-        (item,) = source["downwardAPI"]["items"]
-        assert item["fieldRef"]["fieldPath"] == "metadata.namespace"
-        return [(item["path"], self._namespace.encode())]
-
-    def _data(self, kind: str, name: str) -> dict[str, str]:
-        found = self._kube.get(kind, name, self._namespace)
-        assert found is not None, f"{kind} {name}"
-        return dict(found.get("data") or {})

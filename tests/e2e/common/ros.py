@@ -19,8 +19,13 @@ class Client(ros.Client):
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
-        self._thread = threading.Thread(target=self.executor.spin, daemon=True)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
+
+    def _spin(self) -> None:
+        while not self._over.is_set():
+            self.executor.spin_once()
 
     def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
         end = time.monotonic() + seconds
@@ -44,6 +49,7 @@ class Client(ros.Client):
         return under_way
 
     def close(self) -> None:
-        self.executor.shutdown(timeout_sec=1)
-        self._thread.join(5)
+        self._over.set()
+        self.executor.create_task(lambda: None)  # wakes it
+        self._thread.join(DEADLINE_S)
         super().close()

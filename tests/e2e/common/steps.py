@@ -189,7 +189,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 def _autoscaled(world: World) -> dict[str, str | None]:
     """Return the application with autoscalers; the fusion's chart names a number all the same."""
     chart, registry = f"{CHART}/Chart.yaml", "registry/charts.yaml"
-    deployment = f"{CHART}/templates/deployment.yaml"
+    deployment = "appdefs/charts/ros-service/templates/_deployment.yaml"
     named = re.sub(
         r"  \{\{- if not \.Values\.autoscaler \}\}\n(.*\n)  \{\{- end \}\}\n",
         r"\1",

@@ -19,7 +19,7 @@ from .world import World
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "lane-detection"
 APPDEF = "appdefs/object-detection-fusion"
-CHART = {"folder": "appdefs/lane-detection/charts/ros-launch", "version": "0.1.0"}
+CHART = {"folder": "appdefs/lane-detection/charts/ros-launch", "version": "0.2.0"}
 NODES = "inventory/nodes.yaml"
 
 PLANNER = "plan-edge-object-detection-fusion-440d666b5404"
@@ -39,7 +39,7 @@ def test_four_services_on_three_nodes_serve_two_vehicles(
 ) -> None:
     domain = world.domain
     world.push(definitions(world))
-    at_first = domain.inventory() | {"HelmChart ros-launch-0.1.0"}  # of the next commit
+    at_first = domain.inventory() | {"HelmChart ros-launch-0.2.0"}  # of the next commit
     put(world, requester, "vehicle00", "vehicle01")
     assert_exact(domain, "vehicle00", "vehicle01")
     before = domain.pods()
@@ -93,7 +93,9 @@ def definitions(world: World) -> dict[str, str | None]:
 PLANNER_VALUES = """\
 replicas: {{ replicas }}
 image: {{ images["planner"] }}
-node: {{ node }}
+nodeSelector: {{ node.selector }}
+tolerations: {{ node.tolerations }}
+hostNetwork: {{ node.host_network }}
 launch:
   package: planner
   file: planner.launch.py

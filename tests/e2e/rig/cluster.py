@@ -156,9 +156,7 @@ class Rig:
 
     def helm(self, *arguments: str) -> str:
         """Run the helm command on this cluster and return what it prints."""
-        helm = self._binaries.get("helm") or shutil.which("helm")
-        if helm is None:
-            helm = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
+        helm = self.helm_program()
         # The kubeconfig of an existing cluster may call a login command that needs the environment.
         clean = self._work.environment() if self._work and not self.existing else dict(os.environ)
         environment = clean | {"KUBECONFIG": str(self.kubeconfig)}
@@ -168,6 +166,13 @@ class Rig:
         if done.returncode != 0:
             raise RigError(f"helm {' '.join(arguments)}: {done.stderr.strip()}")
         return done.stdout
+
+    def helm_program(self) -> Path:
+        """Return the helm command; it is built first if need be."""
+        found = self._binaries.get("helm") or shutil.which("helm")
+        if found is None:
+            found = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
+        return Path(found)
 
     # --- single parts -----------------------------------------------------------------------
 

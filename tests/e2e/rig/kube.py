@@ -139,9 +139,9 @@ class Kube:
         call: Any = CoreV1Api(self.api).create_namespaced_service_account_token
         return str(call(account, namespace, {"spec": {"expirationSeconds": 3607}}).status.token)
 
-    def rules(self, account: str, namespace: str) -> list[Manifest]:
-        """Return what a service account may do in its namespace."""
-        who = f"system:serviceaccount:{namespace}:{account}"
+    def rules(self, account: str, namespace: str, home: str = "") -> list[Manifest]:
+        """Return what a service account of ``home`` may do in a namespace, by default its own."""
+        who = f"system:serviceaccount:{home or namespace}:{account}"
         api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)
         call: Any = AuthorizationV1Api(api).create_self_subject_rules_review
         review = api.sanitize_for_serialization(call({"spec": {"namespace": namespace}}))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from demandops.service.approvals import approvals
+from demandops.service.approvals import check_timer
 
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
@@ -38,7 +38,7 @@ def http(server: Server) -> str:
 @pytest.fixture
 def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
     """A person who approves demands, at a generator that looks often."""
-    monkeypatch.setattr(approvals, "CHECK_EMBEDDED_S", 0.05)
-    monkeypatch.setattr(approvals, "CHECK_REMOTE_S", 0.1)
+    monkeypatch.setattr(check_timer, "CHECK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(check_timer, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")
     return person

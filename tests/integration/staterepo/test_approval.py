@@ -350,7 +350,7 @@ def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
     from datetime import datetime
 
     term = datetime.fromisoformat(end) - datetime.fromisoformat(began)
-    assert 598 <= term.total_seconds() <= 601
+    assert 540 <= term.total_seconds() <= 601
     assert rig.commits(bare)[-1].one("Operation") == "follow"
 
 

@@ -21,6 +21,8 @@ from demandops.staterepo.git.repository import (
     StateRepository,
     disk_error,
 )
+from demandops.staterepo.git.tree import commit_of
+from pygit2 import Oid, Repository
 
 from tests.kit import rig
 from tests.kit.limits import files_end_at
@@ -292,6 +294,39 @@ def test_a_damaged_clone_is_made_anew(
     with rig.running(url, data=data) as generator:
         assert rig.book(generator, goal(2))[0].outcome == "booked"
     rig.assert_sound(bare)
+
+
+def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        head = generator._slot.folder / "clone.git" / "HEAD"
+        away = head.rename(head.with_name("HEAD.away"))
+        ticket = generator.submit(goal(2))
+        rig.wait_until(lambda: f"its clone {head.parent} cannot be read" in caplog.text, "it says")
+        assert not ticket.future.done()
+        away.rename(head)
+        assert rig.receipt(ticket).outcome == "booked"
+    rig.assert_sound(bare)
+
+
+def test_a_demand_is_booked_although_what_was_packed_cannot_be_cleaned_up(
+    address: str, bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object, **options: object) -> None:
+        raise PermissionError(errno.EACCES, "of the folder itself")
+
+    with rig.running(address) as generator:
+        monkeypatch.setattr(shutil, "rmtree", fail)
+        assert rig.book(generator, goal(1))[0].outcome == "booked"
+        monkeypatch.undo()
+    rig.assert_sound(bare)
+
+
+def test_a_commit_that_is_not_there_is_no_mistake_of_a_person(bare: Path) -> None:
+    with pytest.raises(StateRepoError, match=r"a{40} cannot be read; check the disk"):
+        commit_of(Repository(str(bare)), Oid(hex="a" * 40))
 
 
 def test_what_people_push_beside_a_damaged_clone_is_followed(

@@ -420,19 +420,22 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
         rig.book(generator, goal(1))
         made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
         followed(bare, made)
+    text = rig.git(bare, "show", f"main:{NODES}")
+    line = text[: text.index("c-itz")].count("\n") + 1
     problem = (
-        f"{NODES}: nodes[0].cluster: 'c-itz' is not in clusters.yaml; "
+        f"{NODES}:{line}: nodes[0].cluster: 'c-itz' is not in clusters.yaml; "
         f"did you mean 'c-its'? (since {made[:10]} by Petra Platform <petra@example.org>)"
     )
     capsys.readouterr()
-    assert run(["status", "--state-repo", str(bare)]) == 0
-    out = capsys.readouterr().out
+    assert run(["status", "--state-repo", str(bare)]) == 1
+    out, err = capsys.readouterr()
+    assert err.splitlines()[-1] == "not well: problems in files: 1"
     assert out.splitlines()[:2] == [
         "1 problem; of each file the last valid version is in effect:",
         f"  {problem}",
     ]
     assert "of-edge-fusion-1" in out
-    assert run(["status", "--state-repo", str(bare), "--output", "json"]) == 0
+    assert run(["status", "--state-repo", str(bare), "--output", "json"]) == 1
     (told,) = json.loads(capsys.readouterr().out)["faults"]
     assert (told["file"], told["field"], told["since"]) == (NODES, "nodes[0].cluster", made)
     assert run(["bookkeeping", "--state-repo", str(bare)]) == 0

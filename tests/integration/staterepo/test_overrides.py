@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.errors import InvalidInput, Refused
-from demandops.service import Generator, Receipt
+from demandops.service import Generator, Receipt, rollback_goal
 
 from tests.kit import rig
 from tests.kit.clock import Clock
@@ -102,17 +102,51 @@ def test_a_service_is_moved_and_comes_back(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1))
-    moved = "clusters/c-its/perception/cloud/od-edge-station00.yaml"
+    moved = "clusters/c-its/perception/cloud/od-cloud-station00.yaml"
     person.override(moved=override(WATCHED, node="cloud"))
     next_demand(generator)
     assert file(bare, DETECTION) == ""
     spec = parsed(bare, moved)["spec"]
     assert spec["values"]["nodeSelector"] == {"node_id": "cloud"}
-    assert rig.books(bare)["services"]["od-edge-station00"]["node"] == "cloud"
+    assert rig.books(bare)["services"]["od-cloud-station00"]["node"] == "cloud"
     person.override(moved=None)
     next_demand(generator, 101)
     assert file(bare, moved) == ""
     assert file(bare, DETECTION)
+    rig.assert_sound(bare)
+
+
+def test_the_connections_of_a_demand_follow_a_moved_service_also_through_a_rollback(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    goal = {
+        "kind": "Demand",
+        "demand": "perception",
+        "requesters": ["vehicle00"],
+        "applications": [
+            {
+                "id": "fusion",
+                "type": "object-detection-fusion",
+                "node": "edge",
+                "inputs": {"point_cloud": [{"topic": "/points", "source": "vehicle00"}]},
+            }
+        ],
+    }
+    rig.book(generator, goal)
+    plain = rig.books(bare)["connections"]
+    before = rig.tip(bare)
+    cause = person.override(away=override({"services": ["object-fusion"]}, node="cloud"))
+    next_demand(generator)
+    moved = rig.books(bare)["connections"]
+    assert {*moved} - {*plain} > {"derived/edge/cloud"}
+    assert "perception" in follow_of(bare, cause).all("Demand-Id")
+    who = ("A", "a@example.org")
+    rolled = rollback_goal.goal(before, drop_newer=True, reason="x", who=who)
+    assert rig.receipt(generator.submit(rolled)).outcome == "restored"
+    assert "derived/edge/cloud" in rig.books(bare)["connections"], "the override is still there"
+    person.override(away=None)
+    next_demand(generator, 2)
+    assert "derived/edge/cloud" not in rig.books(bare)["connections"]
     rig.assert_sound(bare)
 
 

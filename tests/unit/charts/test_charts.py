@@ -1,12 +1,11 @@
-"""The charts of object detection and fusion, as far as they can be judged without Helm.
+"""The charts and their library, as far as they can be judged without Helm.
 
-Schemas and default values are checked here against each other. tests/golden holds the values that
-the generator gives; what the charts render is checked with the real Helm in tests/e2e.
+Schemas, default values and READMEs are checked here against each other. tests/golden holds the
+values that the generator gives; what the charts render is checked with the real Helm in tests/e2e.
 """
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 from collections.abc import Iterator
@@ -16,17 +15,22 @@ from typing import Any
 import jsonschema_rs
 import pytest
 import yaml
+from demandops.charts import chart_files
+from demandops.charts.chart_files import merged
+from demandops.config.load import load
+from demandops.errors import InvalidInput
 
-from tests.kit.config import edited
-from tests.kit.goals import EGO, application, goal
+from tests.kit.config import configuration, edited, skeleton
+from tests.kit.goals import application, goal
 from tests.kit.memory import MemoryRepo
+from tests.unit.charts import write
 
 APPDEF = Path(__file__).parents[3] / "appdefs" / "object-detection-fusion"
 CHARTS = ("object-detection", "object-fusion")
 
 
 def chart_values(chart: str) -> dict[str, Any]:
-    return dict(yaml.safe_load((APPDEF / "charts" / chart / "values.yaml").read_text("utf-8")))
+    return chart_files.defaults(f"appdefs/{APPDEF.name}/charts/{chart}", skeleton())
 
 
 def chart_schema(chart: str) -> dict[str, Any]:
@@ -38,17 +42,9 @@ def faults(chart: str, values: dict[str, Any]) -> list[str]:
     return [error.message for error in validator.iter_errors(values)]
 
 
-def merged(defaults: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Lay ``values`` over a chart's defaults as Helm does: maps are united, lists replaced."""
-    result = copy.deepcopy(defaults)
-    for key, value in values.items():
-        both_maps = isinstance(value, dict) and isinstance(result.get(key), dict)
-        result[key] = merged(result[key], value) if both_maps else value
-    return result
-
-
 def templates(chart: str) -> dict[str, str]:
-    folder = APPDEF / "charts" / chart / "templates"
+    folder = write.LIBRARY if chart == "ros-service" else APPDEF / "charts" / chart
+    folder /= "templates"
     return {path.name: path.read_text("utf-8") for path in sorted(folder.iterdir())}
 
 
@@ -88,24 +84,74 @@ def test_every_object_of_the_schema_is_closed(chart: str) -> None:
 
 
 @pytest.mark.parametrize("chart", CHARTS)
-def test_every_value_is_listed_and_commented(chart: str) -> None:
-    assert set(chart_values(chart)) == set(chart_schema(chart)["properties"])
-    lines = (APPDEF / "charts" / chart / "values.yaml").read_text("utf-8").splitlines()
-    top = [number for number, line in enumerate(lines) if re.match(r"[a-zA-Z]+:", line)]
-    described = ("image:", "ros:", "detection:", "fusion:", "watcher:", "serviceAccount:")
-    bare = [
-        lines[number]
-        for number in top
-        if not lines[number - 1].startswith("#") and not lines[number].startswith(described)
-    ]
-    assert bare == []
+def test_every_value_is_in_the_schema(chart: str) -> None:
+    assert {*chart_values(chart), "ros-service", "global"} == {*chart_schema(chart)["properties"]}
 
 
-def test_the_charts_share_their_ros_helpers_and_definitions() -> None:
-    first, second = CHARTS
-    for name in ("_ros.tpl", "serviceaccount.yaml"):
-        assert templates(first)[name] == templates(second)[name]
-    assert chart_schema(first)["definitions"] == chart_schema(second)["definitions"]
+@pytest.mark.parametrize("chart", [write.LIBRARY, *write.CHARTS], ids=lambda chart: chart.name)
+def test_every_value_is_described_in_a_table(chart: Path) -> None:
+    text = (chart / "README.md").read_text()
+    assert text == write.readme(chart), "run python -m tests.unit.charts.write"
+    rows = re.findall(r"^\| ([\w.]+) \| \w+ \| `.*` \| (.*) \|$", text, re.MULTILINE)
+    assert len(rows) >= 4
+    assert all(description.endswith(".") for _, description in rows)
+
+
+@pytest.mark.parametrize("chart", write.CHARTS, ids=lambda chart: chart.name)
+def test_a_schema_has_what_the_library_has(chart: Path) -> None:
+    text = (chart / "values.schema.json").read_text()
+    assert text == write.schema(chart), "run python -m tests.unit.charts.write"
+
+
+def undescribed(schema: dict[str, Any], path: str = "") -> Iterator[str]:
+    """Yield each property of a schema that has no description, and no parts that have."""
+    for name, one in schema["properties"].items():
+        if "description" not in one and "properties" in one:
+            yield from undescribed(one, f"{path}{name}.")
+        elif "description" not in one and name not in ("ros-service", "global"):
+            yield path + name
+
+
+@pytest.mark.parametrize("chart", write.CHARTS, ids=lambda chart: chart.name)
+def test_every_property_of_a_schema_has_a_description(chart: Path) -> None:
+    schema = json.loads((chart / "values.schema.json").read_text())
+    assert [*undescribed(schema)] == []
+
+
+METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
+
+
+@pytest.mark.parametrize(
+    ("path", "old", "new", "told"),
+    [
+        (
+            METADATA,
+            "file://../../../charts/ros-service",
+            "file://../ros-service",
+            "dependencies[0].repository: 'file://../ros-service': "
+            "'appdefs/object-detection-fusion/charts/ros-service/Chart.yaml' does not exist; "
+            "correct the path, which starts at the chart and stays in appdefs/",
+        ),
+        (
+            METADATA,
+            "file://../../../charts/ros-service",
+            "file://../../../../other/ros-service",
+            "dependencies[0].repository: 'file://../../../../other/ros-service': that does not "
+            "exist; correct the path, which starts at the chart and stays in appdefs/",
+        ),
+        (
+            METADATA,
+            "ros-service\n    version: 1.0.0",
+            "ros-service\n    version: 0.2.0",
+            "dependencies[0].version: is 0.2.0, but appdefs/charts/ros-service/Chart.yaml says "
+            "1.0.0; make them equal",
+        ),
+    ],
+)
+def test_a_library_that_is_not_there_is_a_fault(path: str, old: str, new: str, told: str) -> None:
+    with pytest.raises(InvalidInput) as invalid:
+        load(configuration(edited(path, old, new)))
+    assert [str(fault) for fault in invalid.value.faults] == [f"{METADATA}: {told}"]
 
 
 @pytest.mark.parametrize(
@@ -136,6 +182,8 @@ def test_the_charts_share_their_ros_helpers_and_definitions() -> None:
         ("object-detection", "securityContext.capabilities.dropped", ["ALL"]),
         ("object-detection", "workspaceSetup", ["setup.bash"]),
         ("object-detection", "workspaceSetup", ["--"]),
+        ("object-detection", "runtimeClassName", "Not A Name"),
+        ("object-detection", "commonLabels.team", 7),
         ("object-fusion", "fusion.useSimtime", True),
         ("object-fusion", "fusion.useSimTime", "true"),
         ("object-fusion", "inputs.egodata", []),
@@ -166,6 +214,10 @@ def test_values_that_people_override_are_accepted(chart: str) -> None:
         "probes": {"startup": None, "liveness": {"exec": {"command": ["true"]}}},
         "resources": {"limits": {"nvidia.com/gpu": 1}},
         "podLabels": {"example.org/team": "perception"},
+        "commonLabels": {"example.org/team": "perception"},
+        "fullnameOverride": "detection",
+        "priorityClassName": "high",
+        "runtimeClassName": "nvidia",
     }
     assert faults(chart, merged(chart_values(chart), change)) == []
 
@@ -178,29 +230,21 @@ def test_a_topic_of_two_sources_is_read_once() -> None:
     assert release["spec"]["values"]["inputs"]["egoData"] == ["/A", "/a"]
 
 
-def test_a_definition_may_take_simulated_time_as_a_parameter() -> None:
-    parameter = "parameters: {use_sim_time: {default: false}}\nservices:\n"
-    repo = MemoryRepo(edited(f"appdefs/{APPDEF.name}/appdef.yaml", "services:\n", parameter))
-    repo.send(goal([application(ego=[EGO], clouds=[])]))
-    (release,) = repo.objects("HelmRelease").values()
-    assert release["spec"]["values"]["fusion"]["useSimTime"] is False
-
-
 def test_inputs_reach_one_configmap_and_nothing_else() -> None:
     users = {name for name, text in templates("object-fusion").items() if ".Values.inputs" in text}
     assert users == {"params-configmap.yaml"}
 
 
-@pytest.mark.parametrize("chart", CHARTS)
+@pytest.mark.parametrize("chart", (*CHARTS, "ros-service"))
 def test_no_template_knows_revision_or_chart_version(chart: str) -> None:
     forbidden = re.compile(r"\.Release\.(Revision|IsUpgrade|IsInstall)|\.Chart\.Version")
     assert [name for name, text in templates(chart).items() if forbidden.search(text)] == []
 
 
-@pytest.mark.parametrize("chart", CHARTS)
+@pytest.mark.parametrize("chart", (*CHARTS, "ros-service"))
 def test_nothing_is_glued_into_a_shell_script(chart: str) -> None:
     for name, text in templates(chart).items():
         scripts = re.findall(r'"-c",? (.+)', text) + re.findall(r'\$check := "(.*)" -', text)
         assert all("{{" not in script for script in scripts), name
-    text = templates(chart)["_ros.tpl"]
-    assert text.count("/bin/bash") == 2  # the start of a container and the probe
+    shells = sum(text.count("/bin/bash") for text in templates(chart).values())
+    assert shells == (2 if chart == "ros-service" else 0)  # the start of a container and the probe

@@ -63,7 +63,8 @@ def test_a_file_that_cannot_be_used_is_told_with_field_and_remedy(
         secret_file.chmod(mode)
     with pytest.raises(InvalidInput) as caught:
         access.read(file)
-    assert str(caught.value) == f"{file}: {message.replace('SECRET', str(secret_file))}"
+    place = f"{file}:3" if message.startswith("clusters.") else file
+    assert str(caught.value) == f"{place}: {message.replace('SECRET', str(secret_file))}"
 
 
 @pytest.fixture

@@ -120,7 +120,7 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "an endpoint that needs certificates": (
         NODES, V1, V1 + "    zenoh: {endpoint: tls/vehicle01:7447}\n",
     ),
-    "listening where nobody connects": (
+    "listening without an endpoint": (
         NODES, V1, V1 + '    zenoh: {listen: ["tcp/0.0.0.0:7447"]}\n',
     ),
     "two bridges on one host": (
@@ -150,7 +150,7 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "a cluster in capitals": (NODES, "cluster: c-its", "cluster: C-ITS"),
     "a node twice": (NODES, "id: vehicle01", "id: vehicle00"),
     "a node that is a number": (NODES, "id: vehicle01", "id: 5"),
-    "a text for a truth": (NODES, V1, f'{V1}    hostNetwork: "yes"\n'),
+    "text instead of true or false": (NODES, V1, f'{V1}    hostNetwork: "yes"\n'),
     # inventory/brokers.yaml
     "a misspelt node of a broker": (BROKERS, "node: cloud", "node: clod"),
     "two brokers on a node": (BROKERS, "node: cloud", "node: edge"),
@@ -183,7 +183,7 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "an input of other topics than each": (
         APPDEF, "each: point_cloud\n", "each: point_cloud\n    inputs: {ego_data: ego_data}\n",
     ),
-    "each of what is made once": (
+    "each topic of an output that is made once": (
         APPDEF,
         "services:\n",
         "services:\n  planner:\n    prefix: pl\n    each: lists\n"
@@ -201,6 +201,7 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "a shared service that does not exist": (
         APPDEF, "services:\n", "uses:\n  lidar-driver: {cloud: point_cloud}\nservices:\n",
     ),
+    "a node for a service of each topic": (APPDEF, "prefix: od\n", "prefix: od\n    place: {}\n"),
     "a source for an application": (APPDEF, "prefix: of\n", "prefix: of\n    placement: source\n"),
     "an output that does not exist": (
         APPDEF, "object-detection.object_list", "object-detection.objects",
@@ -265,7 +266,7 @@ _SCALING: dict[str, str] = {
     "an autoscaler without a target": "{max: 4, autoscaler: {}}",
     "an autoscaler of none": "{min: 0, max: 4, autoscaler: {cpu: 70}}",
     "replicas that publish twice": "{min: 2, max: 2}",
-    "an autoscaler of what publishes": "{max: 4, autoscaler: {cpu: 70}}",
+    "an autoscaler of a service that publishes": "{max: 4, autoscaler: {cpu: 70}}",
 }
 """Scalings that a service which publishes cannot have."""
 
@@ -333,6 +334,9 @@ MISTAKES: dict[str, Mapping[str, str | None]] = {
     "a shared service for each topic of an unknown input": shared(("each: cloud", "each: clouds")),
     "a shared service at the source of an application": shared(
         ("each: cloud\n", ""), ("scope: topic", "scope: application")
+    ),
+    "a shared service on a node that it chooses": shared(
+        ("scope: topic\n", "scope: node\nplace: {role: edge}\n"), ("each: cloud\n", "")
     ),
     "a shared service for a cluster": shared(("scope: topic", "scope: cluster")),
     "a shared service at the sources of nothing": shared(

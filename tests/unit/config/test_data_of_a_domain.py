@@ -107,7 +107,7 @@ SHARED = (
     "ros.domainId"
 )
 CLOSED = (
-    f"{DOMAINS}: network: namespace of access domain 'fleet' does not hold for pods with the "
+    f"{DOMAINS}: network: namespace of access domain 'fleet' has no effect on pods with the "
     "host's network, as on 'vehicle00', 'vehicle01', 'vehicle02' and 1 more; set hostNetwork: "
     "false for these nodes, or separate their network yourself"
 )

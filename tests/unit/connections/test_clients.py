@@ -16,7 +16,7 @@ from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
 from demandops.decision import Decision, State, rendered_files
 from demandops.errors import InvalidInput, Refused
-from demandops.ledger.ledger import changes_on
+from demandops.ledger.claim_changes import changes_on
 from demandops.plan.release_keys import affected_keys
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
@@ -270,8 +270,8 @@ class TestWhatPeopleDidInGit:
 
     def test_an_option_that_the_type_cannot_honour(self) -> None:
         assert self.after("zenoh", Route("/a", "/a", qos=1)) == [
-            "connections: 'c': qos of '/a' is not supported by ZENOH; leave it out, or use type "
-            "1 (MQTT)"
+            "connections: 'c': qos of '/a' is not supported by ZENOH; leave it out, or use "
+            "type MQTT"
         ]
 
     def test_another_name(self) -> None:

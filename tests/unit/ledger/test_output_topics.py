@@ -9,8 +9,8 @@ import pytest
 import yaml
 from demandops.decision import faults_of_edit
 from demandops.demand.claim import Claim
+from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.claim_file import path_of
-from demandops.ledger.ledger import ClaimChange
 from demandops.ledger.operations.restoration import Restoration
 from demandops.plan.output_topics import with_booked_topics_marked
 

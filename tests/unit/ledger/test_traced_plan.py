@@ -7,12 +7,13 @@ from random import Random
 
 from demandops.config.config import Config
 from demandops.decision import Decision
-from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys
-from demandops.plan.traced_plan import TracedPlan
+from demandops.plan.views.traced_plan import TracedPlan
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -35,7 +35,7 @@ def text() -> str:
             (name, of_overrides.refused(changed)) for name, changed in of_overrides.MISTAKES.items()
         ),
         "goals": ((name, _refusal(goal)) for name, goal in of_goals.REFUSED.items()),
-        "goals that contradict the books": (
+        "goals that contradict the ledger": (
             (name, _refusal(goal, before=standing)) for name, goal in of_goals.CONTRADICTING.items()
         ),
         "connections": (

@@ -11,7 +11,7 @@ from demandops.errors import Fault, InvalidInput
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 
-from tests.kit.config import configuration
+from tests.kit.config import configuration, edited
 
 VALID: dict[str, Any] = {
     "apiVersion": "demandops/v1",
@@ -51,6 +51,11 @@ _FIELDS: dict[str, dict[str, Any]] = {
     "deny and more": {"deny": True, "version": "0.1.0"},
     "hold and more": {"hold": True, "values": {"a": 1}},
     "a connection moved": {"select": [{"connections": ["*"]}], "replicas": None, "node": "cloud"},
+    "a service moved for some": {
+        "select": [{"services": ["object-fusion"], "requesters": ["v"]}],
+        "replicas": None,
+        "node": "cloud",
+    },
     "a service kept": {"replicas": None, "keep": True},
     "no time": {"expires": "tomorrow"},
     "a time without zone": {"expires": "2026-01-31T12:00:00"},
@@ -64,6 +69,7 @@ _FIELDS: dict[str, dict[str, Any]] = {
 }
 
 
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 DOMAINS = """\
 apiVersion: demandops/v1
 kind: AccessDomains
@@ -77,6 +83,10 @@ MISTAKES: dict[str, dict[str, str]] = {
     },
     "a node in no access domain": {
         "policy/access-domains.yaml": DOMAINS,
+        "overrides/a.yaml": text(node="cloud"),
+    },
+    "a service at its source moved": {
+        **edited(APPDEF, "prefix: od\n", "prefix: od\n    placement: source\n"),
         "overrides/a.yaml": text(node="cloud"),
     },
     "a tie": {

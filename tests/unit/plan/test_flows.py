@@ -5,9 +5,11 @@ The configurations are made by chance: some services shared, some not, at any de
 
 from __future__ import annotations
 
+import copy
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from random import Random
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import yaml
@@ -15,7 +17,7 @@ from demandops.decision import rendered_files
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey, all_keys
-from demandops.plan.traced_plan import TracedPlan
+from demandops.plan.views.traced_plan import TracedPlan
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,6 +29,8 @@ ROLES = ("a", "b")
 TYPES = ("one", "two")
 SOURCES = ("vehicle00", "vehicle01", "edge")
 NODES = ("edge", "cloud", "vehicle01")
+CLUSTER_NODE = "cloud"
+"""Where services run that a cluster has once."""
 
 
 class Origin(NamedTuple):
@@ -44,8 +48,9 @@ class Origin(NamedTuple):
 class Graphs:
     """Two types of applications of services that read each other, made by chance."""
 
-    def __init__(self, random: Random) -> None:
-        self.random = random
+    def __init__(self, random: Random, place: Mapping[str, Any] | None = None) -> None:
+        """Make them; some services for applications have what ``place`` has."""
+        self.random, self._place = random, dict(place or {})
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
         self.files: dict[str, str | None] = {**brokers("edge")}
         roles = [Origin(role, frozenset({role}), "source") for role in ROLES]
@@ -82,7 +87,8 @@ class Graphs:
         self, origins: list[Origin], scope: str, at_source: bool, root: str
     ) -> list[Origin]:
         """Return what a service may read beside what it runs for."""
-        found = [one for one in origins if not (at_source and one.kind == "topic")]
+        apart = at_source or scope == "cluster"
+        found = [one for one in origins if not (apart and one.kind == "topic")]
         if scope == "topic":
             return [one for one in found if not one.roots or root in one.roots]
         return found
@@ -125,6 +131,9 @@ class Graphs:
         if self.random.random() < 0.5:
             read = self._chosen(origins, least=1)
             service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
+            service |= (
+                copy.deepcopy(self._place) if self._place and self.random.random() < 0.8 else {}
+            )
             self._add(type, name, "application", False, read)
         else:
             at_source = self.random.random() < 0.5
@@ -137,11 +146,13 @@ class Graphs:
         self._appdefs[type]["services"][name] = service
 
     def _share(self, name: str) -> None:
-        scope = self.random.choice(["topic", "topic", "node", "application"])
-        at_source = scope != "application" and self.random.random() < 0.5
+        scope = self.random.choice(["topic", "topic", "node", "application", "cluster"])
+        at_source = scope in ("topic", "node") and self.random.random() < 0.5
         definition = self._service(name, name) | {"scope": scope, "name": name}
+        definition |= {"nodes": {"c-its": CLUSTER_NODE}} if scope == "cluster" else {}
+        definition |= copy.deepcopy(self._place) if scope == "application" else {}
         definition |= {"placement": "source" if at_source else "application"}
-        first = self._each(self._common, TYPES[0], at_source)
+        first = self._each(self._common, TYPES[0], at_source or scope == "cluster")
         count = self.random.randint(0, 1)
         made = []
         for type in TYPES:
@@ -201,26 +212,38 @@ class Demands:
         return [{"output": f"{name}.out", "node": "station00"} for name in chosen]
 
 
-def instances(graphs: Graphs, app: dict[str, Any]) -> Iterator[ServiceKey]:
-    """Yield the services that must run for an application as a demand has it."""
+def instances(
+    graphs: Graphs, app: dict[str, Any], moved: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[ServiceKey]:
+    """Yield the services that must run for an application as a demand has it.
+
+    ``moved`` are services that are not on its node.
+    """
     for name, service in graphs.services[app["type"]].items():
+        own = moved.get(name, app["node"])
         if service["scope"] == "application":
-            yield ServiceKey(name, app["node"], application=app["id"])
+            yield ServiceKey(name, own, application=app["id"])
         elif service["scope"] == "node" and not service["at_source"]:
-            yield ServiceKey(name, app["node"])
+            yield ServiceKey(name, own)
+        elif service["scope"] == "cluster":
+            yield ServiceKey(name, CLUSTER_NODE, for_cluster=True)
         for one in (one for role in service["roots"] for one in app["inputs"].get(role, ())):
             topic, source = one["topic"], one["source"]
-            node = source if service["at_source"] else app["node"]
+            node = source if service["at_source"] else own
             if service["scope"] == "topic":
                 yield ServiceKey(name, node, source=source, topic=topic)
             else:
                 yield ServiceKey(name, node)
 
 
-def delivered(demands: Demands, services: list[ServiceRelease]) -> Iterator[tuple[str, str]]:
+def delivered(
+    repo: MemoryRepo, demands: Demands, services: list[ServiceRelease]
+) -> Iterator[tuple[str, str]]:
     """Yield topic and node of what is delivered: what a demand's own inputs are made into."""
     for app in (app for apps in demands.held.values() for app in apps):
-        wanted = {*instances(demands.graphs, app)}
+        booked = repo.state.ledger.application(app["id"])
+        assert booked is not None
+        wanted = {*instances(demands.graphs, app, {**booked.services, **booked.moved})}
         for delivery in app["deliver"]:
             name = delivery["output"].partition(".")[0]
             for one in services:
@@ -249,7 +272,7 @@ def assert_every_topic_comes_in_one_way(repo: MemoryRepo, demands: Demands) -> N
         for topics in one.inputs.values()
         for topic in topics
     }
-    read |= {*delivered(demands, services)}
+    read |= {*delivered(repo, demands, services)}
     for topic, node in read:
         ways = [source for source, name, target in brought if (name, target) == (topic, node)]
         ways += [node] if (node, topic) in made else []

@@ -13,11 +13,13 @@ import yaml
 from demandops.config.config import Config
 from demandops.config.inventory import Node, Position
 from demandops.config.policy import AccessDomain, Rule
-from demandops.demand.application import Application, InputTopic
-from demandops.demand.demand_request import Demanded, Put, Requirement, place_in
+from demandops.demand.application import Application, InputTopic, Requirement
+from demandops.demand.demand_request import Demanded, Put, place_in
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.put import put as book
-from demandops.plan.placement import with_chosen_nodes
+from demandops.ledger.world import World
+from demandops.plan.nodes.capacity import Usage
+from demandops.plan.nodes.placement import with_chosen_nodes
 from demandops.staterepo.history import commit_message
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -75,18 +77,31 @@ def demand(random: Random, demand: str = "d", application: str = "app") -> Put:
         appdef="object-detection-fusion",
         node="",
         inputs={"ego_data": tuple(InputTopic("/ego", source) for source in sources)},
+        place=Requirement(
+            role=random.choice(("", *ROLES)),
+            labels=(("zone", random.choice(LABELS)),) if random.random() < 0.4 else (),
+            capabilities=tuple(c for c in CAPABILITIES if random.random() < 0.3),
+        ),
     )
-    requirement = Requirement(
-        role=random.choice(("", *ROLES)),
-        labels=(("zone", random.choice(LABELS)),) if random.random() < 0.4 else (),
-        capabilities=tuple(c for c in CAPABILITIES if random.random() < 0.3),
-    )
-    one = Demanded(app, ("vehicle0",), place_in("applications[0]"), requirement=requirement)
+    one = Demanded(app, ("vehicle0",), place_in("applications[0]"))
     return Put(id=demand, demand=demand, own_requesters=("vehicle0",), demanded=(one,))
 
 
+def required(request: Put) -> Requirement:
+    held = request.demanded[0].held
+    assert isinstance(held, Application) and held.place is not None
+    return held.place
+
+
+def asking_for(request: Put, requirement: Requirement) -> Put:
+    held = request.demanded[0].held
+    assert isinstance(held, Application)
+    one = replace(request.demanded[0], held=replace(held, place=requirement))
+    return replace(request, demanded=(one,))
+
+
 def chosen(request: Put, ledger: Ledger, config: Config) -> tuple[str, Put, list[str]]:
-    placed, faults = with_chosen_nodes(request, ledger, config)
+    placed, faults = with_chosen_nodes(request, World(config, ledger), Usage())
     (one,) = placed.demanded
     assert isinstance(one.held, Application) and isinstance(placed, Put)
     assert bool(one.held.node) != bool(faults)
@@ -113,8 +128,7 @@ def test_it_is_a_node_that_fits_the_same_in_any_order_and_stays(random: Random) 
             others[node] += 1
     assert dict(ledger.applications_on) == others
     request = demand(random)
-    requirement = request.demanded[0].requirement
-    assert requirement is not None
+    requirement = required(request)
     node, placed, faults = chosen(request, ledger, config)
     assert chosen(request, ledger, shuffled(config, random))[::2] == (node, faults)
     fitting = [
@@ -130,12 +144,10 @@ def test_it_is_a_node_that_fits_the_same_in_any_order_and_stays(random: Random) 
         return
     assert config.nodes[node] in fitting
     ledger, _ = book(ledger, placed, NOW)
-    less = replace(request.demanded[0], requirement=Requirement(role=config.nodes[node].type))
-    later = replace(request, demanded=(less,))
+    later = asking_for(request, Requirement(role=config.nodes[node].type))
     assert chosen(later, ledger, shuffled(config, random))[0] == node
     joining = demand(random, "joins")
-    wanted = joining.demanded[0].requirement
-    assert wanted is not None
+    wanted = required(joining)
     joined, _, faults = chosen(joining, ledger, config)
     assert joined == (node if has(config.nodes[node], wanted) else "")
     assert all("is held by vehicle0 on" in text for text in faults)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from datetime import timedelta
 
 import pytest
@@ -104,3 +105,12 @@ def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseExp
     )
     assert clock.seconds_until_due(Ledger(), 60.0) == 60.0
     assert clock.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0
+
+
+def test_an_end_that_moves_within_its_minute_is_seen(clock: LeaseExpiry) -> None:
+    ledger = leased(("a", 50, 0), ("b", 55, 0))
+    assert clock.seconds_until_due(ledger, 60) == pytest.approx(50, abs=0.1)
+    (claim,) = ledger.claims_of_demand("b")
+    sooner = replace(claim, lease=Lease(20, 0, START + timedelta(seconds=20)))
+    ledger = ledger.replace(claim.key, sooner)
+    assert clock.seconds_until_due(ledger, 60) == pytest.approx(20, abs=0.1)

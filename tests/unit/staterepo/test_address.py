@@ -157,8 +157,8 @@ def test_a_folder_that_is_not_there_is_told_with_the_remedy(tmp_path: Path) -> N
     with pytest.raises(StateRepoError) as error:
         connect(str(tmp_path / "nothing.git"), tmp_path / "data")
     assert str(error.value) == (
-        f"{tmp_path}/nothing.git does not exist; make a state repo with `demandops init "
-        f"{tmp_path}/nothing.git --bare`"
+        f"{tmp_path}/nothing.git does not exist; correct the path, or make a state repo there "
+        f"with `demandops init {tmp_path}/nothing.git --bare`"
     )
 
 

@@ -202,7 +202,10 @@ def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
     "line",
     [b"42", b"null", b"{}", b"\x00\xff", b'{"done": []}', b'{"operation": "x"}', b"[" * 9999]
     + [json.dumps(PROPOSED | {"proposal": one}).encode() for one in NOT_PROPOSED]
-    + [json.dumps(WAITING | {"received": _AT}).encode()],
+    + [
+        json.dumps(WAITING | {"received": at}).encode()
+        for at in (_AT, "9999-12-31T23:59:59+00:00", "1969-12-31T23:59:59+00:00")
+    ],
 )
 def test_a_line_that_the_first_version_did_not_write_is_damage(path: Path, line: bytes) -> None:
     with pytest.raises(DamagedJournal, match="line 2 is not what"):

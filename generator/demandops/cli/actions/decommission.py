@@ -14,12 +14,15 @@ from demandops.cli.actions.ledger_change import (
     print_consequences,
     started_generator,
 )
+from demandops.cli.actions.person_change import confirmed, is_asked, reason_option, yes_option
 from demandops.cli.json_output import claim_data, output_option, show
-from demandops.cli.output import progress, signing_option, state_repo_option
+from demandops.cli.names import names_of
+from demandops.cli.output import busy, progress
+from demandops.cli.target import signing_option, writable_repo_option
 from demandops.decision import decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import Refused
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.claim_changes import ClaimChange
 from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship
@@ -27,8 +30,8 @@ from demandops.staterepo.load.snapshot import Snapshot
 
 
 @click.command()
-@click.argument("name", metavar="NODE|REQUESTER")
-@state_repo_option
+@click.argument("name", metavar="NODE|REQUESTER", shell_complete=names_of("nodes", "requesters"))
+@writable_repo_option
 @click.option("--node", "kinds", flag_value="node", help="Decommission only the node of that name.")
 @click.option(
     "--requester",
@@ -36,14 +39,18 @@ from demandops.staterepo.load.snapshot import Snapshot
     flag_value="requester",
     help="Decommission only the requester of that name.",
 )
+@reason_option
 @click.option("--dry-run", is_flag=True, help="Show the consequences and release nothing.")
+@yes_option
 @signing_option
 @output_option
-def decommission(
+def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     name: str,
     state_repo: str,
     kinds: str | None,
+    reason: str | None,
     dry_run: bool,
+    yes: bool,
     signing_key: Path | None,
     output: str,
 ) -> None:
@@ -51,14 +58,26 @@ def decommission(
 
     A node loses its applications, the inputs from it and the connections that end at it, for every
     requester; then you can delete it from the inventory. A requester loses all its claims, also
-    the claims that it shares with other requesters. If a node and a requester have the name, both
-    are decommissioned.
+    the claims that it shares with other requesters. If NAME is both a node and a requester, both
+    are decommissioned. At a terminal, the command shows the consequences first and asks.
+
+    \b
+    Examples:
+      demandops decommission vehicle00 --dry-run
+      demandops decommission vehicle00 -m "Sold" --yes
+      demandops decommission edge --node
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
-    goal = Decommission(name, kinds=chosen, by=str(authorship.operator())).goal()
-    done = _dry_run(goal, state_repo, output) if dry_run else _book(goal, state_repo, signing_key)
-    row = done or _row(goal, "unchanged", None, ())
-    show(output, row, _lines(row, dry_run))
+    by = str(authorship.operator())
+    goal = Decommission(name, kinds=chosen, by=by, reason=" ".join((reason or "").split())).goal()
+    if dry_run or is_asked(yes, output):
+        row = _dry_run(goal, state_repo, output) or _row(goal, "unchanged", None, ())
+        show(output, row, _lines(row, True))
+        if dry_run or row["outcome"] == "unchanged":
+            return
+        confirmed("Continue?", yes, output)
+    row = _book(goal, state_repo, signing_key) or _row(goal, "unchanged", None, ())
+    show(output, row, _lines(row, False))
 
 
 def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
@@ -66,7 +85,8 @@ def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> di
     with started_generator(state_repo, signing_key) as generator:
         try:
             ticket = generator.submit(goal)
-            await_answer(ticket.future)
+            with busy("booking"):
+                await_answer(ticket.future)
             receipt = ticket.future.result()
         except Refused as error:
             _require_nothing_held(error, goal, generator.snapshot)

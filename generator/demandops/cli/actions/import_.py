@@ -1,4 +1,4 @@
-"""``demandops import``: book what the reference runs, as demands like any other."""
+"""``demandops import``: book the reference's applications and connections as ordinary demands."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import click
 from demandops import strict_yaml
 from demandops.cli.actions.request import Document, book_or_show
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import errors, signing_option, state_repo_option
+from demandops.cli.output import errors
+from demandops.cli.target import clusters_option, signing_option, writable_repo_option
 from demandops.cluster import access
 from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 from demandops.config.base_model import parse_file
 from demandops.errors import InvalidInput, fault
+from demandops.field_lines import located_in
 from demandops.input_file import read_input
 from demandops.migration import imported_goals, reference_files, reference_map
 from demandops.migration.remaining_joins import Join
@@ -24,7 +26,7 @@ from demandops.staterepo import reader
 
 @click.command("import")
 @click.argument("files", nargs=-1, metavar="[FILE…]")
-@state_repo_option
+@writable_repo_option
 @click.option(
     "--map",
     "map_file",
@@ -45,14 +47,7 @@ from demandops.staterepo import reader
     metavar="NAME",
     help="The namespace of the custom resources in the cluster.",
 )
-@click.option(
-    "--clusters",
-    "access_file",
-    envvar="DEMANDOPS_CLUSTERS",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="How to reach the clusters; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
-)
+@clusters_option
 @signing_option
 @output_option
 def import_(  # noqa: PLR0913, PLR0917 - each is an option
@@ -66,11 +61,16 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Book what the reference runs.
+    """Book the reference's applications and connections.
 
     FILE is a bookkeeping or a versioning file of one of its operators, or its custom resources as
-    `kubectl get -o yaml` prints them; - for standard input. docs/migration.md goes through it step
-    by step. Importing the same files again books nothing more.
+    `kubectl get -o yaml` prints them; - for standard input. docs/migration.md explains each step.
+    Importing the same files again books nothing more.
+
+    \b
+    Examples:
+      demandops import --map map.yaml bookkeeping.yaml --dry-run
+      demandops import --map map.yaml --clusters clusters.yaml --cluster c-its
     """
     documents = [(name, data) for file in files for name, data in _documents(file)]
     if cluster:
@@ -88,7 +88,8 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
         _propose(joins, found, map_file, state_repo, output)
         return
     name, text = read_input(map_file)
-    mapped = parse_file(reference_map.ReferenceMap, text, name)
+    with located_in(text):
+        mapped = parse_file(reference_map.ReferenceMap, text, name)
     goals = [Document(name, goal) for goal in imported_goals.goals(joins, mapped, name)]
     book_or_show(goals, state_repo, dry_run, False, signing_key, output)
 

@@ -21,8 +21,8 @@ _LOOK_UP_S = 0.5
 def await_answer(future: Future[Any]) -> None:
     """Return once a demand has an answer; Ctrl-C and SIGTERM interrupt it.
 
-    It polls: an endless wait may miss a signal that arrived just before it, or whose handler
-    another library set.
+    It polls, because an endless wait may miss a signal that arrived just before it, or a signal
+    that a handler of another library takes.
     """
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
@@ -32,7 +32,7 @@ def await_answer(future: Future[Any]) -> None:
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
     """Yield a generator that is closed at the end; meanwhile SIGTERM is like Ctrl-C."""
     before = signal.getsignal(signal.SIGTERM)
-    with suppress(ValueError):  # not in the main thread, which alone gets signals
+    with suppress(ValueError):  # only the main thread may set a handler
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with progress("reading the ledger") as report:
@@ -48,9 +48,9 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
         finally:
             if not generator.close(timeout=0):
                 errors.print(
-                    "what is accepted and not published stays in the journal (`demandops journal` "
-                    "lists it); the next generator that starts on this machine for this state repo "
-                    "continues with it"
+                    "accepted demands that are not published stay in the journal (`demandops "
+                    "journal` lists them); the next generator that starts on this machine for this "
+                    "state repo continues with them"
                 )
     finally:
         with suppress(ValueError):

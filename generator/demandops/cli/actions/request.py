@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
-from demandops import strict_yaml
+from demandops import field_lines, strict_yaml
 from demandops.cli.actions.ledger_change import (
     await_answer,
     print_consequences,
@@ -18,8 +18,10 @@ from demandops.cli.actions.ledger_change import (
     started_generator,
 )
 from demandops.cli.json_output import faults_of, output_option, print_json
-from demandops.cli.output import console, errors, progress, signing_option, state_repo_option
+from demandops.cli.output import console, errors, progress
+from demandops.cli.target import signing_option, writable_repo_option
 from demandops.decision import admit, decide, form_faults
+from demandops.demand.demand_goal import is_demand_goal
 from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
 from demandops.input_file import read_input
 from demandops.quoting import one_line
@@ -35,6 +37,10 @@ class Document:
 
     file: str
     goal: Any
+    text: str = ""
+    """The text of the file."""
+    number: int = 0
+    """Its place among the documents of the text."""
 
     @property
     def request_id(self) -> str:
@@ -50,8 +56,9 @@ class _Answer(Future["Receipt | dict[str, str]"]):
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
-@state_repo_option
+@writable_repo_option
 @click.option("--dry-run", is_flag=True, help="Show the consequences and book nothing.")
+@click.option("--release", is_flag=True, help="Release what the documents demand, instead.")
 @click.option(
     "--wait",
     is_flag=True,
@@ -64,6 +71,7 @@ def request(
     files: tuple[str, ...],
     state_repo: str,
     dry_run: bool,
+    release: bool,
     wait: bool,
     signing_key: Path | None,
     output: str,
@@ -71,11 +79,20 @@ def request(
     """Book demand requests from files.
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
-    documents of the kind Demand (docs/demand.md). Write - for standard input. Nothing is booked
-    unless all documents parse. They are then booked in order; if one is refused, the
-    others are still booked.
+    documents of the kind Demand (docs/demand.md). Write - for standard input. If a document cannot
+    be parsed, nothing is booked. Otherwise they are booked in order; if one is refused, the others
+    are still booked.
+
+    \b
+    Examples:
+      demandops request visit.yaml
+      demandops request visit.yaml --dry-run
+      demandops request visit.yaml --release
+      demandops request - --wait
     """
     documents = [document for file in files for document in _documents(file)]
+    if release:
+        documents = [replace(one, goal=_release_of(one.goal)) for one in documents]
     if not documents:
         raise InvalidInput([fault("", "no request in " + ", ".join(files))])
     book_or_show(documents, state_repo, dry_run, wait, signing_key, output)
@@ -89,7 +106,7 @@ def book_or_show(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Book requests, or show the consequences; print what became of each.
+    """Book requests, or show the consequences; print the outcome of each.
 
     Raises:
         click.Abort, click.exceptions.Exit: if some have no answer, or were refused.
@@ -104,17 +121,33 @@ def book_or_show(
         print_json(rows)
     else:
         _print(rows, documents, dry_run)
-    waiting = sum(row["outcome"] == "waiting" for row in rows)
-    if waiting:
-        errors.print(f"{len(rows) - waiting} of {len(rows)} requests have an answer")
+    unanswered = sum(_is_unanswered(row) for row in rows) if not dry_run else 0
+    if unanswered:
+        errors.print(f"{len(rows) - unanswered} of {len(rows)} requests have an answer")
         raise click.Abort
     if any(row["outcome"] == "refused" for row in rows):
         raise click.exceptions.Exit(1)
 
 
+def _is_unanswered(row: dict[str, Any]) -> bool:
+    """Return whether a request has no answer yet; one that waits for room has one, its commit."""
+    return row["outcome"] == "waiting" and row["commit"] is None
+
+
 def _documents(file: str) -> Iterable[Document]:
     name, text = read_input(file)
-    return [Document(name, goal) for goal in strict_yaml.load_all(text, name) if goal is not None]
+    goals = enumerate(strict_yaml.load_all(text, name))
+    return [Document(name, goal, text, number) for number, goal in goals if goal is not None]
+
+
+def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
+    """Return the goal that releases what a goal demands; what is no goal stays, to be refused."""
+    if not isinstance(goal, dict):
+        return goal
+    if not is_demand_goal(goal):
+        return {**goal, "shutdown": True}
+    names = ("apiVersion", "kind", "demand", "request", "requesters")
+    return {name: goal[name] for name in names if name in goal} | {"operation": "release"}
 
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
@@ -148,7 +181,12 @@ def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]
 
 
 def _refused(index: int, document: Document, error: DemandOpsError) -> dict[str, Any]:
-    return _row(index, document.request_id, "refused", faults=faults_of(error))
+    lines = field_lines.lines(document.text, document.number)
+    faults = [
+        each | {"line": field_lines.nearest(each["field"], lines)} if not each["file"] else each
+        for each in faults_of(error)
+    ]
+    return _row(index, document.request_id, "refused", faults=faults)
 
 
 def _book(
@@ -177,7 +215,7 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
     """Return the row of a request.
 
     Raises:
-        Unsound: nobody knows what became of it.
+        Unsound: nobody knows whether it was booked.
     """
     try:
         result = answer.result(timeout=0)
@@ -244,18 +282,30 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
                 print_consequences(decision)
-            more = {"warnings": decision.warnings, "not_held": decision.changes.not_held}
-            more |= {"placed": decision.placed}
+            more: dict[str, Any] = {
+                "warnings": decision.warnings,
+                "not_held": decision.changes.not_held,
+                "placed": decision.placed,
+                "releases": [asdict(each) for each in decision.releases],
+                "files": sorted(decision.files),
+            }
             more |= {"approval": decision.approval} if decision.approval else {}
             rows.append(_row(index, decision.request.id, outcome, **more))
     return rows
+
+
+def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
+    """Yield what a lease without a unit means; a person may have meant minutes."""
+    lease = goal.get("lease") if isinstance(goal, dict) else None
+    if isinstance(lease, int) and not isinstance(lease, bool):
+        yield f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"
 
 
 def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"
-        if row["outcome"] == "waiting":
+        if not dry_run and _is_unanswered(row):
             errors.print(f"{title} has no answer yet")
         elif row["outcome"] == "refused":
             print_refusal(f"{title} refused", row["faults"])
@@ -266,7 +316,7 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
             out.print(f"{title} {told}", soft_wrap=True)
         for choice in row["placed"]:
             out.print(f"  {choice}", soft_wrap=True)
-        for warning in row["warnings"]:
+        for warning in (*_unit_warnings(document.goal), *row["warnings"]):
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:
             errors.print(f"  not held: {item}")

@@ -15,8 +15,16 @@ from demandops.cli.actions.ledger_change import (
     print_refusal,
     started_generator,
 )
+from demandops.cli.actions.person_change import (
+    confirmed,
+    dry_run_option,
+    is_asked,
+    reason_option,
+    yes_option,
+)
 from demandops.cli.json_output import claim_data, faults_of, output_option, show
-from demandops.cli.output import progress, signing_option, state_repo_option
+from demandops.cli.output import busy, progress
+from demandops.cli.target import signing_option, writable_repo_option
 from demandops.cli.views.diff import release_lines
 from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import Decision, decide
@@ -32,22 +40,24 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 
 @click.command()
 @click.argument("revision", metavar="REV|TIME")
-@state_repo_option
-@click.option("-m", "--reason", metavar="TEXT", help="The reason, for the commit message.")
+@writable_repo_option
+@reason_option
 @click.option(
     "--drop-newer",
     is_flag=True,
     help="Also drop claims that were booked since then; otherwise they prevent the rollback.",
 )
-@click.option("--dry-run", is_flag=True, help="Show the consequences and change nothing.")
+@dry_run_option
+@yes_option
 @signing_option
 @output_option
-def rollback(
+def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     revision: str,
     state_repo: str,
     reason: str | None,
     drop_newer: bool,
     dry_run: bool,
+    yes: bool,
     signing_key: Path | None,
     output: str,
 ) -> None:
@@ -55,10 +65,17 @@ def rollback(
 
     Claims that were released since then are booked again, with the current configuration. A lease
     starts again with its full term. REV is a commit; TIME means the newest commit at or before it.
+    At a terminal, the consequences are shown and confirmed first.
+
+    \b
+    Examples:
+      demandops rollback 14:00 --dry-run
+      demandops rollback 14:00 -m "The station sent nonsense"
+      demandops rollback 2h -m "A wrong test" --drop-newer --yes
     """
     if not (dry_run or (reason and reason.strip())):
         raise click.UsageError("give the reason: -m TEXT")
-    with reader.opened(state_repo) as repo:
+    with reader.opened(state_repo, only_read=False) as repo:
         to, base = repo.commit(revision), repo.commit()
         goal = rollback_goal.goal(
             to, drop_newer=drop_newer, reason=reason or "", who=repo.operator()
@@ -71,6 +88,9 @@ def rollback(
         except InvalidInput as error:
             result["faults"] = faults_of(error)
     if not dry_run and not result["faults"]:
+        if is_asked(yes, output) and result["outcome"] != "unchanged":
+            show(output, None, _lines(result, True))
+            confirmed("Continue?", yes, output)
         result |= _roll_back(state_repo, goal, signing_key, base)
     if result["faults"] and output == "text":
         print_refusal(f"the rollback to {to[:10]} is refused:", result["faults"])
@@ -106,7 +126,8 @@ def _roll_back(
     try:
         with started_generator(state_repo, signing_key) as generator:
             ticket = generator.submit(goal)
-            await_answer(ticket.future)
+            with busy("booking"):
+                await_answer(ticket.future)
             receipt = ticket.future.result()
     except InvalidInput as error:
         return {"outcome": "refused", **_consequences(None), "faults": faults_of(error)}

@@ -10,12 +10,13 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import output_formats, print_json
-from demandops.cli.output import console, errors
+from demandops.cli.output import busy, console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
 from demandops.render.changes.merge_preview import FileChange
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import CheckResult
+from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 
 _MOST_DIFF_LINES = 400
 _MOST_DIFF_LINES_JSON = 20_000
@@ -25,7 +26,7 @@ _MOST_DIFF_LINES_JSON = 20_000
 @click.argument(
     "directory",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="DIR",
+    metavar="[DIR]",
     default=Path(),
 )
 @click.option(
@@ -34,16 +35,29 @@ _MOST_DIFF_LINES_JSON = 20_000
     help="The branch that the edits will be merged into. They are compared with the merge base. "
     "Default: origin/main, or main.",
 )
+@click.option(
+    "--require-helm",
+    is_flag=True,
+    help="Fail if helm is missing, so that no chart can be rendered.",
+)
 @output_formats("text", "json", "markdown")
-def check(directory: Path, base: str | None, output: str) -> None:
+def check(directory: Path, base: str | None, require_helm: bool, output: str) -> None:
     """Check edits of a state repo and show their consequences.
 
-    DIR is a checked-out state repo. Its files must be valid, every application must render, no
-    generated file may be edited (the override to write instead is printed), and a changed chart
-    needs a new version. Then the consequences of a merge are shown: changed releases, files and
-    bookkeeping. docs/pull-requests.md describes the check in a pipeline.
+    DIR is a checked-out state repo; default: this folder. Its files must be valid, every
+    application must render, no generated file may be edited (the override to write instead is
+    printed), and a changed chart needs a new version. Helm lints the charts and renders them, for
+    what runs and for an example of each application. Then the consequences of a merge are shown:
+    changed releases, files and bookkeeping. docs/pull-requests.md describes the check in a
+    pipeline.
+
+    \b
+    Examples:
+      demandops check
+      demandops check . --base origin/main --output markdown
     """
-    checked = merge_check.check(directory, base)
+    with busy("checking"):
+        checked = merge_check.check(directory, base, require_helm=require_helm)
     if output == "json":
         print_json(_data(checked))
     elif output == "markdown":
@@ -65,6 +79,7 @@ def _data(checked: CheckResult) -> dict[str, Any]:
         "faults": [asdict(each) for each in checked.faults],
         "warnings": [asdict(each) for each in checked.warnings],
         "suggestions": [asdict(each) for each in checked.suggestions],
+        "charts": _charts(checked.charts),
         "base": checked.base,
         "base_valid": checked.base_valid,
         "releases": [asdict(each) for each in found.releases] if found else None,
@@ -72,6 +87,19 @@ def _data(checked: CheckResult) -> dict[str, Any]:
         "diff_lines_left_out": left,
         "bookkeeping": None if entries is None else [asdict(each) for each in entries],
     }
+
+
+def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
+    return (
+        None
+        if charts is None
+        else {
+            "rendered": list(charts.rendered),
+            "releases": charts.releases,
+            "examples": charts.examples,
+            "not_rendered": dict(charts.not_rendered),
+        }
+    )
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
@@ -95,7 +123,9 @@ def _print(directory: Path, checked: CheckResult) -> None:
     for each in checked.warnings:
         errors.print(f"warning: {each}")
     if not checked.faults:
-        out.print(f"{directory}: all files are valid and everything renders")
+        out.print(f"{directory}: all files are valid and every release renders")
+        for line in pull_request_comment.chart_lines(checked.charts):
+            out.print(line, soft_wrap=True)
     for line in _lines(checked):
         out.print(line, soft_wrap=True)
 
@@ -106,6 +136,9 @@ def _lines(checked: CheckResult) -> Iterator[str]:
         yield from each.text.splitlines()
         if each.other_releases:
             yield f"\n(it also applies to {', '.join(each.other_releases)})"
+    if checked.newer:
+        commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
+        yield f"\nthe merge target has {commits} that this checkout lacks: git pull --rebase"
     consequence = checked.preview
     if consequence is None:
         if checked.suggestions:

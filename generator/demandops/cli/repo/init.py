@@ -7,7 +7,9 @@ from pathlib import Path
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import signing_option
+from demandops.cli.repo import schema
+from demandops.cli.target import signing_option
+from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.staterepo import new_repo
 from demandops.staterepo.git.signing import Signer
@@ -32,35 +34,74 @@ from demandops.staterepo.git.signing import Signer
     "--url",
     default="",
     metavar="URL",
-    help="The URL (https or ssh) from which the clusters fetch the state repo. It is written to "
-    "demandops.yaml; you can change it there.",
+    help="The URL (https or ssh, or git@host:path) from which the clusters fetch the state repo. "
+    "It is written to demandops.yaml; you can change it there. Without it, no cluster can follow "
+    "the state repo yet.",
+)
+@click.option(
+    "--example",
+    type=click.Choice(["experiment", "none"]),
+    default="experiment",
+    show_default=True,
+    help="The fleet to begin with: that of the paper's experiment with its application, or none.",
 )
 @signing_option
 @output_option
 def init(
-    directory: Path, gitops: str, bare: bool, url: str, signing_key: Path | None, output: str
+    directory: Path,
+    *,
+    gitops: str,
+    bare: bool,
+    url: str,
+    example: str,
+    signing_key: Path | None,
+    output: str,
 ) -> None:
     """Create a state repo.
 
-    Its first commit has the skeleton and the application definitions. To make a cluster follow the
-    state repo, install Flux or Argo CD there (docs/flux.md, docs/argocd.md) and run:
+    Its first commit has the skeleton, and the fleet and application of the example. To make a
+    cluster follow the state repo, install Flux or Argo CD there (docs/flux.md, docs/argocd.md) and
+    run:
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
+
+    \b
+    Examples:
+      demandops init fleet.git --bare
+      demandops init fleet --gitops argocd --url https://git.example/fleet.git
     """
+    if gitops == "argocd" and not url:
+        raise StateRepoError(
+            "--gitops argocd needs --url, because all its manifests name the URL from which the "
+            "clusters fetch the state repo: --url https://HOST/PATH or git@HOST:PATH"
+        )
     commit = new_repo.init(
         directory,
         REAL.now(),
         bare=bare,
         gitops=gitops,
         url=url,
+        example=example == "experiment",
+        schemas={name: schema.text(name) for name in schema.SCHEMAS},
         signer=Signer(signing_key) if signing_key else None,
     )
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
-    lines = [
-        f"state repo in {directory}, first commit {commit[:10]} on main",
-        f"to make a cluster follow it: git -C {directory} show main:bootstrap/c-its.yaml | "
-        "kubectl apply -f -",
-    ]
+    lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
+    if example == "none":
+        lines += [
+            "to fill it: demandops new node, inventory/brokers.yaml, policy/access-domains.yaml,",
+            "            demandops new application (--help has examples)",
+        ]
+    if not url:
+        lines.append(
+            "no cluster can follow it yet: write the url that clusters fetch to demandops.yaml"
+        )
+    else:
+        cluster = "c-its" if example == "experiment" else "CLUSTER"
+        lines.append(
+            f"to make a cluster follow it: git -C {directory} show main:bootstrap/{cluster}.yaml | "
+            "kubectl apply -f -"
+        )
     if bare:
         lines += [
             f"next: demandops serve --state-repo {directory}",

@@ -10,14 +10,15 @@ import click
 
 from demandops import settings
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import errors, state_repo_option
+from demandops.cli.output import errors
+from demandops.cli.target import writable_repo_option
 from demandops.errors import fault
 from demandops.runtime import REAL
 from demandops.staterepo.write.slot import FoundJournal, find_journals
 
 
 @click.command()
-@state_repo_option
+@writable_repo_option
 @click.option(
     "--set-aside",
     is_flag=True,
@@ -27,9 +28,15 @@ from demandops.staterepo.write.slot import FoundJournal, find_journals
 def journal(state_repo: str, set_aside: bool, output: str) -> None:
     """List the accepted demands that are not published.
 
-    A generator on this machine accepted them, and the next one carries them out. It does not start
-    if a journal is damaged, because demands may be missing in it. Then use --set-aside, and send
-    again those of the listed demands that are still needed: --output json prints their goals.
+    A generator on this machine accepted them, and the next one carries them out. A generator does
+    not start if a journal is damaged, because demands may be missing in it. Then use --set-aside,
+    and send again those of the listed demands that are still needed: --output json prints their
+    goals.
+
+    \b
+    Examples:
+      demandops journal
+      demandops journal --set-aside
     """
     now = REAL.now()
     found = list(find_journals(settings.data_home(state_repo), now, set_aside=set_aside))

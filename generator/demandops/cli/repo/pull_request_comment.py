@@ -14,6 +14,7 @@ from demandops.plan.views.bookkeeping import EntryChange
 from demandops.quoting import lines, one_line
 from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
 from demandops.staterepo.pull_request.merge_check import CheckResult
+from demandops.staterepo.pull_request.rendered_charts import MISSING, RenderedCharts
 
 MARK = "<!-- demandops check -->"
 """The first line of every report, by which a pipeline finds its own comment."""
@@ -29,6 +30,22 @@ def report(checked: CheckResult, longest: int = LONGEST) -> str:
     """Return the report, of at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_head(checked), *_faults(checked), *_suggestions(checked)]
     return _bounded([*parts, *_consequence(checked)], longest)
+
+
+def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
+    """Yield which charts helm rendered, and which it did not render and why."""
+    if charts is None:
+        return
+    if MISSING in charts.not_rendered.values():
+        yield f"charts not rendered: {MISSING}"
+        return
+    if charts.rendered:
+        yield (
+            f"charts rendered by helm: {', '.join(charts.rendered)} "
+            f"({charts.releases} releases, {charts.examples} examples)"
+        )
+    for name, reason in charts.not_rendered.items():
+        yield f"chart {name} not rendered: {one_line(reason)}"
 
 
 def code(text: str) -> str:
@@ -58,7 +75,8 @@ def _head(checked: CheckResult) -> Iterator[str]:
     if found:
         yield f"## DemandOps: {'1 error' if found == 1 else f'{found} errors'}\n"
     else:
-        yield "## DemandOps: valid, and everything renders\n"
+        yield "## DemandOps: valid, and every release renders\n"
+    yield from (f"\n{line}\n" for line in chart_lines(checked.charts))
     if checked.base:
         invalid = ", with its last valid files because its own are not valid"
         yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
@@ -67,7 +85,7 @@ def _head(checked: CheckResult) -> Iterator[str]:
 def _faults(checked: CheckResult) -> Iterator[str]:
     for kind, found in (("", checked.faults), ("warning: ", checked.warnings)):
         for each in found:
-            places = [code(place) for place in (each.file, each.field) if place]
+            places = [code(place) for place in (each.place, each.field) if place]
             yield f"\n- {kind}{': '.join([*places, code(each.message)])}"
         if found:
             yield "\n"

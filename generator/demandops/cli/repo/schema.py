@@ -9,7 +9,9 @@ from typing import Any
 import click
 from pydantic import BaseModel
 
+from demandops.cli.contexts import ContextsFile
 from demandops.cli.output import console
+from demandops.cli.repo.schema_properties import describe
 from demandops.cluster.access import AccessFile
 from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
@@ -19,6 +21,7 @@ from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile, Versi
 from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
+from demandops.detection.rules.rule_file import RuleFile
 from demandops.migration.reference_map import ReferenceMap
 
 SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
@@ -31,8 +34,10 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "brokers": (BrokersFile, "inventory/brokers.yaml, inventory/brokers/*.yaml"),
     "charts": (ChartsFile, "registry/charts.yaml, registry/charts/*.yaml"),
     "clusters": (ClustersFile, "inventory/clusters.yaml, inventory/clusters/*.yaml"),
+    "contexts": (ContextsFile, "~/.config/demandops/contexts.yaml"),
     "demand": (DemandGoal, "a demand, for `demandops demand` and `demandops request`"),
     "deployment-request": (WireGoal, "a goal of DeploymentRequest, for `demandops request`"),
+    "detector-rules": (RuleFile, "the file of `demandops detect`"),
     "images": (ImagesFile, "registry/images.yaml, registry/images/*.yaml"),
     "clients": (ClientsFile, "registry/clients.yaml, registry/clients/*.yaml"),
     "nodes": (NodesFile, "inventory/nodes.yaml, inventory/nodes/*.yaml"),
@@ -58,21 +63,29 @@ def schema(name: str | None, folder: Path | None) -> None:
 
     Without NAME, list the schemas. Editors check and complete files with them. For VS Code and its
     YAML extension, begin a file with `# yaml-language-server: $schema=…/nodes.json`.
+
+    \b
+    Examples:
+      demandops schema
+      demandops schema override
+      demandops schema --write schemas
     """
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         for each in SCHEMAS:
-            folder.joinpath(f"{each}.json").write_text(_text(each))
+            folder.joinpath(f"{each}.json").write_text(text(each))
         console().print(f"{len(SCHEMAS)} schemas in {folder}")
     elif name is None:
         for each, (_, file) in SCHEMAS.items():
             console().print(f"{each:20} {file}")
     else:
-        click.echo(_text(name), nl=False)
+        click.echo(text(name), nl=False)
 
 
-def _text(name: str) -> str:
+def text(name: str) -> str:
+    """Return a schema as the command prints it."""
     model, file = SCHEMAS[name]
     generated: dict[str, Any] = model.model_json_schema(by_alias=True)
+    describe(generated, model.__name__)
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": file}
     return json.dumps({**dialect, **generated, "title": file}, indent=2, ensure_ascii=False) + "\n"

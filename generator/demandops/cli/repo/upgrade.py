@@ -10,7 +10,8 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import progress, signing_option, state_repo_option
+from demandops.cli.output import progress
+from demandops.cli.target import signing_option, writable_repo_option
 from demandops.render.gitops.controller_switch import Step
 from demandops.runtime import REAL
 from demandops.staterepo import upgrade as upgrading
@@ -21,7 +22,7 @@ _MOST_PATHS = 50
 
 
 @click.command()
-@state_repo_option
+@writable_repo_option
 @click.option(
     "--gitops",
     type=click.Choice(["flux", "argocd"]),
@@ -54,6 +55,11 @@ def upgrade(
     another render version), or to change between Flux and Argo CD. To change the controller, a
     person also works on the clusters: the steps are printed, and docs/argocd.md explains them. If
     nothing changes, there is no commit.
+
+    \b
+    Examples:
+      demandops upgrade --dry-run
+      demandops upgrade --gitops argocd
     """
     request = UpgradeRequest(gitops, url)
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()

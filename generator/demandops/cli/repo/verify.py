@@ -1,4 +1,4 @@
-"""``demandops verify``: the proof that commits match their ledger and configuration."""
+"""``demandops verify``: a proof that commits match their ledger and configuration."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import progress, state_repo_option
+from demandops.cli.output import progress
+from demandops.cli.target import state_repo_option
 from demandops.errors import fault
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
@@ -29,6 +30,12 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
 
     If the state repo has policy/allowed-signers, each later commit of the generator must have a
     good signature by a key in that file (docs/audit.md). REV, A and B are commits or times.
+
+    \b
+    Examples:
+      demandops verify
+      demandops verify main~50..main
+      demandops verify main --whole
     """
     with reader.opened(state_repo) as repo, progress("rendering again") as report:
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)

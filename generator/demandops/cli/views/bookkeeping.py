@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 
 import click
-from rich.table import Table
 
-from demandops.cli.json_output import output_option, show
-from demandops.cli.output import at_option, progress, state_repo_option, version_text, warn_of
+from demandops.cli.json_output import output_option, show, time_text
+from demandops.cli.output import at_option, progress, version_lines, warn_of
+from demandops.cli.table import Column, Table
+from demandops.cli.target import state_repo_option
 from demandops.plan.views.bookkeeping import ConnectionEntry, ServiceEntry, as_data
 from demandops.plan.views.bookkeeping import bookkeeping as derive
 from demandops.staterepo import reader
@@ -20,7 +21,13 @@ from demandops.staterepo import reader
 @at_option
 @output_option
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
-    """Show who requests which service and connection."""
+    """Show who requests which service and connection.
+
+    \b
+    Examples:
+      demandops bookkeeping
+      demandops bookkeeping --at 14:03 -o json
+    """
     with reader.opened(state_repo) as repo:
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(at, report)
@@ -29,12 +36,12 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     services = [
         (
             name,
-            "\n".join([entry.service, *(f"{key} = {v}" for key, v in entry.parameters.items())]),
-            version_text(asdict(entry)),
+            [entry.service, *(f"{key} = {value}" for key, value in entry.parameters.items())],
+            version_lines(asdict(entry)),
             entry.node,
-            entry.source or ", ".join(entry.applications),
-            "\n".join(line for topics in entry.inputs.values() for line in _lines(topics, entry)),
-            "\n".join(entry.requesters),
+            entry.source or entry.applications,
+            [line for topics in entry.inputs.values() for line in _lines(topics, entry)],
+            ", ".join(entry.requesters),
         )
         for name, entry in books.services.items()
     ]
@@ -44,42 +51,73 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
             entry.type,
             entry.source,
             entry.target,
-            "\n".join(_lines(entry.topics, entry)),
-            "\n".join(entry.requesters),
+            list(_lines(entry.topics, entry)),
+            ", ".join(entry.requesters),
         )
         for id, entry in books.connections.items()
     ]
     suspended = [
-        (
-            f"{entry.kind} {entry.id}",
-            entry.demand,
-            "\n".join(entry.requesters),
-            entry.override,
-            entry.reason,
-        )
-        for entry in books.suspended
+        (f"{one.kind} {one.id}", one.demand, ", ".join(one.requesters), one.override, one.reason)
+        for one in books.suspended
     ]
-    kinds = ("Service", "Kind", "Version", "Node", "For", "Takes in", "Requesters")
-    tables = [
-        _table("Services", kinds, services),
-        _table(
-            "Connections", ("Connection", "By", "From", "To", "Topics", "Requesters"), connections
-        ),
+    text: list[str | Table] = [
+        Table(_SERVICES, services, "Services"),
+        "",
+        Table(_CONNECTIONS, connections, "Connections"),
+        "",
     ]
     if suspended:
-        columns = ("Subject", "Demand", "Requesters", "By", "Reason")
-        tables.append(_table("Suspended", columns, suspended))
-    show(output, as_data(books, commit), [*tables, f"at {commit}"])
+        text += [Table(_SUSPENDED, suspended, "Suspended"), ""]
+    if books.nodes:
+        capacity = [
+            (node, name, each.requested, each.capacity)
+            for node, resources in books.nodes.items()
+            for name, each in resources.items()
+        ]
+        text += [Table(_CAPACITY, capacity, "Capacity"), ""]
+    if books.waiting:
+        waiting = [
+            (one.demand, "\n".join(one.requesters), time_text(one.since), str(one.priority))
+            for one in books.waiting
+        ]
+        text += [Table(_WAITING, waiting, "Waiting for room"), ""]
+    show(output, as_data(books, commit), [*text, f"at {commit}"])
+
+
+_SERVICES = (
+    Column("Service"),
+    Column("Kind", 5),
+    Column("Version", 4),
+    Column("Node", 1),
+    Column("For", 3, wraps=True),
+    Column("Takes in", 6),
+    Column("Requesters", 2, wraps=True),
+)
+_CONNECTIONS = (
+    Column("Connection"),
+    Column("By", 3),
+    Column("From", 1),
+    Column("To", 1),
+    Column("Topics", 4),
+    Column("Requesters", 2, wraps=True),
+)
+_SUSPENDED = (
+    Column("Subject"),
+    Column("Demand", 3),
+    Column("Requesters", 2, wraps=True),
+    Column("By", 1),
+    Column("Reason", 4, wraps=True),
+)
+_WAITING = (
+    Column("Demand"),
+    Column("Requesters", 2, wraps=True),
+    Column("Since", 1),
+    Column("Priority", 1),
+)
+_CAPACITY = (Column("Node"), Column("Resource"), Column("Requested"), Column("Capacity"))
 
 
 def _lines(topics: Mapping[str, list[str]], entry: ServiceEntry | ConnectionEntry) -> Iterator[str]:
-    """Yield each topic, with its requesters if they are not all of the entry's."""
+    """Yield each topic; add its requesters if only some of the entry's requesters hold it."""
     for topic, who in topics.items():
         yield topic if who == entry.requesters else f"{topic} ({', '.join(who)})"
-
-
-def _table(title: str, columns: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
-    table = Table(*columns, title=title)
-    for row in rows or [("(nothing)",)]:
-        table.add_row(*row)
-    return table

@@ -8,7 +8,8 @@ from dataclasses import asdict
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import SIGNS, progress, state_repo_option, warn_of
+from demandops.cli.output import SIGNS, progress, warn_of
+from demandops.cli.target import state_repo_option
 from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.changes.merge_preview import planned_releases, preview
@@ -28,6 +29,11 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
     They are shown in bookkeeping, releases and other files. A and B are commits, or times like
     2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h.
+
+    \b
+    Examples:
+      demandops diff main~1 main
+      demandops diff 2h 0s
     """
     with reader.opened(state_repo) as repo:
         old, new = (loaded(repo, revision) for revision in (before, after))

@@ -8,17 +8,42 @@ from itertools import islice
 from typing import Any
 
 import click
-from rich.table import Table
 
-from demandops.cli.json_output import commit_data, output_option, show
-from demandops.cli.output import state_repo_option
-from demandops.errors import StateRepoError
-from demandops.quoting import one_line
+from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
+from demandops.cli.names import names_of
+from demandops.cli.output import busy
+from demandops.cli.table import Column, Table
+from demandops.cli.target import state_repo_option
+from demandops.cli.times import relative
+from demandops.config.override import parse_time
+from demandops.errors import InvalidInput, StateRepoError, fault, suggestion
+from demandops.quoting import quoted
 from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.reader import Reader
+
+OPERATIONS = (
+    "join",
+    "shutdown",
+    "put",
+    "release",
+    "renew",
+    "expire",
+    "wait",
+    "decommission",
+    "drain",
+    "scale-down",
+    "follow",
+    "expire-override",
+    "scale-down",
+    "rollback",
+    "upgrade",
+    "init",
+    "by-hand",
+)
+"""The operations of commits; ``by-hand`` is a person's commit."""
 
 _TRAILERS = {
     "requester": "Requester",
@@ -42,22 +67,43 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
 @click.argument("commit_range", required=False, metavar="[REV|A..B]")
 @state_repo_option
 @click.option(
-    "--requester", metavar="ID", help="Commits that book or release claims of this requester."
+    "--requester",
+    metavar="ID",
+    shell_complete=names_of("requesters"),
+    help="Commits that book or release claims of this requester.",
 )
-@click.option("--application", metavar="ID", help="Commits about this application.")
-@click.option("--connection", metavar="ID", help="Commits about this connection.")
+@click.option(
+    "--application",
+    metavar="ID",
+    shell_complete=names_of("applications"),
+    help="Commits about this application.",
+)
+@click.option(
+    "--connection",
+    metavar="ID",
+    shell_complete=names_of("connections"),
+    help="Commits about this connection.",
+)
 @click.option(
     "--node",
     metavar="ID",
+    shell_complete=names_of("nodes"),
     help="Commits that change a release on this node or a claim that names it.",
 )
-@click.option("--release", metavar="NAME", help="Commits that changed the file of this release.")
-@click.option("--demand", metavar="ID", help="Commits about this demand.")
+@click.option(
+    "--release",
+    metavar="NAME",
+    shell_complete=names_of("releases"),
+    help="Commits that changed the file of this release.",
+)
+@click.option(
+    "--demand", metavar="ID", shell_complete=names_of("demands"), help="Commits about this demand."
+)
 @click.option(
     "--operation",
+    type=click.Choice(OPERATIONS),
     metavar="WORD",
-    help="Commits of this operation: join, shutdown, put, release, renew, expire, decommission, "
-    "follow, expire-override, rollback, upgrade, init; or by-hand.",
+    help=f"Commits of this operation: {', '.join(OPERATIONS[:-1])}; or {OPERATIONS[-1]}.",
 )
 @click.option(
     "--since",
@@ -73,7 +119,7 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     default=None,
     help="List at most this many commits.",
 )
-@output_option
+@output_formats("text", "wide", "json")
 def log(
     commit_range: str | None,
     state_repo: str,
@@ -84,13 +130,50 @@ def log(
     """List the commits of the state repo, newest first.
 
     With several filters, a commit must match all of them. REV, A and B are commits, or times
-    written as for --since.
+    written as for --since. -o wide adds the absolute times, the operations and the request ids.
+
+    \b
+    Examples:
+      demandops log -n 10
+      demandops log --requester vehicle00 --since 2h
+      demandops log --node edge --operation shutdown
+      demandops log main~20..main -o wide
     """
     with reader.opened(state_repo) as repo:
         commits = _walked(repo, commit_range, given.pop("release"))
-        entries = list(islice(_matching(repo, commits, **given), max_count))
-    text = [_table(entries) if entries else "no commit matches"]
-    show(output, [commit_data(entry) for entry in entries], text)
+        with busy("looking through the commits"):
+            entries = list(islice(_matching(repo, commits, **given), max_count))
+            if not entries:
+                _refuse_unknown(repo, given)
+    rows = [commit_data(entry) for entry in entries]
+    table = log_table(rows, REAL.now(), wide=output == "wide")
+    show(output, rows, [table if entries else "no commit matches"])
+
+
+def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
+    """Refuse filters that no commit ever matched: they are probably misspelled."""
+    known: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
+    for entry in repo.log() if known else ():
+        for name, values in known.items():
+            values.update(entry.trailers.get(_TRAILERS[name], ()))
+    faults = [
+        fault(
+            f"--{name}",
+            f"no commit is about {quoted(given[name])}{suggestion(given[name], values)}",
+        )
+        for name, values in known.items()
+        if given[name] not in values
+    ]
+    node = given["node"]
+    if node is not None:
+        nodes = {*repo.last_valid_snapshot(repo.commit()).state.config.nodes}
+        if node not in nodes and not any(
+            repo.changes_node(entry.commit, node) for entry in repo.log()
+        ):
+            message = f"there is no node {quoted(node)}{suggestion(node, nodes)}"
+            faults.append(fault("--node", message))
+    if faults:
+        raise InvalidInput(faults)
 
 
 def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iterable[LogEntry]:
@@ -130,17 +213,33 @@ def _matching(
     return filter(matches, entries)
 
 
-def _table(entries: Iterable[LogEntry]) -> Table:
-    table = Table("Commit", "Time (UTC)", "Operation", "Requesters", "What")
-    for entry in entries:
-        requesters = one_line(", ".join(entry.trailers.get("Requester", ())))
-        if entry.first("Operation") == "rollback":
-            requesters = f"{entry.author}, for {requesters}"
-        table.add_row(
-            entry.commit[:10],
-            entry.time.strftime("%Y-%m-%d %H:%M:%S"),
-            one_line(entry.first("Operation")) or "by hand",
-            requesters or entry.author,
-            entry.summary,
+_COLUMNS = (
+    Column("Commit"),
+    Column("When", 2),
+    Column("What", 0, wraps=True),
+    Column("Requesters", 1, wraps=True),
+)
+_WIDE = (Column("Time (UTC)"), Column("Operation"), Column("Author"), Column("Request"))
+
+
+def log_table(rows: list[Json], now: datetime, *, wide: bool = False) -> Table:
+    """Return commits, given as JSON data, as a table."""
+    cells = []
+    for row in rows:
+        requesters = row["requesters"] or [row["author"]]
+        if row["operation"] == "rollback":
+            requesters = [f"{row['author']}, for {', '.join(row['requesters'])}"]
+        shown = (
+            row["commit"][:10],
+            relative(parse_time(row["time"]), now),
+            row["summary"],
+            ", ".join(requesters),
         )
-    return table
+        more = (
+            time_text(row["time"]).removesuffix(" UTC"),
+            row["operation"] or "by hand",
+            row["author"],
+            row["request"] or "",
+        )
+        cells.append(shown + (more if wide else ()))
+    return Table([*_COLUMNS, *(_WIDE if wide else ())], cells, whole=wide)

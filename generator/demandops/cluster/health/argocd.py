@@ -12,6 +12,7 @@ from demandops.cluster.health.release_health import (
     Health,
     HealthReader,
     History,
+    Key,
     Object,
     ObjectName,
     Objects,
@@ -23,16 +24,16 @@ from demandops.cluster.health.release_health import (
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""How many objects of a failed sync a reason lists."""
+"""The most objects of a failed sync that a reason lists."""
 
 
 class ArgoCd(HealthReader):
-    """Reads Applications."""
+    """Computes health from Argo CD's Applications."""
 
     service_kind = "Application"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the Application of the domain's folder, and all objects of the namespace."""
+        """Return the Application of the domain's folder, and all objects of its namespace."""
         folder = ObjectSelector("Application", *_folder_application(domain))
         return folder, *self.objects_to_confirm(domain)
 
@@ -40,9 +41,8 @@ class ArgoCd(HealthReader):
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
         """Return how far the Application of a domain's folder has applied a commit."""
-        application = _folder_application(domain)
-        name = f"Application {application.namespace}/{application.name}"
-        app = objects.get(("Application", *application))
+        name = name_of(self.follower(domain))
+        app = objects.get(self.follower(domain))
         if app is None:
             return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
         if any(history.includes(revision, commit) for revision in _applied_commits(app)):
@@ -55,9 +55,13 @@ class ArgoCd(HealthReader):
             return Health("waiting", f"{waiting}; for {revision[:10]} it reports: {message}", name)
         return Health("waiting", message, name, failing=True)
 
+    def follower(self, domain: ClusterDomain) -> Key:
+        """Return the Application of the domain's folder."""
+        return "Application", *_folder_application(domain)
+
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
         """Return the commit that a domain's Application has applied."""
-        app = objects.get(("Application", *_folder_application(domain)))
+        app = objects.get(self.follower(domain))
         return next(iter(_applied_commits(app)), "") if app else ""
 
     def _service_health(

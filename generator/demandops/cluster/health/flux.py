@@ -11,6 +11,7 @@ from demandops.cluster.health.release_health import (
     Health,
     HealthReader,
     History,
+    Key,
     Object,
     Objects,
     ObjectSelector,
@@ -26,7 +27,7 @@ _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 
 
 class Flux(HealthReader):
-    """Reads Kustomizations, GitRepositories and HelmReleases."""
+    """Computes health from Flux's Kustomizations, GitRepositories and HelmReleases."""
 
     service_kind = "HelmRelease"
 
@@ -39,8 +40,8 @@ class Flux(HealthReader):
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
         """Return how far a domain's Kustomization has applied a commit."""
-        kustomization = objects.get(("Kustomization", domain.namespace, domain.name))
-        name = f"Kustomization {domain.namespace}/{domain.name}"
+        kustomization = objects.get(self.follower(domain))
+        name = name_of(self.follower(domain))
         if kustomization is None:
             return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
         status = kustomization.get("status") or {}
@@ -58,9 +59,13 @@ class Flux(HealthReader):
             return Health("waiting", str(fetched.get("message", "")), at, failing=True)
         return Health("waiting", "has not applied the commit yet", name)
 
+    def follower(self, domain: ClusterDomain) -> Key:
+        """Return the domain's Kustomization."""
+        return "Kustomization", domain.namespace, domain.name
+
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
         """Return the commit that a domain's Kustomization has applied."""
-        kustomization = objects.get(("Kustomization", domain.namespace, domain.name)) or {}
+        kustomization = objects.get(self.follower(domain)) or {}
         return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
     def _service_health(

@@ -122,7 +122,7 @@ class HealthReader(ABC):
         """Return how far a domain has applied a commit."""
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return how far a release is at a commit: first applied, then started or removed."""
+        """Return how far a cluster is with a release of a commit: applied, started or removed."""
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain
@@ -131,7 +131,7 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far an applied commit has started a release, or removed it if unwanted."""
+        """Return whether a release of an applied commit runs, or is gone if it must not run."""
         key = self._key(target)
         item = objects.get(key)
         if not target.wanted:
@@ -141,6 +141,10 @@ class HealthReader(ABC):
         if not target.by_helm:
             return deployment_health(item)
         return self._service_health(target, item, commit, objects, history)
+
+    @abstractmethod
+    def follower(self, domain: ClusterDomain) -> Key:
+        """Return the object that applies a domain's folder; the bootstrap file makes it."""
 
     @abstractmethod
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
@@ -156,7 +160,7 @@ class HealthReader(ABC):
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far a service with an existing object has started."""
+        """Return how far a service has started whose object exists."""
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:

@@ -29,7 +29,7 @@ def book(
         key: the key of the claim.
         current: the demand's claim on the same subject before the request.
         now: when the request was received; a claim that only renews keeps its booking time.
-        joined: whether a join books it, which keeps what the current claim holds.
+        joined: whether a join books it; a join also keeps what the current claim holds.
     """
     claim = Claim(
         held=one.held.booked(),

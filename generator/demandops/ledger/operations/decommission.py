@@ -7,33 +7,39 @@ shares: it named the other requesters, who might never release them.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Decommission
 from demandops.errors import Fault, Refused, fault, suggestion
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.waiting import of_requester
 from demandops.subject import Subject, SubjectKind
 
 
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Release all claims of a node or a requester.
+    """Release all claims of a node or a requester, and the demands that wait for it alone.
 
     Raises:
         Refused: if it holds nothing.
     """
-    start, claims = ledger, dict[str, Claim]()
+    start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
+    nodes = request.nodes or (request.id,)
     if "node" in request.kinds:
-        claims |= {f"{c.subject} {c.demand}": c for c in claims_needing(ledger, request.id)}
+        needing = (c for node in nodes for c in claims_needing(ledger, node))
+        claims |= {f"{c.subject} {c.demand}": c for c in needing}
     if "requester" in request.kinds:
         held = ledger.claims_of_requester(request.id)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
+        waiting = tuple(one.demand for one in of_requester(ledger.waiting, request.id))
     for claim in claims.values():
-        ledger = ledger.replace(claim.key, _reduced(claim, request))
+        ledger = ledger.replace(claim.key, _reduced(claim, request, nodes))
     changes = claim_changes(start, ledger, [claim.key for claim in claims.values()])
-    if not changes:
+    if not changes and not waiting:
         raise Refused([_nothing_held(start, request)])
-    return ledger, Changes(claims=changes)
+    return ledger.without_waiting(waiting), Changes(claims=changes, waiting=waiting)
 
 
 def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
@@ -48,10 +54,13 @@ def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
     ]
 
 
-def _reduced(claim: Claim, request: Decommission) -> Claim | None:
+def _reduced(claim: Claim, request: Decommission, nodes: Iterable[str]) -> Claim | None:
     if "requester" in request.kinds and request.id in claim.requesters:
         return None
-    return claim.without_node(request.id) if claim.held.needs(request.id) else claim
+    left: Claim | None = claim
+    for node in nodes:
+        left = left.without_node(node) if left and left.held.needs(node) else left
+    return left
 
 
 def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:

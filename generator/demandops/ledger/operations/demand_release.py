@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from demandops.demand.demand_request import Release
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
-from demandops.ledger.operations.ownership import owned_claims
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
-    """Release all claims of a demand.
+    """Release all claims of a demand; if it waits for room, it stops waiting.
 
     Raises:
         Refused: if the demand holds nothing or belongs to other requesters.
     """
-    held = owned_claims(ledger, request)
-    after = ledger.without(held)
-    return after, Changes(claims=claim_changes(ledger, after, [claim.key for claim in held]))
+    waited = (request.demand,) * is_waiting(ledger, request)
+    held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)
+    after = ledger.without(held).without_waiting(waited)
+    claims = claim_changes(ledger, after, [claim.key for claim in held])
+    return after, Changes(claims=claims, waiting=waited)

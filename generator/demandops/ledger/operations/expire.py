@@ -5,7 +5,8 @@ from __future__ import annotations
 from datetime import datetime
 
 from demandops.demand.demand_request import Expire
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
 
 
 def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:

@@ -8,7 +8,8 @@ from datetime import datetime
 from demandops.demand.claim import ClaimKey, demand_id
 from demandops.demand.demand_request import Join
 from demandops.errors import Fault, Refused
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.booking import book
 from demandops.ledger.operations.conflicts import conflicts
 
@@ -32,7 +33,8 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     changes = claim_changes(start, ledger, keys)
     if not changes:
         return start, Changes()
-    # a join that only renews must not make a repeat a new shutdown: it would end another demand
+    # A join that only renews keeps the record of a shutdown. Without it a repeated shutdown would
+    # count as a new one and end another demand.
     adds = not all(change.only_renews for change in changes)
     shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
     return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)

@@ -7,16 +7,21 @@ from datetime import datetime
 
 from demandops.demand.demand_request import Renew
 from demandops.demand.lease import Term
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
-from demandops.ledger.operations.ownership import owned_claims
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
     """Renew each lease of a demand for its own term; claims without a lease stay as they are.
 
+    A waiting demand has no lease yet, and keeps its place.
+
     Raises:
         Refused: if the demand holds nothing or belongs to other requesters.
     """
+    if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
+        return ledger, Changes()
     start = ledger
     held = owned_claims(ledger, request)
     for claim in held:

@@ -13,6 +13,18 @@ from demandops.errors import Refused, fault
 from demandops.ledger.ledger import Ledger
 
 
+def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
+    """Return whether the request's demand waits for room.
+
+    Raises:
+        Refused: if it belongs to other requesters.
+    """
+    waiting = ledger.waiting.get(request.demand)
+    if waiting is not None:
+        _refuse_others(waiting.requesters, request)
+    return waiting is not None
+
+
 def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
     """Return the claims of the request's demand.
 
@@ -37,7 +49,11 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
 
 def refuse_other_owners(held: Iterable[Claim], request: DemandRequest) -> None:
     """Raise :class:`Refused` if the claims belong to none of the request's requesters."""
-    owners = sorted({requester for claim in held for requester in claim.requesters})
+    _refuse_others({requester for claim in held for requester in claim.requesters}, request)
+
+
+def _refuse_others(owners: Iterable[str], request: DemandRequest) -> None:
+    owners = sorted(owners)
     if owners and not set(owners) & set(request.requesters()):
         message = (
             f"'{request.demand}' is a demand of {', '.join(owners)}; name one of them, or choose "

@@ -7,10 +7,11 @@ from datetime import datetime
 from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import Put
 from demandops.errors import Fault, Refused
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.booking import book
 from demandops.ledger.operations.conflicts import conflicts
-from demandops.ledger.operations.ownership import refuse_other_owners
+from demandops.ledger.operations.ownership import is_waiting, refuse_other_owners
 
 
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
@@ -22,7 +23,8 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
     refuse_other_owners(held, request)
-    # a demand does not contradict itself: it may move an application
+    waited = (demand,) * is_waiting(ledger, request)
+    # a demand's own claims are no conflict: it may move its application
     ledger = others = ledger.without(held)
     faults: list[Fault] = []
     keys = [claim.key for claim in held]
@@ -36,4 +38,5 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
         keys.append(key)
     if faults:
         raise Refused(faults)
-    return ledger, Changes(claims=claim_changes(start, ledger, keys))
+    changes = Changes(claims=claim_changes(start, ledger, keys), waiting=waited)
+    return ledger.without_waiting(waited), changes

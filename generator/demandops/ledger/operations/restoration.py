@@ -16,8 +16,9 @@ from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded, DemandRequest, Put
 from demandops.demand.lease import Lease, Term
 from demandops.errors import Fault, Refused, fault
+from demandops.ledger.claim_changes import Changes, ClaimChange, claim_changes
 from demandops.ledger.claim_file import path_of
-from demandops.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 
 _SHOWN = 20
@@ -76,7 +77,7 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 def _same(one: Claim | None, other: Claim | None) -> bool:
     if one is None or other is None:
         return one is other
-    if one.keeping_override is not None:  # when the override kept it does not matter
+    if one.keeping_override is not None:  # the booking time of a kept claim does not matter
         one = replace(one, booked=other.booked)
     return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
 
@@ -110,7 +111,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
     """Yield why restored claims are not valid in the current configuration."""
     for change in _changes(world.ledger, request):
         after = change.after
-        if after is None or after.keeping_override is not None:  # overrides decide about these
+        if after is None or after.keeping_override is not None:  # overrides decide these
             continue
         booking = request_for(after)
         for found in (

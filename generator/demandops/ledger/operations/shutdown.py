@@ -14,7 +14,8 @@ from datetime import datetime
 from demandops.demand.claim import Claim, ClaimKey, demand_id
 from demandops.demand.demand_request import Demanded, Shutdown
 from demandops.errors import Fault, Refused, fault
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdown
 from demandops.subject import TopicKey
 
@@ -33,7 +34,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
     taken: dict[tuple[ClaimKey, str], set[TopicKey]] = {}
     for one in request.demanded:
         for requester in one.requesters:
-            # look in ``start``: what is listed twice is taken once
+            # look in ``start``, so that a topic that is listed twice is taken once
             claims = _claims_meant(start, request, one, requester)
             for words, claim, held in _holds(one, requester, claims):
                 if claim is None:
@@ -56,7 +57,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
 
 
 def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: str) -> list[Claim]:
-    """Return the claims to take a requester's holds from, in the order to try."""
+    """Return the claims that a shutdown may mean for a requester, the likeliest first."""
     own = demand_id(request.id, one.requesters)
     claims = ledger.claims_held_by(requester, one.held.subject)
     return sorted(

@@ -15,7 +15,7 @@ from demandops.config.policy import matches
 from demandops.demand.application import Application
 from demandops.demand.demand_request import Demanded, DemandRequest
 from demandops.errors import Fault
-from demandops.ledger.ledger import Changes
+from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import (
     Traits,
@@ -56,7 +56,7 @@ def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
 
 
 def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
-    """Return the field of a demand that an override denies, or an empty text."""
+    """Return the field of a demand because of which an override denies it, or an empty text."""
     for selector in override.select:
         for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):

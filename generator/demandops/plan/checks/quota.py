@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 from demandops.config.policy import AccessDomain
 from demandops.errors import Fault, fault
-from demandops.ledger.ledger import Changes
+from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import keys_of
+from demandops.plan.release_keys import is_needed, keys_of
 from demandops.subject import Subject, SubjectKind
 
 
@@ -23,13 +23,20 @@ def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
         yield from _claims(requester, before, after, domain)
     touched = [claim for c in changes.claims if (claim := c.after or c.before)]
     apps = [claim.application for claim in touched if claim.is_on_application]
-    for node in sorted({node for app in apps for node in app.needed_nodes()}):
+    nodes = {node for app in apps for node in app.needed_nodes()}
+    nodes |= {
+        one.runs_at[app.node]
+        for app in apps
+        for one in after.config.services.get(app.appdef, {}).values()
+        if app.node in one.runs_at
+    }
+    for node in sorted(nodes):
         yield from _services(node, before, after)
 
 
 def _claims(requester: str, before: World, after: World, domain: AccessDomain) -> Iterator[Fault]:
     most = domain.quotas.claims_per_requester
-    if most is None or after.ledger.count_of_requester(requester) <= most:  # in all domains
+    if most is None or after.ledger.count_of_requester(requester) <= most:  # counts all domains
         return
     count = _held(requester, after, domain)
     if count > most and count > _held(requester, before, domain):
@@ -57,6 +64,10 @@ def _running(node: str, world: World) -> int:
     names = world.ledger.applications_at(node)
     subjects = (Subject(SubjectKind.APPLICATION, name) for name in names)
     keys = {key for subject in subjects for key in keys_of(world, subject)}
+    for name, one in world.config.definitions.items():
+        key = ServiceKey(name, node, for_cluster=True)
+        if node in one.nodes.values() and is_needed(world, key):
+            keys.add(key)
     return sum(isinstance(key, ServiceKey) and key.node == node for key in keys)
 
 

@@ -40,7 +40,7 @@ def faults(
     """Yield a fault for each new service or route with a topic that its node has already.
 
     Args:
-        request: the demand. One that only releases has no faults.
+        request: the demand; a release has no faults.
         before, after: the world before and after it.
         keys: the releases that it may change.
     """
@@ -83,7 +83,7 @@ def _of_service(
 def _clashes(
     world: World, key: ServiceKey, service: Service, topic: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield what else gives the node of ``key`` this topic, and the remedy."""
+    """Yield every other source of this topic on the node of ``key``, and the remedy, in words."""
     for other in _publishers(world, key.node, topic, but=key):
         yield f"{_words(other)} publishes on", _remedy(key, other, service, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
@@ -93,9 +93,10 @@ def _clashes(
 def _of_connection(
     one: Demanded, connection: Connection, before: World, after: World
 ) -> Iterator[Fault]:
-    """Yield a fault for each new route to a topic that a service published before, and still does.
+    """Yield a fault for each new route to a topic that a service publishes on the same node.
 
-    An application that moves may have its output brought back.
+    The service must have published it before the demand: if an application moves, a connection may
+    bring its output back to the old node.
     """
     for index, route in enumerate(connection.topics):
         _, node = route.sender_and_receiver(*connection.nodes)
@@ -114,7 +115,7 @@ def _of_connection(
 
 
 def _of_deliveries(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
-    """Yield a fault for each delivered topic that comes to its node from another node too."""
+    """Yield a fault for each delivered topic that its node already gets from somewhere else."""
     for flow in flows(after.config, app) if app.deliver else ():
         ids = after.ledger.connections_bringing(flow.receiver, flow.target)
         for id in ids if flow.delivery is not None else ():
@@ -123,6 +124,18 @@ def _of_deliveries(one: Demanded, app: Application, after: World) -> Iterator[Fa
                 yield one.fault(
                     f"deliver[{flow.delivery}].output",
                     f"{flow.target} comes to '{flow.receiver}' by '{id}' already; leave it out",
+                    code="conflict",
+                )
+                continue
+            routes = (
+                route for c in after.ledger.connection_claims(id) for route in c.connection.topics
+            )
+            read = {one.read_topic for one in routes if one.written_topic == flow.target}
+            for topic in sorted(read - {flow.topic})[:1]:
+                yield one.fault(
+                    f"deliver[{flow.delivery}].topic",
+                    f"{flow.target} of '{flow.receiver}' is made from {topic} already; choose "
+                    "another topic",
                     code="conflict",
                 )
 
@@ -143,9 +156,9 @@ def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
 def _publishers(
     world: World, node: str, topic: str, *, but: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
-    """Yield the services on a node that publish ``topic``, without ``but``.
+    """Yield the services on a node that publish ``topic``, except ``but``.
 
-    An appdef's pattern says which instance of its service would, and the ledger whether it runs.
+    The patterns of appdefs tell which instances would publish it, the ledger which of them run.
     """
     for services in world.config.services.values():
         for name, service in services.items():
@@ -156,21 +169,21 @@ def _publishers(
                 if match is None:
                     continue
                 found = (
-                    _named(world, node, name, service, match[1], but)
+                    _keys_called(world, node, name, service, match[1], but)
                     if others
-                    else _all(world, node, name)
+                    else _keys_on(world, node, service)
                 )
                 yield from (key for key in found if key != but and is_needed(world, key))
 
 
-def _named(
+def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the instances of a service on a node that are called ``instance``."""
+    """Yield the keys on a node for which ``{instance}`` of a service becomes ``instance``."""
     ledger, config, role = world.ledger, world.config, service.root
-    if service.scope == "node":
+    if service.scope in ("node", "cluster"):
         if naming.topic_part(node) == instance:
-            yield ServiceKey(name, node)
+            yield ServiceKey(name, node, for_cluster=service.scope == "cluster")
         return
     if role is None:
         for id in ledger.applications_in_topics(instance):
@@ -181,12 +194,17 @@ def _named(
         own = str(but.topic) if but and source == but.source else ""
         for topic in (usual,) if usual else ledger.usual_topics(role, source, but=own):
             yield ServiceKey(name, node, source=source, topic=topic)
-    for further in ledger.further_topics(role, instance):
-        yield ServiceKey(name, node, source=further.source, topic=further.topic)
+    for further, version in ledger.further_topics(role, instance):
+        own = "" if service.shared else version
+        yield ServiceKey(name, node, source=further.source, topic=further.topic, version=own)
 
 
-def _all(world: World, node: str, name: str) -> Iterator[ServiceKey]:
+def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
     """Yield the instances of a service on a node."""
+    name = service.name
+    if service.scope == "cluster":
+        yield ServiceKey(name, node, for_cluster=True)
+        return
     for id in world.ledger.applications_at(node):
         for key in keys_of(world, Subject(SubjectKind.APPLICATION, id)):
             if isinstance(key, ServiceKey) and (key.node, key.service) == (node, name):
@@ -196,7 +214,7 @@ def _all(world: World, node: str, name: str) -> Iterator[ServiceKey]:
 def _words(key: ServiceKey) -> str:
     if key.application is not None:
         return f"application '{key.application}'"
-    if key.scope == "node":
+    if key.scope in ("node", "cluster"):
         return key.service
     return f"{key.service} for {key.topic} of '{key.source}'"
 
@@ -206,7 +224,7 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
         return "use another application id"
     if other is None:
         return "let the connection give it another name there"
-    if "node" in (key.scope, other.scope):
+    if {"node", "cluster"} & {key.scope, other.scope}:
         return f"change this output in {service.file}"
     file = config.file_of(NODES_FILE, str(key.source))
     if key.source == other.source:

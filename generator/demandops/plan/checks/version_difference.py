@@ -1,6 +1,6 @@
-"""Version differences: a demand asks for another version than others of what they share.
+"""Version differences: demands that share an application or a service ask for different versions.
 
-``versions`` of the application definition says what follows: the demand is refused, or the newest
+``versions`` of the application definition says what happens: the demand is refused, or the newest
 version runs, which may need a person's approval first.
 """
 
@@ -14,7 +14,8 @@ from demandops.config.registry import ApplicationVersion, precedence
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded, DemandRequest
 from demandops.errors import Fault
-from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceRelease
@@ -28,12 +29,14 @@ from demandops.plan.running_version import (
 )
 from demandops.subject import Subject
 
-_STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "update", "upgrade")
+_STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
+_REFUSING = ("refuse", "separate")
+"""The policies that refuse a difference. A separate instance shares nothing, so it has none."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A demanded version, and the newest that others ask for, of ``what`` they share."""
+    """A demanded version of the shared ``what``, and the newest version that others ask for."""
 
     what: str
     appdef: str
@@ -43,14 +46,19 @@ class Difference:
     newer: bool
     """Whether the demanded version is the newer one."""
     fault: Fault
-    """The refusal, if the policy is to refuse."""
+    """The fault to report if the policy refuses the difference."""
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether it does; a demand that names no version takes a newer one that runs."""
-        return bool(asked) or self.newer or self.policy == "refuse"
+        """Return whether it matters to a demand; one that names no version takes a newer one."""
+        return bool(asked) or self.newer or self.is_refused
+
+    @property
+    def is_refused(self) -> bool:
+        """Whether the policy refuses it."""
+        return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
-        """Return what requires an approval, or an empty text."""
+        """Return why the difference needs a person's approval, or an empty text."""
         same = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
         if self.policy == "upgrade" or same:
             return ""
@@ -62,7 +70,7 @@ class Difference:
         return f"application definition '{self.appdef}', for {change}"
 
     def warning(self) -> str:
-        """Return what runs instead of the demanded version, or an empty text."""
+        """Return a warning that a newer version runs than the demanded one, or an empty text."""
         others = f"{self.what} runs version {self.others}, which others ask for"
         return "" if self.newer else f"{others}, not {self.demanded}"
 
@@ -74,7 +82,7 @@ def differences(
     changes: Iterable[ClaimChange],
     plans: Mapping[ReleaseKey, Release | None],
 ) -> Iterator[Difference]:
-    """Yield the versions that a demand asks for and others do not.
+    """Yield the differences between the versions that a demand and others ask for.
 
     Args:
         request: the demand.
@@ -99,7 +107,7 @@ def differences(
 
 
 def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
-    """Yield the version that a claim asks for, if it is not the newest that others ask for."""
+    """Yield the difference if a claim asks for another version than the newest of the others."""
     app, ledger = claim.application, after.ledger
     known = after.config.application_versions[app.appdef]
     if len({known[word].rank for word in ledger.versions_asked(app.id, known)}) < 2:
@@ -108,7 +116,7 @@ def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Diffe
     own, theirs = known.get(app.version, known[""]), newest_asked(others, app.id, known)
     if same_version(own, theirs):
         return
-    holders, word = _who_asks(others, app.subject, theirs, known)
+    holders, word = _first_asker(others, app.subject, theirs, known)
     message = (
         f"{_words(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
         f"{holders} in {_words(word, theirs)}; request the same version, or use another "
@@ -127,13 +135,13 @@ def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Diffe
         yield found
 
 
-def _who_asks(
+def _first_asker(
     ledger: Ledger,
     subject: Subject,
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim that asks for a version, and its word for it."""
+    """Return the requesters of the first claim that asks for a version, and how it names it."""
     for claim in ledger.claims_on(subject):
         word = claim.application.version
         if same_version(known.get(word, known[""]), version):
@@ -152,7 +160,7 @@ def _of_service(
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield the versions of a shared service that applications of the demand bring anew."""
+    """Yield the differences in a shared service that applications of the demand bring about."""
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:

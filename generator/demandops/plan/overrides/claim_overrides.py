@@ -20,7 +20,8 @@ from demandops.config.policy import matches
 from demandops.demand.application import Application
 from demandops.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey
 from demandops.demand.demand_request import Demanded
-from demandops.ledger.ledger import Changes, Ledger, claim_changes
+from demandops.ledger.claim_changes import Changes, claim_changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.subject import Subject, SubjectKind
 
@@ -29,7 +30,7 @@ from demandops.subject import Subject, SubjectKind
 class Traits:
     """The values that a selector is compared with; only a service's release has a ``service``.
 
-    Without ``requesters``, those of a selector are ignored.
+    If ``requesters`` is ``None``, the selector's requesters are not compared.
     """
 
     nodes: tuple[str, ...]
@@ -38,6 +39,19 @@ class Traits:
     appdefs: tuple[str, ...] = ()
     connections: tuple[str, ...] = ()
     service: str = ""
+
+
+def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
+    """Return the services of an application that overrides move, each with its node."""
+    moving = [one for one in world.overrides if one.node]
+    found: dict[str, str] = {}
+    for service in world.config.services.get(app.appdef, {}).values() if moving else ():
+        nodes = (app.chosen_node(service.name),)
+        traits = Traits(nodes, None, (app.id,), (app.appdef,), service=service.name)
+        for override in moving if service.is_movable else ():
+            if override.node and selects(override, traits, world.config):
+                found[service.name] = override.node
+    return found
 
 
 def traits_of(one: Claim | Demanded) -> Traits:
@@ -101,7 +115,7 @@ class UnsuspendedClaims(Ledger):
         return claim if claim and self._is_active(claim) else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        """Return the ``known`` versions that claims that are not suspended ask for."""
+        """Return the ``known`` versions that claims ask for, without suspended claims."""
         booked = Ledger.versions_asked(self, application, known)
         asked = {
             word
@@ -217,7 +231,7 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _needed(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the kept claim that a subject without demands needs, or ``None``."""
+    """Return the kept claim for a subject that no demand holds, or ``None`` if none keeps it."""
     for claim in existing:
         if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
             return claim

@@ -1,6 +1,6 @@
 """The effects of overrides on a planned release: version, node, replicas, images, or denial.
 
-Patches of Helm values are applied later, because a template makes the values.
+Patches of Helm values are applied later, after a template has made the values.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ def apply_overrides(release: Release, world: World) -> Release | None:
     by = []
     for override in world.overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
+        if override.node != release.node.id:  # a node is decided when claims are booked
+            effects = tuple(one for one in effects if one != "node")
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
         if effects:
@@ -50,7 +52,7 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release with the effects of these overrides; the last one wins."""
+    """Return a release with the effects of overrides; the last one wins."""
     by = tuple(by)
     if not by:
         return release
@@ -63,7 +65,7 @@ def apply_effects(
             chart = config.charts[release.service.chart].at(str(override.version))
             release = replace(release, chart=chart or release.chart)
         if "replicas" in effects and override.replicas is not None:
-            release = replace(release, replicas=overridden(planned, override.replicas))
+            release = replace(release, replicas=overridden(planned, override.replicas), keeps=None)
         if "node" in effects:
             node, domain = config.node_and_domain(str(override.node))
             release = replace(release, node=node, domain=domain)
@@ -75,7 +77,7 @@ def effects_on(release: Release, override: Override, config: Config) -> tuple[st
     possible = {"hold"}
     if isinstance(release, ServiceRelease):
         known = config.charts[release.service.chart].versions()
-        possible |= {"values", "replicas", "node"}
+        possible |= {"values", "replicas"} | ({"node"} if release.service.is_movable else set())
         possible |= {"version"} if override.version in known else set()
     elif override.patches_clients():
         possible |= {"values"}
@@ -84,9 +86,12 @@ def effects_on(release: Release, override: Override, config: Config) -> tuple[st
 
 
 def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
-    nodes = (release.node.id,)
+    nodes: tuple[str, ...] = (release.node.id,)
     if isinstance(release, ServiceRelease):
         appdefs = {claim.application.appdef for claim in claims}
+        if release.service.is_movable:  # where it runs without overrides
+            chosen = {one.application.chosen_node(release.key.service) for one in claims}
+            nodes = tuple(sorted(chosen)) or nodes
         return Traits(
             nodes,
             release.requesters,

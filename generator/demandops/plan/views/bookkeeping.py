@@ -1,4 +1,4 @@
-"""Bookkeeping: what is demanded, and for each service, connection and topic, who requests it.
+"""Bookkeeping: who requests each service, connection and topic, and what each demand holds.
 
 This is Table III, column 4, of the paper. It is derived from claims and stored nowhere.
 """
@@ -7,16 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
+from datetime import datetime
 from typing import Any, Literal, TypeAlias
 
+from demandops.config.inventory import amount_text
 from demandops.demand.claim import Claim, requesters_of
+from demandops.ledger.waiting import in_turn
 from demandops.ledger.world import World
+from demandops.plan.nodes.capacity import whole_usage
 from demandops.plan.overrides.claim_overrides import suspended_claims, without_suspended
 from demandops.plan.planner import connection_topics, demanded_inputs
 from demandops.plan.release import ServiceRelease, claims_of
 from demandops.plan.views import release_causes
-from demandops.subject import SubjectKind
+from demandops.subject import Subject, SubjectKind
 
+_LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
 _Requesters: TypeAlias = dict[str, list[str]]
 """Topic → who requests it, sorted."""
 
@@ -66,15 +71,47 @@ class SuspendedEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class Bookkeeping:
-    """The whole view: services by release name, connections by id, both sorted.
+class WaitingEntry:
+    """A demand that waits for room, and since when."""
 
-    ``suspended`` are the claims that an override suspends; they are in neither list.
+    demand: str
+    requesters: list[str]
+    since: str
+    priority: int
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceEntry:
+    """How much services request of a node's resource, and its capacity, as quantities."""
+
+    requested: str
+    capacity: str
+
+
+@dataclass(frozen=True, slots=True)
+class DemandEntry:
+    """One demand that holds claims. ``action`` is the ROS action that carries such demands."""
+
+    action: Literal["Demand", "DeploymentRequest"]
+    request: str
+    requesters: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Bookkeeping:
+    """The whole view: services by release name, connections and demands by id, all sorted.
+
+    ``suspended`` are the claims that an override suspends; they are in no service or connection.
+    ``nodes`` are those that declare a capacity, each with its resources. ``waiting`` are
+    the demands that wait for room, in the order in which they get it.
     """
 
     services: dict[str, ServiceEntry]
     connections: dict[str, ConnectionEntry]
+    demands: dict[str, DemandEntry]
     suspended: list[SuspendedEntry]
+    nodes: dict[str, dict[str, ResourceEntry]]
+    waiting: list[WaitingEntry]
 
 
 def bookkeeping(world: World) -> Bookkeeping:
@@ -120,7 +157,57 @@ def bookkeeping(world: World) -> Bookkeeping:
         )
         for claim, override in suspended_claims(world)
     ]
-    return Bookkeeping(dict(sorted(services.items())), connections, suspended)
+    waiting = [
+        WaitingEntry(one.demand, list(one.requesters), _time(one.since), one.priority)
+        for one in in_turn(world.ledger.waiting)
+    ]
+    return Bookkeeping(
+        dict(sorted(services.items())),
+        connections,
+        _demands(world),
+        suspended,
+        _nodes(world),
+        waiting,
+    )
+
+
+def _time(moment: datetime) -> str:
+    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
+    """Return what is requested of the nodes that declare a capacity, sorted."""
+    usage = whole_usage(world)
+    found: dict[str, dict[str, ResourceEntry]] = {}
+    machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
+    for id, node in sorted(machines.items()):
+        listed = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
+        limits = ((name, node.most(name)) for name in sorted(listed))
+        resources = {
+            name: ResourceEntry(amount_text(usage.of(id, name), name), amount_text(most, name))
+            for name, most in limits
+            if most is not None
+        }
+        found |= {id: resources} if resources else {}
+    return found
+
+
+def _demands(world: World) -> dict[str, DemandEntry]:
+    """Return the demands that hold claims; claims that overrides keep belong to no demand."""
+    found: dict[str, list[Claim]] = {}
+    for kind in SubjectKind:
+        for id in world.ledger.subjects(kind):
+            for claim in world.ledger.claims_on(Subject(kind, id)):
+                if claim.keeping_override is None:
+                    found.setdefault(claim.demand, []).append(claim)
+    return {
+        demand: DemandEntry(
+            "DeploymentRequest" if claims[0].joined else "Demand",
+            claims[0].request,
+            list(requesters_of(claims)),
+        )
+        for demand, claims in sorted(found.items())
+    }
 
 
 def _requesters_of_topics(claims: Iterable[Claim]) -> _Requesters:
@@ -135,7 +222,7 @@ def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _
     found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
     for claim in claims_of(release, active.ledger):
         for role, topic, key in demanded_inputs(active, release, claim.application):
-            if topic in found[role]:  # a claim that a person wrote may name it otherwise
+            if topic in found[role]:  # a person may have written a claim with another name
                 found[role][topic].update(claim.holders(key))
     return {role: _sorted(topics) for role, topics in found.items()}
 
@@ -147,12 +234,10 @@ def _sorted(topics: dict[str, set[str]]) -> _Requesters:
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
     """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``.
 
-    ``suspended`` is left out if it is empty.
+    ``demands``, ``suspended``, ``nodes`` and ``waiting`` are left out if they are empty.
     """
     data = asdict(view) | {"commit": commit}
-    if not view.suspended:
-        del data["suspended"]
-    return data
+    return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +283,7 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield what is to be said of an entry where it differs from another of the same name."""
+    """Yield the facts of an entry; those that ``other`` lacks show how the two differ."""
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"
@@ -215,7 +300,7 @@ def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
     topics, known = _topics(entry), _topics(other)
     for what, who in sorted(topics.items()):
         yield what
-        # who comes or goes altogether is named above
+        # the requesters that ``other`` lacks are named above
         yield from (f"{what} for {one}" for one in who if what in known and one in other.requesters)
 
 

@@ -1,10 +1,10 @@
-"""The override report: what each override does now, for ``demandops overrides`` and ``check``."""
+"""The override report: what each override does now, for ``get overrides`` and ``check``."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
@@ -15,9 +15,10 @@ from demandops.plan.overrides import claim_overrides
 from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.release_keys import all_keys
+from demandops.plan.release_keys import all_keys, keys_of_claims
 
-State = Literal["in force", "expired", "matches nothing"]
+State = Literal["in force", "held back", "expired", "matches nothing"]
+"""``held back``: another override holds every file that this override would change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +33,35 @@ class Entry:
 
 def override_report(world: World, now: datetime) -> list[Entry]:
     """Return every override, sorted by name, with what it does."""
+    if not world.config.overrides:
+        return []
     releases = _releases(world)
     claims = _claims(world)
     found = []
     for name, override in sorted(world.config.overrides.items()):
         applied = sorted(releases[name], key=lambda one: one.name), claims[name]
         state: State = "in force" if any(applied) else "matches nothing"
+        if applied[0] and not applied[1] and all(_is_held(one, override) for one in applied[0]):
+            state = "held back"
         expired = override.end is not None and override.end <= now
         if expired or override not in world.overrides:
             state, applied = "expired", ([], [])
         found.append(Entry(override, state, tuple(applied[0]), tuple(applied[1])))
     return found
+
+
+def affected_releases(entry: Entry, world: World) -> list[Release]:
+    """Return the releases that an override changes, denies, or stops by suspending claims."""
+    others = {name: one for name, one in world.config.overrides.items() if one != entry.override}
+    without = World(replace(world.config, overrides=others), world.ledger)
+    runs = {*all_keys(world)} if entry.claims else set()
+    needed = (key for key in keys_of_claims(without, entry.claims) if key not in runs)
+    stopped = [one for one in (plan(without, key) for key in needed) if one is not None]
+    return sorted({one.name: one for one in (*entry.releases, *stopped)}.values(), key=_name)
+
+
+def _name(release: Release) -> str:
+    return release.name
 
 
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
@@ -57,6 +76,12 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             )
         elif entry.state == "matches nothing":
             yield override.path, "matches nothing now; if it should, correct select"
+        elif entry.state == "held back":
+            yield (
+                override.path,
+                "changes nothing while an override with hold keeps the same files; remove one of "
+                "the two, or give this one a higher priority",
+            )
         elif doubled := sorted({*_doubled(entry)}):
             yield (
                 override.path,
@@ -66,8 +91,14 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             )
 
 
+def _is_held(release: Release, override: Override) -> bool:
+    """Return whether a hold of another override keeps this one from changing a release."""
+    effects = next((effects for by, effects in release.shaping.by if by == override), ())
+    return release.shaping.held and "hold" not in effects and {*effects} != {"keep"}
+
+
 def _doubled(entry: Entry) -> Iterator[str]:
-    """Yield the services that publish everything more than once by an override."""
+    """Yield the services that an override makes publish each message several times."""
     for release in entry.releases if (entry.override.replicas or 0) > 1 else ():
         if isinstance(release, ServiceRelease):
             service = release.service

@@ -1,7 +1,7 @@
-"""Warnings about access domains: what the cluster will refuse, and what it cannot close.
+"""Warnings about access domains and nodes, which ``demandops check`` shows.
 
-``demandops check`` shows them. They are no faults: a chart renders some kinds only with certain
-values, which only Helm knows.
+They tell what the cluster will refuse, and which access it cannot prevent. They are not faults: a
+chart may render a kind only with certain values, which only Helm knows.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import groupby
 
-from demandops import strict_yaml
-from demandops.config.config import DOMAINS_FILE, Config
+from demandops.charts import chart_files
+from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.config.policy import AccessDomain, matches
 from demandops.connections.connection import Connection
 from demandops.demand.permission import PEERS, needed_access
-from demandops.errors import Fault, InvalidInput, fault
+from demandops.errors import Fault, fault
+from demandops.ledger.operations.drain import Drain
 from demandops.ledger.world import World
+from demandops.plan.nodes.capacity import overcommitted, whole_usage
+from demandops.plan.nodes.relocation import following_overrides, with_moves
 from demandops.quoting import quoted
 
 _KIND = re.compile(r"^kind:[ \t]*(?P<kind>[^#\n]*)", re.MULTILINE)
@@ -33,6 +36,31 @@ def warnings(world: World) -> Iterator[Fault]:
     yield from _charts(config)
     yield from _open_by_host_network(config)
     yield from _connections_of_before(world)
+    yield from _above_capacity(world)
+    yield from _drained(world)
+    for path, text in following_overrides(world).stays:
+        yield fault("node", text).within(path)
+
+
+def _drained(world: World) -> Iterator[Fault]:
+    """Yield for each drained node which of its applications will move, and which will stay."""
+    for node in world.config.drained_nodes:
+        if world.ledger.applications_on.get(node):
+            drain = with_moves(Drain(node), world, whole_usage(world))
+            file = world.config.file_of(NODES_FILE, world.config.host_of(node))
+            for text in (*drain.moved, *drain.stays):
+                yield fault("", f"'{node}' is drained: {text}").within(file)
+
+
+def _above_capacity(world: World) -> Iterator[Fault]:
+    """Yield a warning for each node on which services request more than its capacity."""
+    for node, excess in overcommitted(world, whole_usage(world)):
+        message = (
+            f"{excess}; running services stay, but nothing more is booked there; raise the "
+            "capacity, or move something"
+        )
+        file = world.config.file_of(NODES_FILE, node.id)
+        yield fault("", f"'{node.id}': {message}").within(file)
 
 
 def _connections_of_before(world: World) -> Iterator[Fault]:
@@ -56,7 +84,7 @@ def _connections_of_before(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield what is open between access domains because pods use the host's network."""
+    """Yield a warning where pods with the host's network can reach another access domain."""
     nodes = [
         (config.domain_of[node.id].name, node)
         for node in config.nodes.values()
@@ -67,8 +95,8 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
         if config.domains[name].network == "namespace":
             ids = [node.id for _, node in group]
             message = (
-                f"network: namespace of access domain '{name}' does not hold for pods with the "
-                f"host's network, as on {_some(ids)}; set hostNetwork: false for these nodes, or "
+                f"network: namespace of access domain '{name}' has no effect on pods with the "
+                f"host's network, as on {_listed(ids)}; set hostNetwork: false for these nodes, or "
                 "separate their network yourself"
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
@@ -86,7 +114,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
             yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
 
 
-def _some(ids: list[str]) -> str:
+def _listed(ids: list[str]) -> str:
     shown = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
     return shown if len(ids) <= _MOST_NODES else f"{shown} and {len(ids) - _MOST_NODES} more"
 
@@ -94,6 +122,7 @@ def _some(ids: list[str]) -> str:
 def _charts(config: Config) -> Iterator[Fault]:
     """Yield a warning for each kind in a chart of the state repo that a domain may not use."""
     for folder, domains in sorted(_domains_of_charts(config).items()):
+        yield from _dependencies(folder, config.files)
         texts = {path: text for path, text in config.files.items() if path.startswith(f"{folder}/")}
         for path in sorted(texts):
             name = path.removeprefix(f"{folder}/")
@@ -101,12 +130,10 @@ def _charts(config: Config) -> Iterator[Fault]:
                 yield from _refused(path, "", "CustomResourceDefinition", domains, config)
             elif _TEMPLATE.fullmatch(name):
                 yield from _template(path, texts[path], domains, config)
-            elif name == "Chart.yaml":
-                yield from _dependencies(path, texts)
 
 
 def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return the access domains where each chart's folder may run, by what their rules allow."""
+    """Return chart folder → the access domains whose rules let the chart run there."""
     found: dict[str, list[AccessDomain]] = {}
     for appdef, services in config.services.items():
         domains = [
@@ -116,8 +143,9 @@ def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
         ]
         for service in services.values():
             for source in config.charts[service.chart].sources():
-                if source.folder:
-                    known = found.setdefault(source.folder, [])
+                top = source.folder
+                for folder in chart_files.folders(top, config.files) if top else ():
+                    known = found.setdefault(folder, [])
                     known += [domain for domain in domains if domain not in known]
     return found
 
@@ -130,7 +158,7 @@ def _template(path: str, text: str, domains: list[AccessDomain], config: Config)
             yield from _refused(path, line, plain[1], domains, config)
         else:
             message = (
-                f"kind {quoted(value)} is computed; see yourself that its access domain may have it"
+                f"kind {quoted(value)} is computed; check yourself that its access domain allows it"
             )
             yield fault(line, message).within(path)
 
@@ -148,18 +176,12 @@ def _refused(
             yield fault(line, message).within(path)
 
 
-def _dependencies(path: str, texts: Mapping[str, str]) -> Iterator[Fault]:
+def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
     """Yield a warning for each subchart that is not there as files."""
-    try:
-        data = strict_yaml.load(texts[path], path)
-    except InvalidInput:  # reported as a fault of the chart
-        return
-    listed = data.get("dependencies") if isinstance(data, dict) else None
-    for index, one in enumerate(listed if isinstance(listed, list) else ()):
-        name = one.get("name") if isinstance(one, dict) else None
-        if f"{path.removesuffix('Chart.yaml')}charts/{name}/Chart.yaml" not in texts:
+    for one in chart_files.dependencies(folder, files):
+        if one.folder is None and f"{folder}/charts/{one.name}/Chart.yaml" not in files:
             message = (
-                f"{quoted(str(name))} is not unpacked in charts/, so its kinds are not known; see "
-                "yourself that its access domain may have them"
+                f"{quoted(one.name)} is not unpacked in charts/, so its kinds are not known; "
+                "check yourself that its access domain allows them"
             )
-            yield fault(f"dependencies[{index}]", message).within(path)
+            yield fault(f"dependencies[{one.index}]", message).within(f"{folder}/Chart.yaml")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from demandops.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
 from demandops.config.override import OVERRIDES_ROOT, Override
@@ -34,12 +34,16 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
         ledger: the ledger without suspended claims.
         release: the release that runs.
     """
-    claims = (claim for claim in claims_of(release, ledger) if _takes(claim, release))
+    return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
+
+
+def by_booking(claims: Iterable[Claim]) -> list[Claim]:
+    """Return claims sorted by their booking time."""
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
-def _takes(claim: Claim, release: Release) -> bool:
-    """Return whether a claim on an application needs this service of it."""
+def needs(claim: Claim, release: Release) -> bool:
+    """Return whether a claim on an application or connection of a release needs this release."""
     if not isinstance(release, ServiceRelease):
         return True
     return takes(claim.application, release.service, release.key)

@@ -12,8 +12,8 @@ from typing import Literal
 
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.errors import Refused, fault
-from demandops.ledger import claim_file, recent_shutdowns
-from demandops.ledger.ledger import Changes
+from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
+from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
@@ -62,6 +62,8 @@ class Changeset:
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
     """The releases that may differ, as they are now."""
+    former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
+    """The same releases as they were before."""
 
 
 def build_changeset(
@@ -95,12 +97,21 @@ def build_changeset(
         files[recent_shutdowns.path_of(digest)] = (
             recent_shutdowns.text_of(shutdown) if shutdown else None
         )
+    for instance in changes.kept:
+        steps = after.ledger.kept.steps.get(instance)
+        files[kept_replicas.path_of(instance)] = (
+            kept_replicas.text_of(instance, steps) if steps else None
+        )
+    for demand in changes.waiting:
+        waits = after.ledger.waiting.get(demand)
+        files[waiting.path_of(demand)] = waiting.text_of(waits) if waits else None
     releases = []
     shaped: set[str] = set()
     blocked: list[str] = []
     now = {key: plan(after, key) for key in keys}
+    former = {key: plans.get(key) or _plan_leniently(before, key) for key in now}
     for key, new in now.items():
-        old = plans.get(key) or _plan_leniently(before, key)
+        old = former[key]
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         if old_path and old_path != new_path and read(old_path) is not None:
@@ -118,11 +129,11 @@ def build_changeset(
     check_files(files)
     _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda change: change.order)
-    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now)
+    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now, former)
 
 
 def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
-    """Refuse a file that grows above the limit; one that shrinks may still be above it."""
+    """Refuse a file that grows above the limit; a file that shrinks may stay above it."""
     faults = []
     for path, text in files.items():
         size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
@@ -177,7 +188,7 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
 
 def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
     before, after = _overrides(old), _overrides(new)
-    if not new.shaping.held:  # of a held file, only the comments change
+    if not new.shaping.held:  # in a held file, only the comments change
         before = (old.facts() if old else []) + before
         after = new.facts() + after
     old_facts, new_facts = frozenset(before), frozenset(after)

@@ -84,8 +84,8 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
 def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
     """Return the faults that keep releases from being planned or rendered.
 
-    A fault's file is the first that exists: a claim of the release that is in ``edited``, the
-    fault's own file, any claim of the release.
+    A fault names the first of these files that exists: a claim of the release that is in
+    ``edited``, the file that has the fault, any claim of the release.
     """
     faults: list[Fault] = []
     files: dict[ReleaseKey, list[str]] = {}
@@ -119,7 +119,7 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return what changes from ``old`` to ``new`` releases, and ``current`` to ``files``."""
+    """Return the changes from ``old`` to ``new`` releases, and from ``current`` to ``files``."""
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
         for path in sorted({*current, *files})
@@ -150,7 +150,7 @@ def preview(
 def _pairs(
     old: Mapping[ReleaseKey, Release], new: Mapping[ReleaseKey, Release]
 ) -> Iterator[tuple[Release | None, Release | None]]:
-    """Yield each release before and after; one that moved has another key and the same name."""
+    """Yield each release before and after; a release that moved is found by its name."""
     gone = {release.name: release for key, release in old.items() if key not in new}
     for key, release in new.items():
         yield old.get(key) or gone.pop(release.name, None), release
@@ -158,7 +158,7 @@ def _pairs(
 
 
 def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield the differences between two manifests as text, then how many more there are."""
+    """Yield the first differences between two manifests in words, then the number of others."""
     try:
         differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:

@@ -15,6 +15,7 @@ from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
+from demandops.render.gitops.bootstrap_digest import with_digest
 from demandops.render.gitops.node_rule import node_rule
 from demandops.render.gitops.paths import (
     bootstrap_path,
@@ -63,17 +64,20 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
 
 
 def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine: Engine) -> str:
-    return engine.text(
-        "argocd/bootstrap.yaml.j2",
-        cluster=cluster,
-        domains=domains,
-        node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
-        folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-        projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
-        urls=_sources(config),
-        repository=config.repo_settings,
-        branch=MAIN_BRANCH,
-        server=IN_CLUSTER,
+    return with_digest(
+        lambda digest: engine.text(
+            "argocd/bootstrap.yaml.j2",
+            digest=digest,
+            cluster=cluster,
+            domains=domains,
+            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
+            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+            projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
+            urls=_sources(config),
+            repository=config.repo_settings,
+            branch=MAIN_BRANCH,
+            server=IN_CLUSTER,
+        )
     )
 
 

@@ -63,7 +63,7 @@ def _suspend_flux(config: Config) -> Iterator[Step]:
             suspend = f"--type merge -p {_SUSPEND}"
             commands.append(f"{kubectl} patch kustomization {domain.name} {suspend}")
             commands.append(
-                f"{kubectl} get helmrelease -l {_of(domain)} -o name | "
+                f"{kubectl} get helmrelease -l {_label(domain)} -o name | "
                 f"xargs -r {kubectl} patch {suspend}"
             )
         yield Step(cluster, "suspend Flux, so that it does not prune the workloads", (*commands,))
@@ -76,10 +76,10 @@ def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
             commands.append(  # Helm's release records: a later Flux would continue from them
-                f"{kubectl} get helmrelease -l {_of(domain)} -o name | sed s,.*/,, | "
+                f"{kubectl} get helmrelease -l {_label(domain)} -o name | sed s,.*/,, | "
                 f"xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
             )
-            commands.append(f"{kubectl} delete {_FLUX_KINDS} -l {_of(domain)}")
+            commands.append(f"{kubectl} delete {_FLUX_KINDS} -l {_label(domain)}")
             commands.append(f"{kubectl} delete kustomization {domain.name}")
         commands += [
             f"kubectl -n {namespace} delete gitrepository {config.repo_settings.source}"
@@ -89,7 +89,7 @@ def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
         yield Step(cluster, description, (*commands,))
 
 
-def _of(domain: AccessDomain) -> str:
+def _label(domain: AccessDomain) -> str:
     """Return the label that Flux puts on everything that a domain's Kustomization applies."""
     return f"kustomize.toolkit.fluxcd.io/name={domain.name}"
 

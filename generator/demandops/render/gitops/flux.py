@@ -14,6 +14,7 @@ from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource
 from demandops.plan.release import ServiceRelease
 from demandops.render.engine import Engine
+from demandops.render.gitops.bootstrap_digest import with_digest
 from demandops.render.gitops.node_rule import node_rule
 from demandops.render.gitops.paths import (
     bootstrap_path,
@@ -43,9 +44,11 @@ def chart_object(name: str, chart: ChartSource) -> str:
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return the bootstrap files, and a placeholder and the chart sources for each domain."""
+    flux = config.repo_settings.flux
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
         for cluster, domains in domains_by_cluster(config).items()
+        if flux is not None and flux.url is not None
     }
     for cluster, domain in domains_in_use(config):
         folder = domain_folder(cluster, domain)
@@ -67,12 +70,15 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
 
 
 def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine: Engine) -> str:
-    return engine.text(
-        "flux/bootstrap.yaml.j2",
-        cluster=cluster,
-        domains=domains,
-        node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
-        folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-        repository=config.repo_settings,
-        branch=MAIN_BRANCH,
+    return with_digest(
+        lambda digest: engine.text(
+            "flux/bootstrap.yaml.j2",
+            digest=digest,
+            cluster=cluster,
+            domains=domains,
+            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
+            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+            repository=config.repo_settings,
+            branch=MAIN_BRANCH,
+        )
     )

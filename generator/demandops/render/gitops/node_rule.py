@@ -1,4 +1,4 @@
-"""The rule of a cluster that pods of an access domain run on nodes of the domain only.
+"""The rule by which a cluster lets pods of an access domain run only on the domain's nodes.
 
 It is an expression of the Common Expression Language over ``variables.selector``, a pod's node
 selector. For nodes with the default selector it has the patterns of the policy, so that one more
@@ -18,7 +18,7 @@ _SELECTOR = "variables.selector"
 
 
 def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
-    """Return the expression that is true for a selector of a node of the domain."""
+    """Return the expression that is true if a pod's selector names a node of the domain."""
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
     for node in config.nodes.values():

@@ -18,6 +18,7 @@ from demandops.decision import Decision, State
 from demandops.demand.demand_request import DemandRequest, Put
 from demandops.errors import DemandOpsError, InvalidInput, Refused, ShuttingDown, Withdrawn, fault
 from demandops.quoting import quoted
+from demandops.service.approvals.check_timer import CheckTimer
 from demandops.service.approvals.forge_worker import ForgeWorker
 from demandops.service.approvals.proposal import (
     Key,
@@ -53,14 +54,6 @@ from demandops.staterepo.write.proposal_branch import (
 
 log = logging.getLogger("demandops")
 
-CHECK_EMBEDDED_S = 1.0
-CHECK_REMOTE_S = 5.0
-"""The interval between checks of the branches; only a check shows that one was deleted."""
-_PAUSE_FACTOR = 9
-"""The pause after a check, as a multiple of its duration: checks take a tenth of the time."""
-
-_UNFINISHED = "unfinished"
-
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
 
@@ -86,10 +79,9 @@ class Approvals:
         self._with_targets = with_targets
         self._branches = ProposalBranches(repository)
         self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
-        self._interval = CHECK_EMBEDDED_S if repository.always_current else CHECK_REMOTE_S
+        self._timer = CheckTimer(repository.runtime, embedded=repository.always_current)
         self._proposals: dict[Key, Proposal] = {}
         self._changed: deque[str] = deque()
-        self._checked_at, self._check_began, self._rest_until, self._next_check = "", 0.0, 0.0, 0.0
         for ticket in demands.proposed:
             self._resume(ticket, admit_or_none(state, ticket.goal))
 
@@ -101,7 +93,7 @@ class Approvals:
             if key in self._proposals:  # an earlier run proposed the same demand
                 key = ("operation", ticket.operation)
             proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
-        if ticket.state == "proposed":  # what was withdrawn has an older record
+        if ticket.state == "proposed":  # a withdrawn ticket has an older record
             proposal.record = record
         proposal.tickets.append(ticket)
         proposal.requests += [request] if request else []
@@ -125,7 +117,8 @@ class Approvals:
             for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 self._delete_branch(proposal, self._branches.heads())
-                self._changed.append(proposal.branch)  # the check answers: it may be merged already
+                # the next check answers the demands, because their branch may be merged already
+                self._changed.append(proposal.branch)
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
@@ -162,7 +155,7 @@ class Approvals:
             branch = branch_name(request.demand or request.id, ticket.operation)
             proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
         elif isinstance(request, Put) and request not in proposal.requests:
-            # the next check answers these: a person may have merged them meanwhile
+            # the next check answers the withdrawn demands: a person may have merged them meanwhile
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
             proposal.requests = []
         if not self._demands.propose(ticket, proposal.record):
@@ -192,21 +185,14 @@ class Approvals:
         if not self._proposals:
             return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
-        if self._checked_at != _UNFINISHED and (
-            self._changed or any(ticket.state == "withdrawn" for ticket in tickets)
-        ):
-            return True
-        return self._runtime.monotonic() >= self._due_time(tip)
+        withdrawn = any(ticket.state == "withdrawn" for ticket in tickets)
+        return self._timer.is_due(tip, has_news=bool(self._changed) or withdrawn)
 
     def seconds_until_due(self, tip: str, longest: float) -> float:
         """Return the seconds until the next check; ``longest`` without proposals."""
         if not self._proposals:
             return longest
-        return min(longest, max(self._due_time(tip) - self._runtime.monotonic(), 0.05))
-
-    def _due_time(self, tip: str) -> float:
-        has_moved = self._checked_at not in (tip, _UNFINISHED)
-        return min(self._next_check, self._rest_until) if has_moved else self._next_check
+        return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
         """Fetch the commits of the branches, and plan the next check even if this one fails.
@@ -214,8 +200,7 @@ class Approvals:
         Raises:
             RemoteAway: if the remote cannot be reached.
         """
-        self._check_began = self._runtime.monotonic()
-        self._next_check, self._checked_at = self._check_began + self._interval, _UNFINISHED
+        self._timer.began()
         return self._branches.heads()
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
@@ -245,9 +230,7 @@ class Approvals:
                     self._runtime.failed(f"rebuilding {proposal.branch}", error)
                 else:
                     self._end(proposal, error)
-        ended = self._runtime.monotonic()
-        self._checked_at = str(snapshot.commit)
-        self._rest_until = ended + _PAUSE_FACTOR * (ended - self._check_began)
+        self._timer.ended(str(snapshot.commit))
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Carry out the verdict on a proposal."""
@@ -265,7 +248,7 @@ class Approvals:
         self._demands.answer(booked)
         proposal.drop(booked)
         if verdict.waiting:
-            if booked and not head:  # only a part was merged
+            if booked and not head:  # a person merged only some of the demands
                 proposal.record = replace(proposal.record, pushed=False)
             if not self._leave_out(proposal, verdict, snapshot, head):
                 self._changed.append(proposal.branch)
@@ -273,7 +256,7 @@ class Approvals:
             proposal.checked_at = tip
         elif not booked or head in proposal.record.commits:
             self._delete_branch(proposal, heads)
-        # the branch has none of these any more, so nobody can merge them
+        # the branch no longer has these demands, so nobody can merge them
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
         if not verdict.waiting:
@@ -288,7 +271,8 @@ class Approvals:
         recorded: RecordedOutcome | None,
     ) -> Receipt:
         commit = recorded.commit if recorded else str(snapshot.commit)
-        if isinstance(decision, InvalidInput) or decision.files:  # merged, and changed since
+        # merged, but a later commit changed the files
+        if isinstance(decision, InvalidInput) or decision.files:
             return Receipt(ticket.operation, ticket.name, "booked", commit)
         before = snapshot.state
         targets = targets_of_decision(before, decision) if self._with_targets else ()

@@ -31,7 +31,7 @@ _PREFIX = "awaiting approval: "
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The verdict on the demands of a proposal, some with their decision on the current main.
+    """The verdict on each demand of a proposal; some come with their decision on the current main.
 
     ``booked``: main has their claims. ``failed``: they were withdrawn or turned down, or can no
     longer be booked. ``free``: they no longer need approval. ``waiting``: they still do.
@@ -45,9 +45,9 @@ class Verdict:
 
 @dataclass(eq=False)
 class Proposal:
-    """Demands with one key.
+    """Demands that share a key (:func:`key_of`), and so a branch.
 
-    ``reasons`` name what requires approval. No commit of main up to ``searched_to`` has one of the
+    ``reasons`` say why approval is needed. No commit of main up to ``searched_to`` has one of the
     demands. ``checked_at`` is the commit of main at the last check. ``edited``: a person committed
     to the branch.
     """

@@ -12,7 +12,7 @@ FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
 """The longest delay while the remote cannot be reached."""
 LONGEST_TURN_S = 0.4
-"""The longest delay after another writer was first; a writer that waits long loses again."""
+"""The longest delay after another writer was first; with longer ones a writer loses again."""
 LIMIT_EMBEDDED = 20
 LIMIT_REMOTE = 200
 """How many demands to publish together: a push costs some 50 ms, moving a branch less than one."""
@@ -39,7 +39,7 @@ class Backoff:
             evaluating_s: seconds that it took to evaluate and commit them.
             pushing_s: seconds until the push was rejected.
         """
-        # who evaluates for longer than a push takes always loses to faster writers
+        # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
         self._away = FIRST_PAUSE_S

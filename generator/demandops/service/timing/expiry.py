@@ -1,4 +1,4 @@
-"""Which leases and overrides have ended, and when to check again.
+"""Which leases, overrides and kept replicas have ended, and when to check again.
 
 A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 jumps forward would end leases that were renewed in time, so after a jump every lease gets its full
@@ -14,9 +14,10 @@ from datetime import datetime, timedelta, timezone
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Expire
 from demandops.errors import InvalidInput
+from demandops.ledger.kept_replicas import Instance
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
-from demandops.plan.overrides.lifecycle import expired_overrides
+from demandops.plan.override_lifecycle import expired_overrides
 from demandops.quoting import quoted
 from demandops.runtime import Runtime
 from demandops.service.ticket import Receipt, Ticket
@@ -40,6 +41,8 @@ class LeaseExpiry:
         self._last = (runtime.now(), runtime.monotonic())
         self._jumped_at: datetime | None = None
         self._tried: dict[str, datetime] = {}
+        self._first: object = None
+        self._next_end: datetime | None = None
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, unless one was just answered.
@@ -48,7 +51,7 @@ class LeaseExpiry:
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
-        # forget what was released or renewed meanwhile
+        # forget demands that were released or renewed meanwhile
         self._tried = {d: at for d, at in self._tried.items() if at > now - _RETRY and d in ended}
         return [self._ticket(demand, now) for demand in ended if demand not in self._tried]
 
@@ -58,7 +61,7 @@ class LeaseExpiry:
         def tell(future: Future[Receipt]) -> None:
             self._tried[demand] = now
             error = future.exception()
-            if isinstance(error, InvalidInput):  # nobody else gets it as an answer
+            if isinstance(error, InvalidInput):  # no client gets this error, so report it here
                 self._runtime.failed(f"end of the lease of {quoted(demand)}", error)
 
         ticket.future.add_done_callback(tell)
@@ -81,7 +84,10 @@ class LeaseExpiry:
         Never zero, because an ended lease stays in the ledger if its release failed or if it was
         granted more time.
         """
-        end = ledger.next_lease_end()
+        first = ledger.first_to_end()
+        if first is not self._first:  # many leases may end in one minute
+            self._first, self._next_end = first, ledger.next_lease_end()
+        end = self._next_end
         return longest if end is None else _seconds_until(end, self._read_clocks(), longest)
 
     def _read_clocks(self) -> datetime:
@@ -139,6 +145,41 @@ class OverrideExpiry:
             for override in world.overrides
             if override.end
         ]
+
+
+class ScaleDown:
+    """Removes the extra replicas of services whose time is over, in a commit for each service."""
+
+    def __init__(self) -> None:
+        self._retry_at: dict[Instance, datetime] = {}
+        self._not_before = datetime.min.replace(tzinfo=timezone.utc)
+
+    def end_due(self, commits: CommitBatch, now: datetime) -> None:
+        """Commit each scale-down that is due; retry failed ones later."""
+        for instance in commits.head.state.ledger.kept.due(now):
+            if self._retry_at.get(instance, now) > now:
+                continue
+            try:
+                log.info("%s", commits.scale_down(instance, now))
+                self._retry_at.pop(instance, None)
+            except InvalidInput as error:
+                self._retry_at[instance] = now + _RETRY
+                for problem in error.faults:
+                    log.error("cannot scale down: %s; trying again later", problem)
+
+    def postpone(self, now: datetime) -> None:
+        """Remove no replicas for a while, because the commits could not be published."""
+        self._not_before = now + _RETRY
+
+    def is_due(self, ledger: Ledger, now: datetime) -> bool:
+        """Return whether to remove extra replicas now."""
+        retried = (self._retry_at.get(one, now) <= now for one in ledger.kept.due(now))
+        return self._not_before <= now and any(retried)
+
+    def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
+        """Return the seconds until the next check: at least one, at most ``longest``."""
+        end = ledger.kept.next_end()
+        return longest if end is None else _seconds_until(max(end, self._not_before), now, longest)
 
 
 def _seconds_until(time: datetime, now: datetime, longest: float) -> float:

@@ -1,6 +1,6 @@
 """When to fetch from the state repo while no demand comes.
 
-It does not call Git; its user reports the end of each fetch.
+It does not fetch itself; the caller fetches and reports the end of each fetch.
 """
 
 from __future__ import annotations

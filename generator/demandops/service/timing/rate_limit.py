@@ -45,7 +45,7 @@ class RateLimit:
         """Return how many demands were received in the minute up to this one."""
         self._forget_idle(received)
         seen = self._seen.pop(key, None) or deque()
-        self._seen[key] = seen  # at the end: ordered by who sent last
+        self._seen[key] = seen  # at the end, so that the longest idle come first
         while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
         operations = [known for _, known in seen]

@@ -1,4 +1,4 @@
-"""Signatures in verdicts: whether each commit of the generator is signed by an allowed key."""
+"""Adds to each verdict whether an allowed key has signed the generator's commit."""
 
 from __future__ import annotations
 

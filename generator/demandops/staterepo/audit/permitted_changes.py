@@ -1,4 +1,4 @@
-"""Which files a commit of the generator may change: generated ones and what its message names."""
+"""Which files a commit of the generator may change: generated files and claims that it names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from pygit2 import Commit
 
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import OVERRIDE_PREFIX
-from demandops.ledger import claim_file, ended_override_file, recent_shutdowns
+from demandops.ledger import (
+    claim_file,
+    ended_override_file,
+    kept_replicas,
+    recent_shutdowns,
+    waiting,
+)
 from demandops.settings import GENERATED_ROOTS, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import LogEntry
@@ -18,6 +24,15 @@ from demandops.staterepo.load import ledger_files
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
 _RECORDING = ("shutdown", "join", "rollback")
 """Operations that may record or forget recent shutdowns."""
+_RECORDS = tuple(
+    f"{root}/"
+    for root in (
+        ended_override_file.MARKERS_ROOT,
+        recent_shutdowns.SHUTDOWNS_ROOT,
+        kept_replicas.REPLICAS_ROOT,
+    )
+)
+"""The ledger's folders of records, which are not claims."""
 _REWRITING = ("follow", "upgrade")
 """Operations that may write a claim anew: its lease starts, or its schema changes."""
 _ENDING = ("follow", "upgrade", "expire-override")
@@ -25,7 +40,7 @@ _ENDING = ("follow", "upgrade", "expire-override")
 
 
 def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
-    """Yield the files that a commit changed although its message does not account for them.
+    """Yield the files that a commit changed but that its message gives no reason to change.
 
     These are files that people write, claims of demands that the message does not name, and claims
     that are not formatted as the generator writes them.
@@ -33,19 +48,15 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     if not commit.parents:
         return
     before, operation = commit.parents[0].tree, entry.first("Operation")
-    named = _named(entry)
+    named = _claims_named_by(entry)
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
             continue
         if root != claim_file.LEDGER_ROOT:
             yield path
-        elif path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
-            text = trees.read_text(commit.tree, path) or ""
-            if operation not in _ENDING or (blob and not ended_override_file.read({path: text})):
-                yield path
-        elif path.startswith(f"{recent_shutdowns.SHUTDOWNS_ROOT}/"):
-            if operation not in _RECORDING:
+        elif path.startswith(_RECORDS):
+            if not _may_record(commit, path, operation):
                 yield path
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
@@ -54,7 +65,7 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
             yield path
 
 
-def _named(entry: LogEntry) -> set[str]:
+def _claims_named_by(entry: LogEntry) -> set[str]:
     demands = {*entry.trailers.get("Demand-Id", ())}
     for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
         demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
@@ -62,7 +73,7 @@ def _named(entry: LogEntry) -> set[str]:
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
-    """Return whether a claim changed only its schema, or its lease started after approval."""
+    """Return whether a claim differs only in its schema, or in a lease that approval started."""
     before, after = (
         ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
     )
@@ -74,5 +85,21 @@ def _only_rewrites(commit: Commit, path: str) -> bool:
 
 
 def _is_canonical(commit: Commit, path: str) -> bool:
+    if path.startswith(f"{waiting.WAITING_ROOT}/"):
+        text = trees.read_text(commit.tree, path) or ""
+        waits = waiting.read(text, path)
+        return waits is not None and waiting.text_of(waits) == text
     claim = ledger_files.valid_claim_at(commit.tree, path)
     return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)
+
+
+def _may_record(commit: Commit, path: str, operation: str) -> bool:
+    """Return whether an operation may write or remove a record, a file of :data:`_RECORDS`."""
+    text = trees.read_text(commit.tree, path) or ""
+    if path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
+        return operation in _ENDING and (not text or bool(ended_override_file.read({path: text})))
+    if path.startswith(f"{recent_shutdowns.SHUTDOWNS_ROOT}/"):
+        return operation in _RECORDING
+    record = kept_replicas.read(text, path)
+    is_canonical = record is not None and kept_replicas.text_of(*record) == text
+    return operation not in (*_REWRITING, *_ENDING) and (not text or is_canonical)

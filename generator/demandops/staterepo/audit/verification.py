@@ -3,13 +3,13 @@
 A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
 proven before it. The second way relies on object ids, and on plans and files that depend on their
 input only. It does not trust which releases the generator considered affected: it plans and renders
-every release again if any input of its plan changed (:mod:`demandops.plan.traced_plan`), and
+every release again if any input of its plan changed (:mod:`demandops.plan.views.traced_plan`), and
 compares every file that differs in Git. The first and the last commit are proven whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import pygit2
@@ -19,11 +19,12 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import State, rendered_files
 from demandops.errors import InvalidInput, StateRepoError
 from demandops.ledger import ended_override_file
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.kept_replicas import Instance
 from demandops.ledger.world import World
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
-from demandops.plan.traced_plan import TracedPlan
+from demandops.plan.views.traced_plan import TracedPlan
 from demandops.render import release_file
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
@@ -32,6 +33,7 @@ from demandops.staterepo.audit.permitted_changes import disallowed_files
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.staterepo.load import ledger_files, state_in_effect
+from demandops.staterepo.load.snapshot import changed_kept_replicas
 
 _CHARTS = "/_charts/"
 
@@ -41,8 +43,8 @@ class Verdict:
     """Whether the generated files of a commit are those that ledger and configuration give.
 
     ``holds`` is true if nothing is wrong, or the commit is ``skipped``. ``touched`` are files that
-    the commit changed but may not change. ``signature`` says what is wrong with a required
-    signature, ``signer`` who signed.
+    the commit changed but may not change. ``signature`` says why a required signature is not valid,
+    ``signer`` who signed.
     """
 
     commit: str
@@ -89,16 +91,19 @@ class _Proof:
         ledger = self.state.ledger
         for change in changes:
             ledger = ledger.replace(change.key, change.after)
+        kept = dict(changed_kept_replicas(before, after))
+        for instance, steps in kept.items():
+            ledger = replace(ledger, kept=ledger.kept.replace(instance, steps))
         for path, blob in trees.differences(before, after, GENERATED_ROOTS):
             self._committed.pop(path, None)
             if blob is not None:
                 self._committed[path] = blob
         self.state, self._commit = replace(self.state, ledger=ledger), commit
-        self._render(changes)
+        self._render(changes, kept)
 
-    def _render(self, changes: Sequence[ClaimChange]) -> None:
+    def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
         """Plan and render the releases that changes affect, and those that overrides hold."""
-        for key, release in self._plan.advance(self.state.ledger, changes).items():
+        for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
             if release is not None and release.shaping.held:
@@ -153,7 +158,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         except _Unreadable as error:
             why = f"a file was not valid then: {error}"
             yield replace(verdict, skipped=why, holds=not verdict.touched)
-        except InvalidInput as error:  # the generator did render it then, so it must now
+        except InvalidInput as error:  # the generator could render it, so a verification must too
             yield replace(verdict, holds=False, fault=str(error.faults[0]))
         except StateRepoError as error:
             yield replace(verdict, holds=False, fault=str(error))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from demandops.errors import StateRepoError
 from demandops.quoting import quoted
+from demandops.staterepo.git.checkout import Checkout, is_checkout
 from demandops.staterepo.git.local_repository import LocalRepository
 from demandops.staterepo.git.remote_repository import (
     HAS_PASSWORD,
@@ -31,13 +32,19 @@ def is_url(address: str) -> bool:
 
 
 def connect(
-    address: str, folder: Path, notify: Notify = lambda text: None, *, allow_offline: bool = False
+    address: str,
+    folder: Path,
+    notify: Notify = lambda text: None,
+    *,
+    allow_offline: bool = False,
+    only_read: bool = False,
 ) -> StateRepository:
     """Open the state repo at a bare repository's folder, or at a URL that git clones to ``folder``.
 
     Args:
         notify: called with a text before work that takes a while.
         allow_offline: use an existing clone if its remote cannot be reached.
+        only_read: the folder may also be a checkout.
 
     Raises:
         StateRepoError: the address is not usable, or the remote cannot be reached.
@@ -48,16 +55,18 @@ def connect(
     try:
         path = Path(address).expanduser()
         is_folder = path.is_dir()
-    except (OSError, ValueError, RuntimeError) as error:  # ~x without a user x
+    except (OSError, ValueError, RuntimeError) as error:  # ``~x``, but there is no user x
         reason = getattr(error, "strerror", None) or str(error)
         raise StateRepoError(
             f"{quoted(address)} cannot be opened: {reason}; name the folder of a state repo"
         ) from None
     if not is_folder:
+        place = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise StateRepoError(
-            f"{address} does not exist; make a state repo with `demandops init {address} --bare`"
+            f"{address} does not exist{place}; correct the path, or make a state repo there with "
+            f"`demandops init {address} --bare`"
         )
-    return LocalRepository(path)
+    return Checkout(path) if only_read and is_checkout(path) else LocalRepository(path)
 
 
 def _check_url(url: str) -> None:

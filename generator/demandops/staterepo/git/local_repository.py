@@ -43,16 +43,9 @@ class LocalRepository(StateRepository):
             raise StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
-        borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
-        if borrowed.exists():
-            raise StateRepoError(
-                f"{path} borrows objects of another repository, which may remove them; copy them "
-                f"with `git -C {path} repack -a -d`, then remove {borrowed}"
-            )
         self.new = NewObjects(self.objects)
-        self.new.clean()
         try:
-            self._require_branch(path)
+            self._require_usable(path)
         except (pygit2.GitError, KeyError) as error:
             raise disk_error(error, self.address) or self._unreadable(str(error)) from None
 
@@ -63,7 +56,7 @@ class LocalRepository(StateRepository):
         )
 
     def renew_if_damaged(self) -> bool:
-        """Raise StateRepoError if git finds it damaged: nobody can make it anew."""
+        """Raise StateRepoError if git finds it damaged; a repository on this disk has no copy."""
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
@@ -79,7 +72,14 @@ class LocalRepository(StateRepository):
             raise self._unreadable(next(missing, found[0]))
         return False
 
-    def _require_branch(self, path: Path) -> None:
+    def _require_usable(self, path: Path) -> None:
+        borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
+        if borrowed.exists():
+            raise StateRepoError(
+                f"{path} borrows objects of another repository, which may remove them; copy them "
+                f"with `git -C {path} repack -a -d`, then remove {borrowed}"
+            )
+        self.new.clean()
         if MAIN not in self.objects.references:
             raise StateRepoError(
                 f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
@@ -109,7 +109,7 @@ class LocalRepository(StateRepository):
         except (pygit2.GitError, OSError) as error:
             reason = disk_error(error, self.address)
             if isinstance(reason, PushDenied) and self.tip() != expected:
-                return False  # it may be this commit that is there, and not synced
+                return False  # the tip may be this very commit, written but not synced
             if reason is not None:
                 raise reason from None
             self._break_stale_lock()
@@ -132,7 +132,8 @@ class LocalRepository(StateRepository):
         except (pygit2.GitError, OSError) as error:
             self._break_stale_lock()
             reason = disk_error(error, self.address)
-            if not isinstance(reason, Unsound | Unavailable):  # it is no answer: they are on main
+            # PushDenied would be wrong, because the commits are on main
+            if not isinstance(reason, Unsound | Unavailable):
                 reason = Unavailable(str(reason or f"{self.address} cannot be written: {error}"))
             raise reason from None
 

@@ -18,20 +18,22 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 import pygit2
-from pygit2 import Oid, PackBuilder, Repository, Tree
+from pygit2 import Oid, Repository, Tree
 from pygit2.enums import ObjectType
+
+from demandops.staterepo.git.pack_file import write_pack
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 _LAST = 0
-"""The lowest priority among the places of objects: most objects that are read are not new."""
+"""The lowest priority among the sources of objects, because most objects that are read are old."""
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-"""The errors of file systems that have no hard links, or allow no more to a file."""
+"""The errors of file systems without hard links, or if a file has too many of them."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -43,9 +45,9 @@ _FOLDER = b"40000"
 Entries = dict[bytes, bytes]
 """The entries of a folder by name; a folder's name ends in a slash, as Git sorts it."""
 _REMEMBERED = 32
-"""How many of the folders that were written last stay parsed; the next demand changes some again.
+"""How many parsed folders to remember: the last written, because demands often change them again.
 
-What an id stands for never changes.
+They never become outdated, because an id always means the same content.
 """
 
 
@@ -54,7 +56,7 @@ class NewObjects(pygit2.OdbBackend):
 
     def __init__(self, repo: Repository) -> None:
         super().__init__()
-        # the repo holds this object where Python does not see it, so holding it too would leak both
+        # libgit2 refers to this object, which Python cannot see: a strong reference would leak both
         self._repo = weakref.ref(repo)
         self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
         self._folders: dict[Oid, Entries] = {}
@@ -62,7 +64,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository; whoever writes to it keeps it alive."""
+        """The repository; the code that writes to it keeps it alive."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - whoever writes to it holds it
         return repo
@@ -88,7 +90,7 @@ class NewObjects(pygit2.OdbBackend):
         return oid
 
     def forget(self) -> None:
-        """Drop what is not packed."""
+        """Drop all objects that are not packed."""
         self._known.clear()
 
     @contextmanager
@@ -110,7 +112,7 @@ class NewObjects(pygit2.OdbBackend):
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
         """Write the objects between two commits again, to a new pack, synced, like :meth:`packed`.
 
-        A sync may have failed for the files that have them; then reading these proves nothing.
+        A sync of their files may have failed; then the objects can be read, but may not be durable.
         """
         with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n^{since}\n")):
             yield
@@ -119,16 +121,11 @@ class NewObjects(pygit2.OdbBackend):
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
         """Build a pack, then move it and its index into place, in this order.
 
-        Git removes an index without a pack. The pack's .keep begins like the index, by which
+        Git removes an index without a pack. The pack's .keep file begins like its index, so that
         :meth:`clean` recognizes it.
         """
         packs = self._packs
-        with (
-            _locked(packs, fcntl.LOCK_SH),
-            TemporaryDirectory(
-                dir=self.repo.path, prefix=UNFINISHED, ignore_cleanup_errors=True
-            ) as folder,
-        ):
+        with _locked(packs, fcntl.LOCK_SH), _folder_until_done(self.repo.path) as folder:
             built = build(folder)
             placed = packs / built.name
             keep = placed.with_suffix(".keep")
@@ -148,7 +145,7 @@ class NewObjects(pygit2.OdbBackend):
         return Path(self.repo.path) / "objects" / "pack"
 
     def clean(self) -> None:
-        """Remove what killed processes left, unless another process writes a pack now."""
+        """Remove files that killed processes left, unless another process writes a pack now."""
         with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
             for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -174,13 +171,7 @@ class NewObjects(pygit2.OdbBackend):
         return _pack_in(folder)
 
     def _build_pack(self, folder: str, needed: list[Oid]) -> Path:
-        """Build a pack and its index; libgit2 syncs both, and raises if that fails."""
-        builder = PackBuilder(self.repo)
-        builder.set_threads(1)
-        for oid in needed:
-            builder.add(oid)
-        builder.write(folder)
-        return _pack_in(folder)
+        return write_pack(Path(folder), [(oid, *self._known[oid]) for oid in needed])
 
     def _needed_by(self, commit: Oid) -> list[Oid]:
         known = {oid.raw: oid for oid in self._known}
@@ -198,7 +189,7 @@ class NewObjects(pygit2.OdbBackend):
                 queue += [known[raw] for raw in _ID.findall(data) if raw in known]
         return list(needed)
 
-    # ---- what libgit2 calls ----
+    # ---- called by libgit2 ----
 
     def __iter__(self) -> Iterator[Oid]:
         """Iterate over the ids of the new objects."""
@@ -218,7 +209,7 @@ class NewObjects(pygit2.OdbBackend):
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return type, content and id of a new object; a shortened id finds none."""
+        """Return type, content and id of a new object; a shortened id finds nothing here."""
         kind, data = self._known[oid]
         return kind, data, oid
 
@@ -238,8 +229,19 @@ def _entries_of(data: bytes) -> Entries:
 
 
 @contextmanager
+def _folder_until_done(parent: str) -> Iterator[str]:
+    """Yield a new folder. A failure to remove it is none: the next start removes it."""
+    folder = mkdtemp(dir=parent, prefix=UNFINISHED)
+    try:
+        yield folder
+    finally:
+        with suppress(OSError):  # rmtree does not ignore all errors of the folder itself
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
 def _locked(folder: Path, how: int) -> Iterator[None]:
-    """Hold a lock of a folder; whoever writes packs shares it."""
+    """Hold a lock of a folder; writers of packs share it."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(handle, how)

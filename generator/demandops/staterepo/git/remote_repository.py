@@ -1,4 +1,4 @@
-"""The state repo behind a URL: a bare clone, fetched and pushed by git, and why that failed."""
+"""The state repo behind a URL: a bare clone that git fetches and pushes; git's errors explained."""
 
 from __future__ import annotations
 
@@ -29,17 +29,33 @@ from demandops.staterepo.git.repository import (
     PushDenied,
     RemoteAway,
     StateRepository,
+    Unavailable,
 )
+from demandops.staterepo.git.slow_git import SlowGit
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
 _REMOTE_MOVED = re.compile(r"\[rejected\]")
 _REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
 _REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
-_TEMPORARY = re.compile(r"lock|failed to update ref|incorrect old value")
+_TEMPORARY = re.compile(
+    r"lock|failed to update ref|incorrect old value|unpack|unable to (create|migrate|write)"
+)
+"""Matches a rejection that passes: a problem of the server or another writer, not a rule."""
+_RULE = re.compile(r"fsck|exceeds maximum|[Ii]nsufficient permission")
+"""Matches the server's words for a push that it will never accept."""
+_WITHOUT_REASON = re.compile(
+    r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
+    r"error: failed to push some refs|Please make sure you have the correct access|"
+    r"and the repository exists|send-pack: unexpected disconnect"
+)
+"""Matches git's last lines that tell no reason."""
 _POLL_S = 0.02
+_DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
 """The limit of a first clone; git ends a connection that carries nothing much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
+_NO_CLONE = re.compile(r"^(?!remote:).*fatal: not a git repository", re.MULTILINE)
+"""Matches what git says if it cannot read the repository in which it runs."""
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
@@ -66,6 +82,7 @@ class RemoteRepository(StateRepository):
 
     always_current = False
     main_reference = _REMOTE_MAIN
+    branches = "refs/remotes/origin/"
 
     def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
         self.address = without_secrets(url)
@@ -86,7 +103,11 @@ class RemoteRepository(StateRepository):
             log.warning("%s; continuing with the commits of the last fetch", error)
 
     def _open(self) -> None:
-        self._git, self.objects = git.Repo(self._folder), Repository(str(self._folder))
+        try:
+            self._git = git.Repo(self._folder)
+        except (git.InvalidGitRepositoryError, git.NoSuchPathError):
+            raise self._unreadable() from None
+        self.objects = Repository(str(self._folder))
         self.new = NewObjects(self.objects)
         self.new.clean()
 
@@ -95,11 +116,11 @@ class RemoteRepository(StateRepository):
             repo = Repository(str(self._folder))
             commit = repo[repo.references[_REMOTE_MAIN].target]
             is_whole = isinstance(commit, pygit2.Commit) and bool(commit.tree.id)
-            # git itself must find it: it reads more of the files than libgit2
+            # git needs more of the files than libgit2, so check HEAD too
             head = (self._folder / "HEAD").read_text()
             is_whole = is_whole and re.fullmatch(r"ref: refs/heads/\w+\n", head) is not None
             return is_whole and git.Repo(self._folder).remote("origin").url == self._url
-        except Exception:  # whatever is wrong with it, a new one is not
+        except Exception:  # whatever the damage, a new clone repairs it
             return False
 
     def renew_if_damaged(self) -> bool:
@@ -139,7 +160,7 @@ class RemoteRepository(StateRepository):
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = TIMEOUT_S,
     ) -> None:
-        # given here, not configured, so that a push that outlives its generator moves no ref
+        # not in the configuration: a push that outlives its generator would move the reference
         spec = f"+{MAIN}:{_REMOTE_MAIN}"
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
@@ -150,11 +171,11 @@ class RemoteRepository(StateRepository):
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Push ``commit``; the remote accepts it only on top of its own tip."""
-        try:  # the lease forces nothing: commit is on top
+        try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except git.GitCommandError as error:
-            if _REMOTE_MOVED.search(str(error)):  # git compared first: nothing was sent
+            if _REMOTE_MOVED.search(str(error)):  # git saw it before it sent anything
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
@@ -164,7 +185,7 @@ class RemoteRepository(StateRepository):
             raise self.push_error(error) from None
         try:
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
-        except (pygit2.GitError, OSError) as error:  # the next fetch does it
+        except (pygit2.GitError, OSError) as error:  # the next fetch moves the reference
             log.warning("%s was pushed, but not noted in %s: %s", commit, self._folder, error)
         return True
 
@@ -199,14 +220,17 @@ class RemoteRepository(StateRepository):
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()
-        rejected = _REMOTE_REJECTED.search(text)
-        if rejected and not _TEMPORARY.search(rejected[1]):
+        if _NO_CLONE.search(text):
+            return self._unreadable()
+        rejected, reason = _REMOTE_REJECTED.search(text), _reason(text)
+        if rejected:
             message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
             reason = f"{rejected[1]}: {message}" if message else rejected[1]
+            is_final = bool(_RULE.search(text)) or not _TEMPORARY.search(rejected[1])
+        else:
+            is_final = bool(_NO_PERMISSION.search(text))
+        if is_final:
             return PushDenied(f"{self.address} rejects the push: {reason}")
-        if _NO_PERMISSION.search(text):
-            return PushDenied(f"{self.address} rejects the push: {_last_line(text)}")
-        reason = rejected[1] if rejected else _last_line(text)
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
     def _read(
@@ -230,8 +254,16 @@ class RemoteRepository(StateRepository):
             )
         if _NO_ROOM.search(text):
             raise self._disk_full()
+        if _NO_CLONE.search(text):
+            raise self._unreadable()
         failed = "read" if command[0] == "ls-remote" else "fetched"
-        raise RemoteAway(f"{self.address} cannot be {failed}: {_last_line(text)}")
+        raise RemoteAway(f"{self.address} cannot be {failed}: {_reason(text)}")
+
+    def _unreadable(self) -> Unavailable:
+        return Unavailable(
+            f"{self.address} cannot be fetched or pushed: its clone {self._folder} cannot be read; "
+            "check its disk, then start again: a damaged clone is made anew"
+        )
 
     def _disk_full(self) -> DiskFull:
         return DiskFull(
@@ -249,7 +281,7 @@ class RemoteRepository(StateRepository):
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
         with repo.git.custom_environment(**ENVIRONMENT):
-            guard = repo.git.execute(  # keep a reference: it ends the process when it is collected
+            guard = repo.git.execute(  # keep it: when it is garbage, it ends the process
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,
                 start_new_session=True,
@@ -257,12 +289,16 @@ class RemoteRepository(StateRepository):
         process = guard.proc
         assert process is not None  # noqa: S101 - it was started just now
         self._process = process
-        if self._aborted:  # since the first check
+        if self._aborted:  # by another thread, since the first check
             self.abort()
+        slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
         try:
-            out, err = _wait_for(process, urgent, timeout)
+            out, err = _wait_for(process, urgent, timeout, slow)
         finally:
             self._process = None
+            slow.ends()
+        if process.returncode < 0:
+            err += f"\nfatal: git was ended by signal {-process.returncode}".encode()
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
@@ -277,14 +313,16 @@ class RemoteRepository(StateRepository):
 
 
 def _wait_for(
-    process: subprocess.Popen[bytes], urgent: Callable[[], bool], timeout: float
+    process: subprocess.Popen[bytes], urgent: Callable[[], bool], timeout: float, slow: SlowGit
 ) -> tuple[bytes, bytes]:
     """Return git's output; end git if it takes too long or something is urgent."""
-    end = REAL.monotonic() + timeout
+    start = REAL.monotonic()
+    end = start + timeout
     while True:
         try:
             return process.communicate(timeout=_POLL_S)
         except subprocess.TimeoutExpired:
+            slow.lasts(REAL.monotonic() - start)
             hurry = urgent()
             if not hurry and REAL.monotonic() < end:
                 continue
@@ -304,8 +342,10 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
     raise AssertionError("a killed process has ended")  # pragma: no cover
 
 
-def _last_line(text: str) -> str:
+def _reason(text: str) -> str:
+    """Return the last line of git's error output that tells a reason."""
     text = text.replace("stderr: '", "")  # GitPython's prefix
     lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
-    fatal = [line for line in lines if line.startswith(("fatal:", "error:", "remote:", "!"))]
-    return (fatal or lines or ["git gave no reason"])[-1]
+    telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines
+    fatal = [line for line in telling if line.startswith(("fatal:", "error:", "remote:", "!"))]
+    return (fatal or telling or ["git gave no reason"])[-1]

@@ -34,7 +34,7 @@ ENVIRONMENT = {
 
 
 class Unavailable(StateRepoError):
-    """The state repo cannot be written now; the journal keeps the demands until it can."""
+    """The state repo cannot be written now; until then the journal keeps the demands."""
 
 
 class RemoteAway(Unavailable):
@@ -101,17 +101,19 @@ class StateRepository(ABC):
 
     objects: Repository
     new: NewObjects
-    """What was written since the last publication."""
+    """The objects that were written since the last publication."""
     address: str
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
     runtime: Runtime = REAL
-    """The clock, chance and threads of whoever writes to it."""
+    """The clock, chance and threads of the code that writes to it."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
     _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
     """The branch, or its remote-tracking branch of the last fetch."""
+    branches = "refs/heads/"
+    """The start of the names of its branches here."""
 
     def tip(self) -> Oid:
         """Return the newest published commit that is known here; does not ask the remote."""
@@ -135,13 +137,13 @@ class StateRepository(ABC):
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote's answer was its promise
-        """Write again what was published after the commit ``since``, so that it is durable.
+        """Write the commits after ``since`` again, so that they are durable.
 
         Raises Unavailable or Unsound if that fails.
         """
 
     def reopened(self) -> Repository:
-        """Return the repository opened again, for a thread that is not the owner's."""
+        """Return the repository opened again, for use in another thread."""
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
@@ -179,11 +181,11 @@ class StateRepository(ABC):
 
     @abstractmethod
     def renew_if_damaged(self) -> bool:
-        """Make the files here anew if they are damaged and can be; return whether that was done.
+        """Replace a damaged clone by a new one; return whether that was necessary.
 
         Raises:
-            Unavailable: they are damaged and cannot be made anew now.
-            StateRepoError: they are damaged, and nobody can make them anew.
+            Unavailable: the files are damaged and cannot be replaced now.
+            StateRepoError: the files are damaged, and there is nothing to replace them from.
         """
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end

@@ -31,7 +31,7 @@ class Signer:
     """Signs with one key: a private key file, or the public file of a key that an agent holds."""
 
     def __init__(self, key: Path) -> None:
-        """Try the key, so that one that cannot sign fails before any demand is accepted."""
+        """Try the key, so that a useless key is noticed before a demand is accepted."""
         self.key = key.expanduser()
         if not self.key.is_file():
             raise SigningFailed(

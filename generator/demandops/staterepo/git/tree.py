@@ -30,6 +30,11 @@ def commit_of(repo: Repository, revision: str | Oid) -> Commit:
             raise StateRepoError(
                 f"commit {error}; set the branch back to the commit before it"
             ) from None
+        if isinstance(revision, Oid):  # a branch or a commit named it, no person
+            raise StateRepoError(
+                f"the commit {revision} cannot be read; check the disk of the state repo and of "
+                "its clone, then try again"
+            ) from None
         raise StateRepoError(
             f"'{revision}' is not a commit of the state repo; `demandops log` lists them"
         ) from None
@@ -185,7 +190,7 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
             entries[folder] = b"40000 %s\0%s" % (name, subtree.raw)
         elif kept:
             del entries[folder]
-    for name, text in here.items():  # last, so that a file can replace a folder
+    for name, text in here.items():  # after the folders, so that a file can replace one
         if text is not None:
             entries.pop(name + b"/", None)
             blob = objects.add(ObjectType.BLOB, text.encode())
@@ -197,7 +202,7 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
-    """Return the raw name of the entry that reads as ``name``; else ``name``, encoded."""
+    """Return the raw name of the entry that is shown as ``name``; else ``name``, encoded."""
     raw = name.encode()
     if raw in entries or b"\\" not in raw:
         return raw

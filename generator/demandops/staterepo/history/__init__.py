@@ -1,1 +1,1 @@
-"""What commits say: their messages, their authors, and the history of a path."""
+"""The history: messages and authors of commits, and the commits that changed a path."""

@@ -25,7 +25,7 @@ _MOST_KNOWN = 100_000
 
 
 class Check(NamedTuple):
-    """The check of a signature: who signed, or what is wrong with it."""
+    """The result of checking a signature: who signed, or why it is not valid."""
 
     signer: str = ""
     fault: str = ""
@@ -74,7 +74,7 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
 
 
 def _fault(signature: str, state: str) -> str:
-    """Return what is wrong with a signature; ``state`` is git's letter for it."""
+    """Return why a signature is not valid; ``state`` is git's letter for it."""
     if not signature:
         return f"is not signed, but {ALLOWED_SIGNERS} requires it"
     if state == "B":

@@ -38,7 +38,7 @@ class Person(NamedTuple):
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return people's commits since ``known`` that change what the generator reads."""
+    """Return people's commits since ``known`` that change files which the generator reads."""
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
@@ -49,7 +49,7 @@ def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple
     If they did not change the path, it finds their last change to any path.
     """
 
-    @cache  # read late: most reports exist already and need no commits
+    @cache  # read only when needed: most problems are already in the report
     def commits() -> list[Commit]:
         return list(commit_log.person_commits(repo, to, known))
 

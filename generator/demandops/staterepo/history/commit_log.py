@@ -47,10 +47,12 @@ class LogEntry:
     by_generator: bool = False
     """Whether the generator is the committer; then the files should match the ledger.
 
-    The message alone proves nothing, because anybody may quote trailers. A proposal does not count:
-    a person merges it, maybe onto other changes, so it is read again. :func:`is_by_generator` also
-    asks for a signature.
+    The message alone proves nothing, because anybody may write trailers. False for a proposal: a
+    person merges it, perhaps onto other changes, so its files are read again.
+    :func:`is_by_generator` also requires a signature.
     """
+    authored: datetime | None = None
+    """The author's time; for a demand's commit, the time when the demand was received."""
 
     def first(self, key: str) -> str:
         """Return the first value of a trailer, or an empty text."""
@@ -58,9 +60,12 @@ class LogEntry:
 
 
 def time_of(commit: Commit) -> datetime:
-    """Return the committer's time; beyond the calendar it is the calendar's end."""
-    seconds = min(max(commit.commit_time, 0), _LAST_SECOND)
-    return datetime.fromtimestamp(seconds, tz=timezone.utc)
+    """Return the committer's time; a time after the year 9999 becomes its last second."""
+    return _time(commit.commit_time)
+
+
+def _time(seconds: int) -> datetime:
+    return datetime.fromtimestamp(min(max(seconds, 0), _LAST_SECOND), tz=timezone.utc)
 
 
 def author_of(commit: Commit) -> tuple[str, str]:
@@ -90,6 +95,7 @@ def entry_of(commit: Commit) -> LogEntry:
         trailers=text.trailers if is_told else {},
         why=text.why if is_told else "",
         by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
+        authored=_time(commit.author.time),
     )
 
 
@@ -104,7 +110,14 @@ def commits(
     """Yield the commits that ``tip`` includes and ``until`` does not, newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     if until is not None:
-        walker.hide(commit_of(repo, until).id)
+        hidden = commit_of(repo, until).id
+        walker.hide(hidden)
+        found = list(walker)
+        if any(len(commit.parent_ids) > 1 for commit in found):
+            # with merges, libgit2 orders by the commits' times, which a wrong clock may have set
+            known = {commit.id for commit in repo.walk(hidden)}
+            found = [commit for commit in found if commit.id not in known]
+        return ((commit, entry_of(commit)) for commit in found)
     return ((commit, entry_of(commit)) for commit in walker)
 
 
@@ -118,7 +131,7 @@ def person_commits(
 def _told_apart(
     repo: Repository, tip: str | Oid, until: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return the commits; ``by_generator`` of an entry also means that its signature is good."""
+    """Return the commits with entries whose ``by_generator`` also means a good signature."""
     found = list(commits(repo, tip, until))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
     return [
@@ -134,7 +147,7 @@ def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
     return iter(walker)
 
 
-_Outcome = Literal["changed", "unchanged", "refused"]
+_Outcome = Literal["changed", "waiting", "unchanged", "refused"]
 _OUTCOMES: dict[str, _Outcome] = {
     "Operation-Id": "changed",
     "Unchanged-Operation-Id": "unchanged",
@@ -154,7 +167,7 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     """Return operation id → outcome of every demand that commits after ``base`` record.
 
     A person who merges a proposal may keep its trailers; any other commit by a person records no
-    demand. Reads all of history if ``base`` is not known here (a remote that was made again).
+    demand. Reads the whole history if ``base`` is unknown, because the remote was made anew.
     """
     if str(tip) == base:
         return {}
@@ -166,8 +179,9 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     for _, entry in _told_apart(repo, tip, base if known else None):
         is_record = entry.by_generator or PROPOSAL in entry.trailers
         for key, outcome in _OUTCOMES.items() if is_record else ():
+            waits = key == "Operation-Id" and entry.first("Operation") == "wait"
             for operation in entry.trailers.get(key, ()):
-                outcomes[operation] = RecordedOutcome(entry.commit, outcome)
+                outcomes[operation] = RecordedOutcome(entry.commit, "waiting" if waits else outcome)
     return outcomes
 
 
@@ -250,7 +264,7 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 
 
 def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
-    """Return the output of ``git log`` for the path that ``query`` ends with."""
+    """Return what ``git log`` prints for a path; ``query`` is its options, then the path."""
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
     with git.Repo(repo.path) as opened:

@@ -21,9 +21,12 @@ from demandops.demand.claim import OVERRIDE_PREFIX, ClaimKey
 from demandops.demand.demand_request import Decommission, Expire
 from demandops.errors import Fault
 from demandops.ledger import claim_file
+from demandops.ledger.kept_replicas import Instance
+from demandops.ledger.operations.drain import Drain
 from demandops.ledger.operations.restoration import Restoration
+from demandops.ledger.waiting import Wait
 from demandops.quoting import one_line
-from demandops.render.changes.changeset import ReleaseChange
+from demandops.render.changes.changeset import Changeset, ReleaseChange
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.history import revisions
 from demandops.staterepo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME
@@ -37,7 +40,7 @@ _MAX_SUBJECT = 90
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 
 
-_CRUD = " .,:;\"'\\"  # Git removes these at both ends, and refuses what is empty then
+_CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an empty name
 
 
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
@@ -64,7 +67,8 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
         name, _, email = request.by.removesuffix(">").rpartition(" <")
         return signature(name, email, received) if name else generator_signature(received)
     names = ", ".join(_requesters(decision))
-    demand = decision.changes.claims[0].key.demand
+    claims = decision.changes.claims
+    demand = claims[0].key.demand if claims else request.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else claim_file.segment(demand)
     return signature(names, f"{local}@demandops.invalid", received)
 
@@ -89,7 +93,7 @@ def of_decision(
         ("Operation-Id", operation),
         *settled,
         *_of_request(decision),
-        *(("Demand-Id", demand) for demand in dict.fromkeys(key.demand for key in keys)),
+        *(("Demand-Id", demand) for demand in _demands(decision)),
         *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
@@ -98,6 +102,12 @@ def of_decision(
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
+
+
+def _demands(decision: Decision) -> Iterable[str]:
+    """Return the demands whose claims changed, or that begin or stop waiting, each once."""
+    keys = (change.key.demand for change in decision.changes.claims)
+    return dict.fromkeys((*keys, *decision.changes.waiting))
 
 
 def _list(head: str, items: Iterable[object]) -> list[str]:
@@ -119,7 +129,7 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     """Return the requesters of a demand, else those of the claims that it changed."""
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
-    if isinstance(decision.request, Decommission):  # it is a requester only before
+    if isinstance(decision.request, Decommission):  # the requester is in the old claims only
         claims = [change.before for change in changes]
     found = sorted({who for claim in claims if claim for who in claim.requesters})
     return decision.request.requesters() or tuple(found)
@@ -146,11 +156,27 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
             f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
             f"{revisions.format_time(last)} and was not renewed."
         )
+    if isinstance(request, Drain):
+        moved = "".join(f" {text[0].upper()}{text[1:]}." for text in request.moved)
+        return f"Drain {request.id}", f"'{request.id}' is drained in the inventory.{moved}"
     if isinstance(request, Decommission):
         by = f" by {request.by}" if request.by else ""
+        reason = f" ({request.reason})" if request.reason else ""
         return f"Decommission {request.id}", (
-            f"'{request.id}' was decommissioned{by} on {time}; it held a part of {what_of_whom}."
+            f"'{request.id}' was decommissioned{by} on {time}{reason}; it held a part of "
+            f"{what_of_whom}."
         )
+    if isinstance(request, Wait):
+        who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
+        return f"Let {request.demand} wait", (
+            f"request '{request.id}' of demand '{request.demand}', received {time}, waits for room "
+            f"in the name of {who}: {reasons}."
+        )
+    if not changes:
+        return f"Release {', '.join(decision.changes.waiting)}", (
+            f"request '{request.id}', received {time}, gives up what waited for room."
+        )
+    waited = [one for one in decision.changes.waiting if one == request.demand]
     only_leases = all(
         change.before and change.after and change.before.booked == change.after.booked
         for change in changes
@@ -160,6 +186,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     named = "" if request.is_reference else f" of demand '{request.demand}'"
     why = f"request '{request.id}'{named}, received {time}, {verb} {what_of_whom}."
     placed = "".join(f" {text[0].upper()}{text[1:]}." for text in decision.placed)
+    placed += " It waited for room." if waited else ""
     return f"{title} {subjects}", why + placed
 
 
@@ -168,11 +195,15 @@ def _of_request(decision: Decision) -> list[tuple[str, str]]:
     request = decision.request
     if isinstance(request, Restoration):
         return [("Restores", request.to), ("Reason", request.reason)]
-    if not isinstance(request, Decommission) or "node" not in request.kinds:
+    if isinstance(request, Drain):
+        return [("Node", request.id)]
+    if not isinstance(request, Decommission):
         return []
+    reason = [("Reason", request.reason)]
     befores = [change.before for change in decision.changes.claims]
-    needed = any(before.held.needs(request.id) for before in befores if before)
-    return [("Node", request.id)] if needed else []
+    nodes = request.nodes or (request.id,)
+    needed = any(one.held.needs(node) for one in befores if one for node in nodes)
+    return ([("Node", request.id)] if needed and "node" in request.kinds else []) + reason
 
 
 def of_follow(
@@ -211,12 +242,12 @@ def of_follow(
 def of_override_end(
     override: Override,
     releases: tuple[ReleaseChange, ...],
-    kept: Iterable[ClaimKey],
+    keys: Iterable[ClaimKey],
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
     """Return the message of the commit that ends an expired override.
 
-    ``kept`` are the claims that changed with it and that ``keep`` overrides add.
+    ``keys`` are the claims that changed with it, those of demands and of ``keep`` overrides.
     """
     why = (
         f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
@@ -229,7 +260,28 @@ def of_override_end(
     ]
     trailers = [
         ("Operation", "expire-override"),
-        *override_trailers([override.path, *keep_override_paths(kept)]),
+        *override_trailers([override.path, *keep_override_paths(keys)]),
+        *demand_trailers(keys),
+        *more,
+        ("Render-Version", str(RENDER_VERSION)),
+    ]
+    return compose(paragraphs, trailers)
+
+
+def of_scale_down(
+    instance: Instance, change: Changeset, more: Iterable[tuple[str, str]] = ()
+) -> str:
+    """Return the message of the commit that ends the time for which a service keeps replicas."""
+    service, node = instance[1:3]
+    names = ", ".join(release.name for release in change.releases) or f"{service} on {node}"
+    paragraphs = [
+        [one_line(f"Scale down {names}", _MAX_SUBJECT)],
+        ["Why: no demand has needed the replicas for as long as downAfter says."],
+        _desired_state(change.releases) if change.releases else ["Desired state: unchanged."],
+    ]
+    trailers = [
+        ("Operation", "scale-down"),
+        *override_trailers(change.overrides),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]
@@ -245,6 +297,12 @@ def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
     """Return the files of the ``keep`` overrides that add these claims."""
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
+
+
+def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
+    """Return the trailers that name the demands of claims which overrides changed."""
+    demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
+    return [("Demand-Id", demand) for demand in sorted(demands)]
 
 
 def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:

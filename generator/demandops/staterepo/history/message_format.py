@@ -23,7 +23,7 @@ _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-"""A quoted value; it has an escape, or it would not be quoted."""
+"""A quoted value; it has an escape, because only values that need one are quoted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
 
 
 def parse(message: str) -> MessageText:
-    """Return the summary, the reason and the trailers of any message, also of a person's."""
+    """Return the summary, the reason and the trailers of any message, even of a person's."""
     lines = message.split("\n")
     whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
     return MessageText(lines[0], next(whys, ""), _trailers(message))

@@ -34,8 +34,8 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
         text: a date, a time of the day (the last time the clock showed it), both, or a duration
             before ``now`` (``2h``, ``1h30m``, ``2d``).
         now: with time zone.
-        end: a date means the end of its day, and a time without seconds the end of its minute,
-            rather than the beginning.
+        end: whether a date means the end of its day, and a time without seconds the end of its
+            minute, instead of the beginning.
     """
     text = text.strip()
     try:

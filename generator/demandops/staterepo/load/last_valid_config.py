@@ -1,7 +1,7 @@
-"""The configuration at a commit, and its last valid version if a file is not valid.
+"""The configuration at a commit; the last valid versions of files replace invalid ones.
 
-The last valid version replaces an invalid file, the other files of its application definition, and
-the other files of the commits that changed it: a commit applies whole or not at all. All other
+A file's last valid version replaces an invalid file, the other files of its application definition,
+and the other files of the commits that changed it: a commit applies whole or not at all. All other
 changes apply. If the result is not valid either, no change applies.
 """
 
@@ -136,7 +136,7 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return these files, and all files of the same commits or the same definition."""
+    """Return the broken files, and all files of the same commits or the same definitions."""
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}

@@ -12,7 +12,8 @@ from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import Lease
 from demandops.errors import Fault, InvalidInput
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import ClaimChange, Ledger
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.restoration import Restoration
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
@@ -89,7 +90,7 @@ def last_valid_claims(
 
 
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
-    """Return the lease that the claim at a path had on main before a proposal of it was merged."""
+    """Return the lease that a claim had on main before the proposal that changes it was merged."""
     for commit in commit_log.first_parents(repo, to):
         claim = valid_claim_at(commit.tree, path)
         if claim is None or claim.lease is None or claim.lease.has_started:

@@ -7,10 +7,10 @@ the same bytes, so an unchanged report causes no commit. Pure: texts and faults 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput
+from demandops.errors import Fault, InvalidInput, place_text
 from demandops.quoting import is_visible, one_line
 from demandops.settings import API_VERSION, NOTES_ROOT
 
@@ -20,6 +20,7 @@ _HEAD = (
     "# stays in effect until the file is fixed. The generator then removes this report.\n"
 )
 _MOST = 100
+_WRITTEN = ("file", "field", "message", "since", "author")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +32,12 @@ class Problem:
     message: str
     since: str = ""
     author: str = ""
+    line: int | None = None
+    """The line of the field in the file as it is now; the report does not have it."""
 
     def __str__(self) -> str:
-        text = ": ".join(part for part in (self.file, self.field, self.message) if part)
+        places = (place_text(self.file, self.line), self.field)
+        text = ": ".join(part for part in (*places, self.message) if part)
         if not self.since:
             return text
         return f"{text} (since {self.since[:10]} by {self.author})"
@@ -77,7 +81,7 @@ def write(problems: tuple[Problem, ...]) -> str | None:
 
 
 def read(text: str | None) -> tuple[Problem, ...]:
-    """Return the problems of a report; none if it is missing. A person may have edited it."""
+    """Return the problems of a report; none if it is missing or a person made it unreadable."""
     try:
         data = strict_yaml.load(text or "")
     except InvalidInput:
@@ -88,9 +92,7 @@ def read(text: str | None) -> tuple[Problem, ...]:
 
     entries = data.get("problems") if isinstance(data, dict) else None
     return tuple(
-        Problem(
-            **{name: visible(entry.get(name)) for name in (each.name for each in fields(Problem))}
-        )
+        Problem(**{name: visible(entry.get(name)) for name in _WRITTEN})  # type: ignore[arg-type]
         for entry in (entries if isinstance(entries, list) else ())
         if isinstance(entry, dict)
     )

@@ -17,7 +17,9 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file, recent_shutdowns
+from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.kept_replicas import Instance, Steps
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.settings import GENERATED_ROOTS
@@ -60,7 +62,7 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot at a new commit of this program, with the ``state`` after it."""
+        """Return the snapshot at a new commit that this program made; ``state`` is its state."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
@@ -91,7 +93,9 @@ def load(
     shutdowns = recent_shutdowns.read_all(
         trees.texts(commit.tree, (recent_shutdowns.SHUTDOWNS_ROOT,))
     )
-    ledger = replace(found.ledger(), ended=ended, shutdowns=shutdowns)
+    waits = waiting.read_all(trees.texts(commit.tree, (waiting.WAITING_ROOT,)))
+    kept = kept_replicas.read_all(trees.texts(commit.tree, (kept_replicas.REPLICAS_ROOT,)))
+    ledger = replace(found.ledger(), ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
     return Snapshot(commit.id, State.of(config, ledger), commit.id)
 
 
@@ -127,7 +131,13 @@ def advance(
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = world_changed or _must_render_all(repo, before.commit, to)
-    ledger = replace(state.ledger, ended=ended, shutdowns=_shutdowns(old, new, state.ledger))
+    shutdowns, waits = _shutdowns(old, new, state.ledger), state.ledger.waiting
+    if trees.differ(old, new, (waiting.WAITING_ROOT,)):
+        waits = waiting.read_all(trees.texts(new, (waiting.WAITING_ROOT,)))
+    kept = state.ledger.kept
+    for instance, steps in changed_kept_replicas(old, new):
+        kept = kept.replace(instance, steps)
+    ledger = replace(state.ledger, ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
     state = State.of(config, ledger) if known.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
@@ -137,23 +147,28 @@ def advance(
             problems += error.faults
             invalid.append(path)
     claims |= ledger_files.last_valid_claims(repo, before.last_valid_commit, to, invalid)
-    ledger, subjects = state.ledger, list[Subject]()
+    ledger, changes = state.ledger, list[ClaimChange]()
     for path in sorted(claims):
         claim = claims[path]
         held = claim or ledger_files.valid_claim_at(old, path)
         key = held.key if held else ledger_files.key_of(path, ledger)
         if key is not None and ledger.get(key) != claim:
+            changes.append(ClaimChange(ledger.get(key), claim))
             ledger = ledger.replace(key, claim)
-            subjects.append(key.subject)
+    if world_changed:
+        state = replace(state, ledger=ledger)
+    else:
+        state = before.state.with_ledger(ledger, changes)
     snapshot = Snapshot(
         to,
-        replace(state, ledger=ledger),
+        state,
         before.last_valid_commit if problems else to,
         tuple(problems),
         tuple(invalid),
         known.source if known.faults or recorded else None,
     )
-    return Advance(snapshot, tuple(dict.fromkeys(subjects)), config_changed)
+    subjects = dict.fromkeys(change.key.subject for change in changes)
+    return Advance(snapshot, tuple(subjects), config_changed)
 
 
 def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
@@ -163,6 +178,15 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
         shutdown = recent_shutdowns.read(text, path) if text is not None else None
         shutdowns = shutdowns.replace(recent_shutdowns.digest_in(path), shutdown)
     return shutdowns
+
+
+def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
+    """Yield the service instances whose kept replicas differ, and what they keep now."""
+    for path, _ in trees.differences(old, new, (kept_replicas.REPLICAS_ROOT,)):
+        texts = [trees.read_text(tree, path) for tree in (old, new)]
+        before, after = (kept_replicas.read(text, path) if text else None for text in texts)
+        if record := after or before:
+            yield record[0], after[1] if after else ()
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
@@ -175,7 +199,8 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
     if not people or people[0].id != to:
         return False
     is_alone = len(people) == sum(1 for _ in commit_log.commits(repo, to, before))
-    roots = GENERATED_ROOTS if is_alone else (*GENERATED_ROOTS, *ROOTS)
+    own = (*GENERATED_ROOTS, kept_replicas.REPLICAS_ROOT)
+    roots = own if is_alone else (*own, *ROOTS)
     return any(
         trees.differ(commit.parents[0].tree, commit.tree, roots)
         for commit in people
@@ -184,7 +209,7 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
 
 
 _judged: dict[object, LastValidConfig] = {}
-"""The newest results, so that a file that stays broken is judged once, not on each demand."""
+"""The newest results, so that a broken file is judged once and not again for each demand."""
 _MOST_JUDGED = 8
 
 
@@ -224,10 +249,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Keeps what was read beyond the published snapshot, until a commit is published on it.
+    """Keeps the commits read after the published snapshot, until a commit is published on them.
 
-    So each attempt reads only new commits. If it read all of them again, faster writers could
-    always publish first.
+    So each attempt to publish reads only new commits. If it read all of them again, faster writers
+    could always publish first.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""The state in effect at a commit, also while some file is not valid.
+"""The state in effect at a commit, even if some files are not valid.
 
 The generator's commits record it in trailers. ``In-Force`` names the newest commit where all files
 were valid. ``Configuration`` names the commit whose configuration is in effect. Each ``Stands-In``
@@ -23,7 +23,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops.decision import State, changeset_of_edit, faults_of_edit, rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import ClaimChange
+from demandops.ledger.claim_changes import ClaimChange
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import StateRepository
@@ -75,10 +75,14 @@ def state_at(
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     commit = trees.commit_of(repo, revision)
-    start = start_at(repo, commit.id, progress)
-    if start.commit == commit.id:
+    return state_after(repo, start_at(repo, commit.id, progress), commit.id)
+
+
+def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
+    """Return the state in effect at a commit: an earlier one with people's later changes."""
+    if start.commit == to:
         return start
-    advance = snapshots.advance(repo, start, commit.id)
+    commit, advance = trees.commit_of(repo, to), snapshots.advance(repo, start, to)
     judgement = judge(repo, advance, start, commit.tree)
     accepted = judgement.with_new_config().snapshot
     try:
@@ -92,7 +96,7 @@ def state_at(
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest known state up to a commit: a recorded one, or one without invalid files.
+    """Return the newest state that is recorded up to a commit, or of a commit that is fully valid.
 
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
@@ -101,7 +105,7 @@ def start_at(
     if record.first("In-Force"):
         try:
             return recorded_state(repo, record, progress)
-        except (InvalidInput, StateRepoError) as error:  # a record that is not ours
+        except (InvalidInput, StateRepoError) as error:  # the record is not a generator's
             faults.append(error)
     for ancestor in commit_log.first_parents(repo, record.commit):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in snapshots.ROOTS)
@@ -195,14 +199,14 @@ class Judgement:
     """The new ledger with the configuration that was in effect before."""
 
     def with_new_config(self) -> Advance:
-        """Return the state in effect, and what changed, if the new configuration is accepted."""
+        """Return the advance to the state in effect if the new configuration is accepted."""
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
         return self._without(self.advance, _together(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the state in effect, and what changed, if the new configuration has ``faults``."""
+        """Return the advance to the state in effect if the new configuration has ``faults``."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(

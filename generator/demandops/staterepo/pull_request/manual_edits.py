@@ -16,12 +16,12 @@ from demandops.config.config import Config
 from demandops.config.override import OVERRIDES_ROOT
 from demandops.config.registry import Image
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file
+from demandops.ledger import claim_file, waiting
 from demandops.plan.release import Release, ServiceRelease
 from demandops.render.changes.merge_preview import ABSENT, leaf_differences
 from demandops.render.gitops.flux import chart_object
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
-from demandops.settings import API_VERSION, GENERATED_ROOTS, NOTES_ROOT
+from demandops.settings import API_VERSION, GENERATED_ROOTS, NOTES_ROOT, modeline
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.pull_request.worktree import Base
 
@@ -59,8 +59,9 @@ def is_written_by_generator(path: str) -> bool:
     root = path.split("/", maxsplit=1)[0]
     if trees.is_readme(path):
         return False
-    if root == claim_file.LEDGER_ROOT:  # people may edit claims
-        return claim_file.kind_of(path) is None
+    if root == claim_file.LEDGER_ROOT:  # people may edit claims and waiting demands
+        is_waiting = path.startswith(f"{waiting.WAITING_ROOT}/")
+        return claim_file.kind_of(path) is None and not is_waiting
     return root in (*GENERATED_ROOTS, NOTES_ROOT)
 
 
@@ -133,7 +134,7 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects of an override that replaces an edit, and the parts that it leaves out."""
+    """Return effects of an override that replace an edit, and the parts of it that they miss."""
     if after is None:
         return {"deny": True}, []
     try:
@@ -148,7 +149,8 @@ def _effects(
 def _override_text(effects: dict[str, Any], release: Release, owner: str) -> str:
     head = {"apiVersion": API_VERSION, "kind": "Override", "reason": _REASON, "owner": owner}
     select = {"select": [_selector(release, whole="deny" in effects)]}
-    return strict_yaml.dump(head | select | {name: effects[name] for name in _used(effects)})
+    text = strict_yaml.dump(head | select | {name: effects[name] for name in _used(effects)})
+    return modeline(f"{OVERRIDES_ROOT}/NAME.yaml", "override") + text
 
 
 def _fits(release: Release, other: Release) -> bool:
@@ -179,7 +181,10 @@ def _service_effects(
     """Return :func:`_effects` of an edit of a HelmRelease or an Application."""
     effects, not_covered = dict[str, Any](), list[str]()
     place_of_values = _VALUES.get(old[0].get("kind"), ())
-    before, after = _at(old[0], place_of_values), _at(new[0] if new else None, place_of_values)
+    before, after = (
+        _value_at(old[0], place_of_values),
+        _value_at(new[0] if new else None, place_of_values),
+    )
     patched: tuple[str, ...] = ()
     if isinstance(before, dict) and isinstance(after, dict):
         values = _merge_patch(before, after)
@@ -212,7 +217,7 @@ def _service_effects(
     return effects, not_covered
 
 
-def _at(document: Any, path: tuple[str, ...]) -> Any:  # noqa: ANN401
+def _value_at(document: Any, path: tuple[str, ...]) -> Any:  # noqa: ANN401
     for key in path:
         document = document.get(key) if isinstance(document, dict) else None
     return document
@@ -225,7 +230,7 @@ def _move_images(
     config: Config,
     moved: dict[str, dict[str, str]],
 ) -> None:
-    """Move the changes of registry images from a patch of values to ``moved``."""
+    """Move changes of images that the registry lists from a patch of values to ``moved``."""
     names: dict[str, list[str]] = {}
     for name in release.service.images:
         names.setdefault(config.images[name].repository, []).append(name)

@@ -13,18 +13,22 @@ from datetime import datetime
 from pathlib import Path
 
 from demandops import strict_yaml
+from demandops.charts import chart_files
 from demandops.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
 from demandops.config.load import load
 from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, faults_of_edit, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file, ended_override_file
-from demandops.ledger.ledger import Ledger, changes_on
+from demandops.field_lines import with_lines
+from demandops.ledger import claim_file, ended_override_file, kept_replicas
+from demandops.ledger.claim_changes import changes_on
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
-from demandops.plan.overrides.lifecycle import expired_overrides, update_ledger
-from demandops.plan.views import override_report, policy_warnings
+from demandops.plan.override_lifecycle import expired_overrides, update_ledger
+from demandops.plan.views import override_report, policy_warnings, unmatched_patterns
 from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
+from demandops.plan.views.missing_inputs import missing_inputs
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT
@@ -32,8 +36,10 @@ from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import ledger_files
-from demandops.staterepo.pull_request import manual_edits
+from demandops.staterepo.pull_request import manual_edits, rendered_charts
+from demandops.staterepo.pull_request.helm import HELM_BIN
 from demandops.staterepo.pull_request.manual_edits import Suggestion
+from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, files_of
 
 
@@ -43,7 +49,8 @@ class CheckResult:
 
     ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if no valid commit
     can be compared with. ``base`` is the commit compared with, if any; if its files are not valid
-    (``base_valid``), their last valid versions are used. ``warnings`` are likely mistakes.
+    (``base_valid``), their last valid versions are used. ``newer`` are the commits that the merge
+    target has and the checkout lacks. ``warnings`` are likely mistakes.
     """
 
     faults: tuple[Fault, ...]
@@ -52,10 +59,18 @@ class CheckResult:
     bookkeeping: tuple[EntryChange, ...] | None = None
     base: str | None = None
     base_valid: bool = True
+    newer: int = 0
     warnings: tuple[Fault, ...] = ()
+    charts: RenderedCharts | None = None
 
 
-def check(folder: Path, base: str | None = None, now: datetime | None = None) -> CheckResult:
+def check(
+    folder: Path,
+    base: str | None = None,
+    now: datetime | None = None,
+    *,
+    require_helm: bool = False,
+) -> CheckResult:
     """Check the files of a folder, render them, and preview the effect of a merge.
 
     Args:
@@ -63,6 +78,7 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
             with the common ancestor.
         now: overrides that ended by then are left out; by default the current time.
+        require_helm: it is a fault if charts are not rendered because helm is missing.
 
     Raises:
         StateRepoError: it is not a state repo, or ``base`` is not a commit with an ancestor here.
@@ -74,7 +90,10 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     faults += claims.faults
     edited = [path for path in edit.changed if manual_edits.is_written_by_generator(path)]
     result = CheckResult(
-        (), base=start.commit if start else None, base_valid=start is None or start.valid
+        (),
+        base=start.commit if start else None,
+        base_valid=start is None or start.valid,
+        newer=start.newer if start else 0,
     )
     try:
         config = edit.config()
@@ -85,22 +104,34 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
     except InvalidInput as error:
         faults += error.faults
     else:
-        # a proposal or an upgrade has exactly what the generator would write: no manual edit
+        # a proposal or an upgrade is what the generator would write, so it is no manual edit
         edited = [
             path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
         ]
         new = merge_preview.planned_releases(state)
+        preview = merge_preview.preview(
+            new if start is None else start.releases(), new, edit.merged_into(wanted), wanted
+        )
+        charts = rendered_charts.render_charts(
+            folder,
+            state,
+            edit.changed if start else None,
+            {each.path for each in preview.files},
+        )
+        faults += [*charts.faults, *(_helm_is_missing(charts) if require_helm else ())]
         idle = override_report.warnings(override_report.override_report(state, edit.now))
         result = replace(
             result,
-            preview=merge_preview.preview(
-                new if start is None else start.releases(), new, edit.generated, wanted
-            ),
+            preview=preview,
+            charts=charts,
             bookkeeping=_bookkeeping_changes(start, state),
             warnings=(
                 *(fault("", text).within(path) for path, text in idle),
                 *policy_warnings.warnings(state),
+                *unmatched_patterns.warnings(state.config),
                 *edit.changed_bootstraps(wanted),
+                *_newly_missing(start, state),
+                *charts.warnings,
             ),
         )
     if start is not None and edited:
@@ -109,7 +140,29 @@ def check(folder: Path, base: str | None = None, now: datetime | None = None) ->
         )
         faults, result = [*faults, *manual], replace(result, suggestions=suggestions)
     ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
-    return replace(result, faults=tuple(ordered))
+    return replace(
+        result,
+        faults=tuple(with_lines(ordered, files.get)),
+        warnings=tuple(with_lines(result.warnings, files.get)),
+    )
+
+
+def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
+    if rendered_charts.MISSING in charts.not_rendered.values():
+        message = (
+            f"charts not rendered: {rendered_charts.MISSING}; install it and put it on PATH, or "
+            f"name it in {HELM_BIN}"
+        )
+        yield fault("", message)
+
+
+def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
+    """Yield a warning for each topic that the merge keeps from arriving."""
+    old = start.state if start else None
+    known = {(one.application, one.reason) for one in missing_inputs(old)} if old else set()
+    for one in missing_inputs(state):
+        if (one.application, one.reason) not in known:
+            yield one.warning
 
 
 def _generated(path: str) -> bool:
@@ -144,6 +197,15 @@ class _Edit:
             if _generated(path) and not trees.is_readme(path)
         }
 
+    def merged_into(self, wanted: Mapping[str, str]) -> dict[str, str]:
+        """Return the generated files before the edit, or as wanted where the target has them so."""
+        found, there = self.generated, self.start.merged if self.start else {}
+        for path in {*there, *found} if there else ():
+            if there.get(path) == wanted.get(path):
+                found.pop(path, None)
+                found |= {path: wanted[path]} if path in wanted else {}
+        return found
+
     def config(self) -> Config:
         """Return the configuration."""
         files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
@@ -163,6 +225,9 @@ class _Edit:
         root = f"{ended_override_file.MARKERS_ROOT}/"
         markers = {path: text for path, text in self.files.items() if path.startswith(root)}
         ended = ended_override_file.read(markers)
+        root = f"{kept_replicas.REPLICAS_ROOT}/"
+        kept = {path: text for path, text in self.files.items() if path.startswith(root)}
+        ledger = replace(ledger, kept=kept_replicas.read_all(kept))
         expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
         ended |= {one.name: format_time(one.end) for one in expired if one.end}
         state = State.of(config, replace(ledger, ended=ended))
@@ -175,7 +240,7 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield why claims that the edit adds or changes are refused."""
+        """Yield the faults for which claims that the edit adds or changes are refused."""
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
@@ -194,11 +259,13 @@ class _Edit:
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
         """Yield a warning for each bootstrap file that a person has to apply to its cluster."""
-        for path, text in sorted(self.generated.items()):
+        for path, text in sorted(self.merged_into(wanted).items()):
             if path.startswith(f"{BOOTSTRAP_ROOT}/") and wanted.get(path, text) != text:
+                cluster = path.removeprefix(f"{BOOTSTRAP_ROOT}/").removesuffix(".yaml")
                 message = (
-                    "changes with the merge, and no controller applies it; apply it to the cluster "
-                    f"again: kubectl apply -f {path}"
+                    "changes with the merge, and no controller applies it; afterwards, an "
+                    f"administrator of cluster '{cluster}' applies it: "
+                    f"git show main:{path} | kubectl apply -f -"
                 )
                 yield fault("", message).within(path)
 
@@ -212,16 +279,18 @@ class _Edit:
         }
         edited = self.changed
         for folder, (name, source) in sorted(sources.items()):
-            metadata, prefix = f"{folder}/Chart.yaml", f"{folder}/"
-            changed = [path for path in edited if path.startswith(prefix)]
+            metadata = f"{folder}/Chart.yaml"
+            prefixes = tuple(f"{one}/" for one in chart_files.folders(folder, self.files))
+            changed = [path for path in edited if path.startswith(prefixes)]
             if not changed or metadata not in self.before:
                 continue
             if _version(self.before[metadata]) == source.version:
+                first = changed[0].removeprefix(prefixes[0])
                 yield fault(
                     "version",
-                    f"is still {source.version}, but {changed[0].removeprefix(prefix)} changed; "
-                    f"raise it here and at charts.{name} in {config.file_of(CHARTS_FILE, name)}, "
-                    "or no cluster applies it",
+                    f"is still {source.version}, but {first} changed; raise it here and at "
+                    f"charts.{name} in {config.file_of(CHARTS_FILE, name)}, or no cluster "
+                    "applies it",
                 ).within(metadata)
 
 

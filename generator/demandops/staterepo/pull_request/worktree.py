@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pygit2
@@ -38,6 +38,10 @@ class Base:
     state: State | None
     valid: bool
     """Whether the commit's files are valid; if not, ``state`` is from an earlier commit."""
+    newer: int = 0
+    """How many commits the merge target has that the checkout lacks."""
+    merged: Mapping[str, str] = field(default_factory=dict)
+    """The generated files of the merge target, if it has such commits."""
 
     def releases(self) -> dict[ReleaseKey, Release]:
         """Return the releases of ``state``."""
@@ -84,19 +88,23 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         return None
     if repo.is_empty or repo.head_is_unborn:
         return None
-    commit = _started_from(repo, revision)
-    files = trees.texts(commit.tree, _ROOTS)
+    target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
+    commit = _started_from(repo, target)
+    base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
+    if target:
+        tip = trees.commit_of(repo, target)
+        _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
+        merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
+        base = replace(base, newer=newer, merged=merged)
     try:
         snapshot = state_in_effect.state_at(repo, commit.id)
     except (InvalidInput, StateRepoError):
-        return Base(str(commit.id), files, None, False)
-    return Base(str(commit.id), files, snapshot.state, not snapshot.problems)
+        return base
+    return replace(base, state=snapshot.state, valid=not snapshot.problems)
 
 
-def _started_from(repo: Repository, revision: str | None) -> Commit:
+def _started_from(repo: Repository, target: str) -> Commit:
     head = repo.head.peel(Commit)
-    known = [name for name in _DEFAULTS if name in repo.references]
-    target = revision or next(iter(known), "")
     try:
         common = repo.merge_base(head.id, trees.commit_of(repo, target).id) if target else None
     except (StateRepoError, pygit2.GitError, KeyError):

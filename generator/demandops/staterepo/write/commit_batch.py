@@ -10,22 +10,33 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
+from itertools import islice
 from types import MappingProxyType
 from typing import Literal
 
 import pygit2
 from pygit2 import Oid, Signature
 
+from demandops.config.config import NODES_FILE
 from demandops.config.override import Override
-from demandops.decision import Decision, State, changeset_of_edit, rendered_files
+from demandops.decision import (
+    Decision,
+    State,
+    changeset_of_edit,
+    decide,
+    rendered_files,
+)
+from demandops.decision import scale_down as scaled_down
 from demandops.demand.claim import ClaimKey
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import claim_file
-from demandops.plan.overrides import claim_overrides
-from demandops.plan.overrides.lifecycle import (
-    changed_claim_files,
+from demandops.ledger.claim_changes import claim_changes
+from demandops.ledger.kept_replicas import Instance
+from demandops.ledger.operations.drain import Drain
+from demandops.plan.override_lifecycle import (
     changed_override_files,
     end_override,
+    update_claims,
     update_ledger,
 )
 from demandops.render.changes.changeset import Change, Changeset, ReleaseChange
@@ -61,6 +72,8 @@ class CommitBatch:
         self._settled: list[tuple[str, str]] = []
         self.start = start
         self.head = start
+        self.frees = False
+        """Whether a demand gave room back since this was last reset."""
 
     @property
     def is_empty(self) -> bool:
@@ -88,6 +101,7 @@ class CommitBatch:
             more.append((commit_log.PROPOSAL, proposal))
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
+        self.frees = self.frees or decision.frees
         author = commit_message.author(decision, received)
         return self.commit_files(decision.files, decision.state, text, author, now)
 
@@ -105,10 +119,10 @@ class CommitBatch:
         return str(made)
 
     def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
-        """Have the next commit, if any, name a demand that changed nothing.
+        """Record a demand that changed nothing in the message of the next commit, if there is one.
 
-        If the process dies before it answers, a restart must not evaluate that demand again after
-        a later release.
+        The process may die before it answers. A restart must not evaluate the demand again, because
+        a later release may have changed its outcome.
         """
         self._settled.append((f"{outcome}-Operation-Id", operation))
 
@@ -137,6 +151,7 @@ class CommitBatch:
             problems,
             [
                 *commit_message.override_trailers(overrides),
+                *commit_message.demand_trailers(keys),
                 *authorship.caused_by_trailers(causes),
                 *state_in_effect.trailers_of(self.head),
             ],
@@ -146,7 +161,7 @@ class CommitBatch:
         self.commit_files(files, state, text, author, now)
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return the effect, with the old configuration if the new one cannot be planned."""
+        """Return the effect of people's changes; if the new configuration fails, with the old."""
         judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
@@ -167,12 +182,13 @@ class CommitBatch:
 
     def _rendered_subjects(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-        ledger, keys = claim_overrides.update_kept_claims(old, state, subjects, now)
-        files = changed_claim_files(state.ledger, ledger, keys)
-        state = replace(state, ledger=ledger)
+        applied = update_claims(old, state, subjects, now)
+        touched = claim_changes(state.ledger, applied.ledger, applied.keys)
+        state = state.with_ledger(applied.ledger, touched)
+        subjects = tuple(dict.fromkeys((*subjects, *(one.key.subject for one in touched))))
         change = changeset_of_edit(state, old, subjects, self.read)
-        change = replace(change, files={**files, **change.files})
-        return self._with_started_leases(accepted.snapshot, state, change, keys, now)
+        change = replace(change, files={**applied.files, **change.files})
+        return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
 
     def _with_started_leases(
         self,
@@ -194,7 +210,8 @@ class CommitBatch:
             started = replace(claim, lease=claim.lease.started(now, before))
             ledger = ledger.replace(claim.key, started)
             files[path] = claim_file.text_of(started)
-        snapshot = replace(snapshot, state=replace(state, ledger=ledger))
+        # a lease does not affect a release, so nothing is counted anew
+        snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
         return snapshot, replace(change, files=files), tuple(keys)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
@@ -217,6 +234,36 @@ class CommitBatch:
         more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+
+    def scale_down(self, instance: Instance, now: datetime) -> str:
+        """Commit that a service no longer keeps replicas; return the commit's first line.
+
+        Raises Refused or InvalidInput if the service cannot be planned or rendered.
+        """
+        state, change = scaled_down(self.head.state, instance, now, self.read)
+        more = state_in_effect.trailers_of(self.head)
+        text = commit_message.of_scale_down(instance, change, more)
+        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+        return text.partition("\n")[0]
+
+    def drain(self, node: str, operation: str, now: datetime) -> Decision:
+        """Move placed applications off a drained node, in one commit; return the decision.
+
+        Its author is the person who last changed the node's file.
+        """
+        decision = decide(self.head.state, Drain(node), now, self.read)
+        if decision.files:
+            config = decision.state.config
+            file = config.file_of(NODES_FILE, config.host_of(node))
+            changes = commit_log.changes_to(self._objects, self.start.commit, file)
+            by_people = (one.entry.commit for one in changes if not one.entry.by_generator)
+            causes = [trees.commit_of(self._objects, one) for one in islice(by_people, 1)]
+            caused_by = authorship.caused_by_trailers(causes)
+            more = [*caused_by, *state_in_effect.trailers_of(self.head)]
+            text = commit_message.of_decision(decision, operation, now, more)
+            author = authorship.follow_author(causes, now)
+            self.commit_files(decision.files, decision.state, text, author, now)
+        return decision
 
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})

@@ -22,6 +22,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from demandops.demand.lease import UNSTARTED
 from demandops.errors import StateRepoError, Unsound
 from demandops.staterepo.git.repository import disk_error
 
@@ -42,7 +43,7 @@ class DamagedJournal(StateRepoError):
 
 @dataclass(frozen=True, slots=True)
 class ProposalRecord:
-    """What the journal keeps of a proposal, enough to resume it.
+    """The journal's record of a proposal, enough to resume it.
 
     ``commits`` are the past, current and next commits of the branch, the newest last; ``base`` is
     the commit of main below the newest. ``pushed``: the branch existed once. ``link``: its web
@@ -93,10 +94,10 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise if nobody knows what is in the file.
+        """Raise the error of an earlier write that left the file in an unknown state.
 
         Raises:
-            Unsound: the same as every write raises from then on.
+            Unsound: every later write raises it too.
         """
         if self._unsound is not None:
             raise self._unsound
@@ -135,7 +136,7 @@ class Journal:
         """Close the journal; pending demands stay for the next process."""
         with suppress(
             OSError, Unsound
-        ):  # the demands are there; what is done may be evaluated again
+        ):  # the demands are in the file; evaluating a done one again is harmless
             self._write([], durably=True)
         self._file.close()
 
@@ -153,7 +154,7 @@ class Journal:
             self._require_known(error)
             try:
                 self._file.truncate(self._size)
-            except OSError:  # a restart may find what is refused here
+            except OSError:  # a restart could find demands that are refused here
                 self._unsound = Unsound(
                     f"the journal {self._path} cannot be written or cut back: {error.strerror}; "
                     "check its disk, then start again"
@@ -183,7 +184,7 @@ class Journal:
             self._file = file
         else:
             self._is_broken = True
-            self._file.truncate(0)  # unlike another file, it needs no room on a full disk
+            self._file.truncate(0)  # a new file would need room, and the disk may be full
             os.fdatasync(self._file.fileno())
         sync_folder(self._path.parent)
         self._is_broken, self._chain, self._size = False, chain, len(text)
@@ -228,7 +229,7 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
             raise DamagedJournal(path, number) from None
     with suppress(ValueError):
         _apply(last[:-1], chain, {})
-        raise DamagedJournal(path, len(lines) + 1)  # complete: only the end of its line is changed
+        raise DamagedJournal(path, len(lines) + 1)  # only its line break was changed
     with suppress(ValueError):
         _apply(last, chain, pending)
     return pending
@@ -290,8 +291,9 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         if proposal := record.pop("proposal", None):
             proposal = ProposalRecord(**{**proposal, "commits": tuple(proposal["commits"])})
         entry = JournalEntry(**record, proposal=proposal)
-        if datetime.fromisoformat(entry.received).tzinfo is None:
-            raise ValueError("a time without a zone")
+        received = datetime.fromisoformat(entry.received)
+        if received.tzinfo is None or not 1970 <= received.year < UNSTARTED.year:
+            raise ValueError("a time without a zone, or of no generator")
         pending[entry.operation] = entry
     except (TypeError, LookupError, AttributeError, RecursionError) as error:
         raise ValueError("not an entry") from error

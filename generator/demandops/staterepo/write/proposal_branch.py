@@ -71,6 +71,13 @@ class ProposalBranches:
         named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
         return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
 
+    def exists(self, branch: str) -> bool:
+        """Return whether there is a branch of any name, or raise RemoteAway."""
+        reference = f"{_HEADS}{branch}"
+        if self._remote is None:
+            return reference in self._repository.objects.references
+        return reference in self._remote.list_references(reference)
+
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
         """Make a branch point to ``commit``, durably; return the link that the server printed.
 
@@ -85,7 +92,7 @@ class ProposalBranches:
             RemoteAway, PushDenied: it could not be pushed for another reason.
         """
         with self._repository.new.packed(commit):
-            return self._set(branch, commit, expected, options)
+            return self._move(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
         """Delete a branch, if it exists.
@@ -94,12 +101,12 @@ class ProposalBranches:
             BranchMoved: the branch is at another commit.
             RemoteAway, PushDenied: the deletion could not be pushed for another reason.
         """
-        self._set(branch, None, expected)
+        self._move(branch, None, expected)
 
-    def _set(
+    def _move(
         self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Move or delete a branch; if the push fails, check whether it took effect nevertheless."""
+        """Move or delete a branch; if the push fails, check whether it took effect anyway."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             self._set_here(reference, commit, expected)
@@ -109,7 +116,7 @@ class ProposalBranches:
             return _link(self._remote.push(spec, lease, options))
         except git.GitCommandError as error:
             if options and _NO_OPTIONS.search(str(error.stderr)):
-                return self._set(branch, commit, expected)
+                return self._move(branch, commit, expected)
             now = self.heads().branches.get(branch, "")
             if now == wanted:
                 return ""  # the push succeeded, but the answer was lost
@@ -184,10 +191,9 @@ class PendingProposal:
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     """Yield the proposals that are not merged, by branch, or raise RemoteAway."""
-    space = f"{_HEADS}{PREFIX}"
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
-        space = f"refs/remotes/origin/{PREFIX}"
+    space = f"{repository.branches}{PREFIX}"
     repo = Repository(repository.objects.path)
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):

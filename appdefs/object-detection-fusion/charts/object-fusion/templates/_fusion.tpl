@@ -13,11 +13,11 @@ checksum of them restarts the pods when they change.
 {{- end -}}
 
 {{- define "fusion.paramsName" -}}
-{{- printf "%s-params" .Release.Name -}}
+{{- printf "%s-params" (include "ros-service.fullname" .) -}}
 {{- end -}}
 
 {{- define "fusion.watcherName" -}}
-{{- printf "%s-watcher" .Release.Name -}}
+{{- printf "%s-watcher" (include "ros-service.fullname" .) -}}
 {{- end -}}
 
 {{- /*
@@ -27,4 +27,25 @@ empty list becomes a list with one empty string, which cannot be a topic's name.
 */ -}}
 {{- define "fusion.topics" -}}
 {{- . | uniq | sortAlpha | default (list "") | toJson -}}
+{{- end -}}
+
+{{- /* The volume with the account's token, as Kubernetes' client libraries expect it. */ -}}
+{{- define "fusion.apiAccess" -}}
+name: api-access
+projected:
+  sources:
+    - serviceAccountToken:
+        path: token
+        expirationSeconds: 3607
+    - configMap:
+        name: kube-root-ca.crt
+        items:
+          - key: ca.crt
+            path: ca.crt
+    - downwardAPI:
+        items:
+          - path: namespace
+            fieldRef:
+              apiVersion: v1
+              fieldPath: metadata.namespace
 {{- end -}}

@@ -1,0 +1,1 @@
+"""Charts in the state repo: their files, libraries, values, schemas and tables."""

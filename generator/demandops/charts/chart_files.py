@@ -1,0 +1,154 @@
+"""Charts in folders of the state repo: the libraries that they depend on, and their default values.
+
+Pure: a chart's files are given as texts by path. Flux and Argo CD read a library where
+``repository: file://…`` of ``Chart.yaml`` says; so does this module.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from demandops import strict_yaml
+from demandops.errors import Fault, InvalidInput, fault
+from demandops.quoting import quoted
+
+_LOCAL = "file://"
+_EXACT = re.compile(r"\d+\.\d+\.\d+")
+
+
+@dataclass(frozen=True, slots=True)
+class Dependency:
+    """An entry of a chart's ``dependencies``.
+
+    ``folder`` is its path in the state repo, unless it comes from elsewhere. ``imports`` names the
+    ``exports`` that become values of the chart.
+    """
+
+    index: int
+    name: str
+    version: str
+    repository: str
+    folder: str | None
+    imports: tuple[str, ...]
+
+
+def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...]:
+    """Return the dependencies of a chart; none if its ``Chart.yaml`` cannot be read."""
+    return _dependencies(folder, files.get(f"{folder}/Chart.yaml", ""))
+
+
+def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the folder of a chart, and those of the libraries that it depends on, at any depth."""
+    found = [folder]
+    for one in found:
+        for dependency in dependencies(one, files):
+            if dependency.folder and dependency.folder not in found:
+                found.append(dependency.folder)
+    return tuple(found)
+
+
+def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
+    """Return the default values of a chart, over those that it imports, as Helm merges them.
+
+    Raises:
+        InvalidInput: a ``values.yaml`` cannot be read.
+    """
+    imported: dict[str, Any] = {}
+    for dependency in dependencies(folder, files):
+        if dependency.folder and dependency.imports:
+            exports = _values(dependency.folder, files).get("exports")
+            for name in dependency.imports:
+                values = exports.get(name) if isinstance(exports, dict) else None
+                imported = merged(imported, values if isinstance(values, dict) else {})
+    return merged(imported, _values(folder, files))
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge values by Helm's rules: mappings merge, null removes, others replace."""
+    result = dict(below)
+    for key, value in above.items():
+        if value is None:
+            result.pop(key, None)
+        elif isinstance(value, dict) and isinstance(result.get(key), dict):
+            result[key] = merged(result[key], value)
+        else:
+            result[key] = value
+    return result
+
+
+def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
+    """Yield a fault for each library that is not where a chart says, or has another version."""
+    for one in dependencies(folder, files):
+        if not one.repository.startswith(_LOCAL):
+            continue
+        place = f"dependencies[{one.index}]"
+        text = files.get(f"{one.folder}/Chart.yaml") if one.folder else None
+        if text is None:
+            where = f"'{one.folder}/Chart.yaml'" if one.folder else "that"
+            message = (
+                f"{quoted(one.repository)}: {where} does not exist; correct the path, which "
+                "starts at the chart and stays in appdefs/"
+            )
+            yield fault(f"{place}.repository", message).within(f"{folder}/Chart.yaml")
+            continue
+        version = _mapping(text).get("version")
+        if _EXACT.fullmatch(one.version) and one.version != version:
+            message = (
+                f"is {one.version}, but {one.folder}/Chart.yaml says {version}; make them equal"
+            )
+            yield fault(f"{place}.version", message).within(f"{folder}/Chart.yaml")
+
+
+@lru_cache(maxsize=256)
+def _dependencies(folder: str, text: str) -> tuple[Dependency, ...]:
+    listed = _mapping(text).get("dependencies")
+    return tuple(
+        Dependency(
+            index,
+            str(one.get("name")),
+            str(one.get("version")),
+            str(one.get("repository") or ""),
+            _local_folder(folder, str(one.get("repository") or "")),
+            _imports(one.get("import-values")),
+        )
+        for index, one in enumerate(listed if isinstance(listed, list) else ())
+        if isinstance(one, dict)
+    )
+
+
+def _imports(listed: object) -> tuple[str, ...]:
+    return tuple(map(str, listed)) if isinstance(listed, list) else ()
+
+
+def _local_folder(folder: str, repository: str) -> str | None:
+    """Return the folder of a library; Flux fetches nothing outside ``appdefs/``."""
+    if not repository.startswith(_LOCAL):
+        return None
+    path = posixpath.normpath(posixpath.join(folder, repository.removeprefix(_LOCAL)))
+    return path if path.startswith("appdefs/") else None
+
+
+def _values(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
+    file = f"{folder}/values.yaml"
+    try:
+        return _read(files.get(file, ""))
+    except InvalidInput as error:
+        raise InvalidInput(strict_yaml.faults_in(error, file)) from None
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    try:
+        return _read(text)
+    except InvalidInput:  # a fault of its own
+        return {}
+
+
+@lru_cache(maxsize=256)
+def _read(text: str) -> dict[str, Any]:
+    values = strict_yaml.load(text)
+    return values if isinstance(values, dict) else {}

@@ -1,0 +1,80 @@
+"""The ``values.schema.json`` of a chart: its own values, and those of the library that it imports.
+
+Helm and the generator follow no reference out of a schema. So a chart's schema contains what the
+library's says, put there by this module.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from demandops.charts.values_table import descriptions
+
+LIBRARY = "ros-service"
+EXPORT = "service"
+
+
+def composed(
+    title: str, own: Mapping[str, Any], values: str, library: Mapping[str, Any], shared: str
+) -> dict[str, Any]:
+    """Return the schema of a chart.
+
+    Args:
+        title: the schema's title.
+        own: the properties that the chart adds or replaces, by name.
+        values: the text of the chart's ``values.yaml``, which describes its values.
+        library: the schema of the library.
+        shared: the text of the library's ``values.yaml``.
+    """
+    prefix = f"exports.{EXPORT}."
+    told = {
+        path.removeprefix(prefix): said
+        for path, said in descriptions(shared).items()
+        if path.startswith(prefix)
+    } | descriptions(values)
+    properties = {**library["definitions"][EXPORT]["properties"], **own}
+    definitions = {name: one for name, one in library["definitions"].items() if name != EXPORT}
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "title": title,
+        "type": "object",
+        "additionalProperties": False,
+        # Lint does not know imported values, so the schema requires only those of the chart.
+        "required": sorted(own),
+        "properties": {
+            name: _described(copy.deepcopy(one), name, told)
+            for name, one in sorted(properties.items())
+        }
+        # Helm puts the library's own values here.
+        | {name: {"type": "object"} for name in (LIBRARY, "global")},
+        "definitions": definitions,
+    }
+
+
+def own_properties(schema: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the properties of a chart's schema that are not those of the library."""
+    shared = {
+        name: _plain(copy.deepcopy(one))
+        for name, one in library["definitions"][EXPORT]["properties"].items()
+    }
+    plain = {name: _plain(copy.deepcopy(one)) for name, one in schema["properties"].items()}
+    return {
+        name: one
+        for name, one in plain.items()
+        if name not in (LIBRARY, "global") and one != shared.get(name)
+    }
+
+
+def _described(schema: dict[str, Any], path: str, told: Mapping[str, str]) -> dict[str, Any]:
+    for name, one in schema.get("properties", {}).items():
+        schema["properties"][name] = _described(one, f"{path}.{name}", told)
+    return {**schema, "description": told[path]} if path in told else schema
+
+
+def _plain(schema: dict[str, Any]) -> dict[str, Any]:
+    for name, one in schema.get("properties", {}).items():
+        schema["properties"][name] = _plain(one)
+    schema.pop("description", None)
+    return schema

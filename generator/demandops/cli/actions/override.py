@@ -1,0 +1,220 @@
+"""``demandops override``: declare and end a deviation, as a commit of one's own."""
+
+from __future__ import annotations
+
+from datetime import timedelta
+from typing import Any
+
+import click
+
+from demandops import strict_yaml
+from demandops.cli.actions.person_change import (
+    Edit,
+    Way,
+    carry_out,
+    confirmed,
+    consequence,
+    consequence_lines,
+    editing,
+    print_edit,
+    selecting,
+    selector,
+    warn_of_idle,
+    writable,
+)
+from demandops.cli.names import names_of
+from demandops.cli.output import errors
+from demandops.config.load import is_override_name
+from demandops.config.override import OVERRIDES_ROOT, format_time, parse_time
+from demandops.config.policy import seconds_of
+from demandops.errors import InvalidInput, suggestion
+from demandops.identifiers import id_problem
+from demandops.input_file import read_input
+from demandops.plan.views.override_report import Entry
+from demandops.quoting import quoted
+from demandops.runtime import REAL
+from demandops.scaffold.written import document
+from demandops.staterepo.reader import Reader
+
+
+@click.group()
+def override() -> None:
+    """Create and end overrides: deviations that people declare.
+
+    \b
+    Examples:
+      demandops override create calm --node edge --hold -m "Demonstration on Friday"
+      demandops override end calm
+      demandops get overrides
+    """
+
+
+def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
+    """Refuse a name that no override may have."""
+    if not is_override_name(name):
+        raise click.BadParameter(
+            f"{quoted(name)} cannot name an override; use lower-case letters, digits and '-'"
+        )
+    return name
+
+
+@override.command()
+@click.argument("name", metavar="NAME", callback=_new_name)
+@selecting
+@click.option("--hold", is_flag=True, help="Keep the files as they are.")
+@click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
+@click.option("--keep", is_flag=True, help="Keep services running without a demand.")
+@click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the replicas.")
+@click.option("--on", "target", metavar="NODE", help="Move services to this node.")
+@click.option("--use-version", "version", metavar="WORD", help="Pin the version of the chart.")
+@click.option(
+    "--values", "values_file", metavar="FILE", help="Patch Helm values with this YAML file."
+)
+@click.option("--priority", type=int, metavar="N", help="The higher one wins. Default: 0.")
+@click.option(
+    "--expires", metavar="TIME", help="When it ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z."
+)
+@click.option("--owner", metavar="NAME", help="Who is responsible. Default: your name in git.")
+@editing
+def create(  # noqa: PLR0913, PLR0917 - each is an option
+    name: str,
+    hold: bool,
+    deny: bool,
+    keep: bool,
+    replicas: int | None,
+    target: str | None,
+    version: str | None,
+    values_file: str | None,
+    priority: int | None,
+    expires: str | None,
+    owner: str | None,
+    way: Way,
+    **selected: tuple[str, ...],
+) -> None:
+    """Create an override.
+
+    It is committed in your own name, as git knows it, or with --propose put on a branch. Options of
+    the same name are alternatives; options of different names must all match (docs/overrides.md).
+
+    \b
+    Examples:
+      demandops override create calm --node edge --hold -m "Demonstration on Friday"
+      demandops override create more --service tracker --replicas 2 --expires 2d -m Load
+      demandops override create later --application 'edge/*' --keep -m Tests --propose
+    """
+    effects: dict[str, Any] = {
+        "values": _values(values_file),
+        "version": version,
+        "replicas": replicas,
+        "node": target,
+        "hold": hold or None,
+        "deny": deny or None,
+        "keep": keep or None,
+    }
+    more = {"owner": owner, "priority": priority, "expires": ends_at(expires)}
+    with writable(way.state_repo, way.signing_key) as repo:
+        text = new_override(repo, name, way, selected, {**more, **effects})
+        create_override(repo, Edit(name, text, f"Create override {name}", way.reason), way)
+
+
+@override.command()
+@click.argument("name", metavar="NAME", shell_complete=names_of("overrides"))
+@editing
+def end(name: str, way: Way) -> None:
+    """End an override: remove its file.
+
+    The releases that it changed become again as they are demanded.
+
+    \b
+    Examples:
+      demandops override end calm -m "The demonstration is over"
+      demandops override end calm --dry-run
+    """
+    with writable(way.state_repo, way.signing_key) as repo:
+        end_override(repo, Edit(name, None, f"End override {name}", way.reason), way)
+
+
+def new_override(
+    repo: Reader,
+    name: str,
+    way: Way,
+    selected: dict[str, tuple[str, ...]],
+    more: dict[str, Any],
+) -> str:
+    """Return the text of an override's file; ``more`` are its effects and other fields."""
+    if not way.reason:
+        raise click.UsageError("give the reason: -m TEXT")
+    chosen = selector(selected)
+    if not chosen:
+        raise click.UsageError("select what it applies to, for example --node edge")
+    fields = {
+        "reason": way.reason,
+        **more,
+        "owner": more.get("owner") or _owner(repo),
+        "select": [chosen],
+    }
+    given = {key: value for key, value in fields.items() if value is not None}
+    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
+
+
+def create_override(repo: Reader, edit: Edit, way: Way) -> None:
+    """Show what a new override does, ask, and commit it."""
+    if repo.file_reader()(edit.path) is not None:
+        message = "exists already; end it first, or choose another name"
+        raise InvalidInput.at("", message, file=edit.path)
+    entry = consequence(repo, edit)
+    warn_of_idle(entry)
+    _carry_out(repo, edit, entry, way)
+
+
+def end_override(repo: Reader, edit: Edit, way: Way) -> None:
+    """Show what the end of an override changes, ask, and commit it."""
+    known = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+    if edit.name not in known:
+        message = f"there is no override '{edit.name}'{suggestion(edit.name, known)}"
+        raise InvalidInput.at("", message)
+    _carry_out(repo, edit, consequence(repo, edit), way)
+
+
+def _carry_out(repo: Reader, edit: Edit, entry: Entry, way: Way) -> None:
+    if way.output == "text":
+        errors.print(f"{edit.summary} ({edit.path})")
+        for line in consequence_lines(edit, entry):
+            errors.print(line)
+    if not way.dry_run:
+        confirmed("Continue?", way.yes, way.output)
+    made = None if way.dry_run else carry_out(repo, edit, way.propose)
+    print_edit(edit, entry, made, way.output)
+
+
+def _values(file: str | None) -> dict[str, Any] | None:
+    if file is None:
+        return None
+    name, text = read_input(file)
+    data = strict_yaml.load(text, name)
+    if not isinstance(data, dict):
+        raise InvalidInput.at("", "must be a mapping of Helm values", file=name)
+    return data
+
+
+def ends_at(text: str | None) -> str | None:
+    """Return the end of an override: a time, or a duration from now."""
+    if text is None:
+        return None
+    try:
+        end = REAL.now() + timedelta(seconds=seconds_of(text))
+        return format_time(end.replace(microsecond=0))
+    except ValueError:
+        pass
+    try:
+        return format_time(parse_time(text))
+    except ValueError as error:
+        raise click.BadParameter(
+            f"{error}, or a duration like 2h", param_hint="--expires"
+        ) from None
+
+
+def _owner(repo: Reader) -> str:
+    """Return the person's name in git, or the address if the name is no id."""
+    person = repo.operator()
+    return person.email if id_problem(person.name) else person.name

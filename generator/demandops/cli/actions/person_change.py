@@ -1,0 +1,259 @@
+"""Shared parts of the commands by which a person edits the state repo."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from demandops import settings
+from demandops.cli.json_output import (
+    Json,
+    claim_data,
+    output_option,
+    override_data,
+    release_data,
+    show,
+)
+from demandops.cli.names import names_of
+from demandops.cli.output import errors
+from demandops.cli.target import signing_option, writable_repo_option
+from demandops.config.base_model import parse_file
+from demandops.config.override import Override, OverrideFile
+from demandops.config.repo_settings import Proposals
+from demandops.forge import ForgeError, forge_for
+from demandops.ledger.world import World
+from demandops.plan.views.override_report import Entry, override_report
+from demandops.quoting import one_line
+from demandops.runtime import REAL
+from demandops.settings import MAIN_BRANCH
+from demandops.staterepo import reader
+from demandops.staterepo.git.signing import Signer
+from demandops.staterepo.reader import Reader
+from demandops.staterepo.write import person_commit
+from demandops.staterepo.write.person_commit import Author, Published
+
+Command = Callable[..., Any]
+
+reason_option = click.option(
+    "-m", "--reason", metavar="TEXT", help="The reason, for the commit message and the file."
+)
+yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
+dry_run_option = click.option(
+    "--dry-run", is_flag=True, help="Show the consequences and change nothing."
+)
+propose_option = click.option(
+    "--propose",
+    is_flag=True,
+    help="Push a branch and open a merge request, instead of a commit on main.",
+)
+
+
+def is_asked(yes: bool, output: str) -> bool:
+    """Return whether to ask a person before something changes; a script is not asked."""
+    return not yes and output == "text" and sys.stdin.isatty()
+
+
+def confirmed(question: str, yes: bool, output: str) -> None:
+    """Ask the question, unless ``yes`` is given or a script runs the command.
+
+    Raises:
+        click.ClickException: the answer was no.
+    """
+    if is_asked(yes, output) and not click.confirm(question, err=True):
+        raise click.ClickException("nothing was changed")
+
+
+@contextmanager
+def writable(state_repo: str, signing_key: Path | None) -> Iterator[Reader]:
+    """Yield an open state repo to which a person's commits can be published."""
+    with reader.opened(state_repo, only_read=False) as repo:
+        repo.repository.signer = Signer(signing_key) if signing_key else None
+        yield repo
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """The options of a person's edit: where, why, and whether it is proposed or only shown."""
+
+    state_repo: str
+    signing_key: Path | None
+    reason: str
+    propose: bool
+    dry_run: bool
+    yes: bool
+    output: str
+
+
+def editing(command: Command) -> Command:
+    """Add the options that give the ``way`` of a command."""
+
+    @wraps(command)
+    def run(**given: Any) -> Any:  # noqa: ANN401
+        given["reason"] = " ".join((given["reason"] or "").split())
+        way = Way(**{field.name: given.pop(field.name) for field in fields(Way)})
+        return command(way=way, **given)
+
+    options = (
+        reason_option,
+        propose_option,
+        dry_run_option,
+        yes_option,
+        writable_repo_option,
+        signing_option,
+        output_option,
+    )
+    added: Command = run
+    for option in reversed(options):
+        added = option(added)
+    return added
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A person's edit of one override: path, new text (None: removed), and the commit's words."""
+
+    name: str
+    text: str | None
+    summary: str
+    reason: str
+
+    @property
+    def path(self) -> str:
+        """The file of the override."""
+        return f"overrides/{self.name}.yaml"
+
+
+def consequence(repo: Reader, edit: Edit) -> Entry:
+    """Return the effect of a new override, or the current effect of one that is removed.
+
+    Raises:
+        InvalidInput: the new file is not valid.
+    """
+    state = repo.last_valid_snapshot(repo.commit()).state
+    world = World(state.config, state.ledger)
+    if edit.text is not None:
+        override = Override.from_file(edit.name, parse_file(OverrideFile, edit.text, edit.path))
+        overrides = {**state.config.overrides, edit.name: override}
+        world = World(replace(state.config, overrides=overrides), state.ledger)
+    entries = override_report(world, REAL.now())
+    return next(entry for entry in entries if entry.override.name == edit.name)
+
+
+def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
+    """Commit the edit to main, or push it as a branch with a merge request."""
+    files = {edit.path: edit.text}
+    author = Author(repo.operator(), REAL.now(), edit.summary, one_line(edit.reason))
+    if not propose:
+        return person_commit.commit_to_main(repo.repository, lambda _: files, author)
+    branch = f"override/{edit.name}"
+    made = person_commit.commit_to_branch(
+        repo.repository, files, author, branch, _push_options(repo, edit)
+    )
+    return Published(made.commit, branch, made.link or _opened(repo, edit, branch))
+
+
+def _forge_settings(repo: Reader) -> Proposals:
+    return repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals
+
+
+def _push_options(repo: Reader, edit: Edit) -> list[str]:
+    if _forge_settings(repo).forge != "gitlab":
+        return []
+    return [
+        "merge_request.create",
+        f"merge_request.target={MAIN_BRANCH}",
+        f"merge_request.title={one_line(edit.summary)}",
+        f"merge_request.description={one_line(edit.reason)}",
+        "merge_request.remove_source_branch",
+    ]
+
+
+def _opened(repo: Reader, edit: Edit, branch: str) -> str:
+    """Open a pull request at GitHub or Gitea and return its link; the branch is already pushed."""
+    try:
+        forge = forge_for(_forge_settings(repo), settings.forge_token_file())
+        if forge is None:
+            return ""
+        return forge.open(branch, MAIN_BRANCH, one_line(edit.summary), one_line(edit.reason)).link
+    except ForgeError as error:
+        errors.print(f"warning: no merge request was opened: {error}; open it for {branch}")
+        return ""
+
+
+def print_edit(edit: Edit, entry: Entry, made: Published | None, output: str) -> None:
+    """Print what the edit did, or would do, and the releases and claims that it applies to."""
+    data: Json = {
+        "outcome": _outcome(made),
+        "commit": made.commit if made else None,
+        "branch": made.branch if made else None,
+        "link": made.link or None if made else None,
+        "text": edit.text,
+        "override": override_data(entry.override),
+        "state": entry.state,
+        "releases": [release_data(each) for each in entry.releases],
+        "claims": [claim_data(each) for each in entry.claims],
+    }
+    show(output, data, _lines(edit, data))
+
+
+def _outcome(made: Published | None) -> str:
+    if made is None:
+        return "would-change"
+    return "committed" if made.branch == MAIN_BRANCH else "proposed"
+
+
+def _lines(edit: Edit, data: Json) -> Iterator[str]:
+    if data["outcome"] == "committed":
+        yield f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}"
+        yield "a running generator carries it out; so does the next one that starts"
+    elif data["outcome"] == "proposed":
+        yield f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()
+    else:
+        yield f"{edit.summary}: nothing was changed"
+        yield from (f"    {line}" for line in (edit.text or "").splitlines())
+
+
+def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
+    """Return lines on what an override changes, or no longer changes if it is removed."""
+    verb = "affects" if edit.text is not None else "no longer affects"
+    found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
+    found += [f"  {verb} {claim.subject} of {claim.demand}" for claim in entry.claims]
+    return found or [f"  {verb} nothing now"]
+
+
+def warn_of_idle(entry: Entry) -> None:
+    """Warn about an override that has no effect now."""
+    override = entry.override
+    if entry.state == "matches nothing":
+        errors.print(f"warning: {override.path} matches nothing that is demanded now")
+    elif entry.state in ("held back", "expired"):
+        errors.print(f"warning: {override.path} is {entry.state}, so it changes nothing now")
+
+
+SELECTORS = ("application", "appdef", "service", "connection", "node", "requester")
+
+
+def selecting(command: Command) -> Command:
+    """Add the options that select the releases and claims of an override."""
+    for name in reversed(SELECTORS):
+        command = click.option(
+            f"--{name}",
+            f"{name}s",
+            metavar="NAME",
+            multiple=True,
+            shell_complete=names_of(f"{name}s"),
+            help=f"Select this {name}; * and ? stand for any text. May be repeated.",
+        )(command)
+    return command
+
+
+def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
+    """Return the selector that the options of :func:`selecting` make."""
+    return {name: list(values) for name, values in given.items() if values}

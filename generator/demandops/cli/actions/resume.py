@@ -1,0 +1,31 @@
+"""``demandops resume``: end an override that ``demandops suspend`` made."""
+
+from __future__ import annotations
+
+import click
+
+from demandops.cli.actions.override import end_override
+from demandops.cli.actions.person_change import Edit, Way, editing, selecting, selector, writable
+from demandops.cli.actions.suspend import described, name_of
+from demandops.cli.names import names_of
+
+
+@click.command()
+@click.argument("name", required=False, metavar="[NAME]", shell_complete=names_of("overrides"))
+@selecting
+@editing
+def resume(name: str | None, way: Way, **selected: tuple[str, ...]) -> None:
+    """Run suspended applications and connections again.
+
+    Give the same options as for `demandops suspend`, or NAME, the override's name.
+
+    \b
+    Examples:
+      demandops resume --requester vehicle00
+      demandops resume suspend-vehicle00-1c2f3a
+    """
+    if bool(name) == bool(selector(selected)):
+        raise click.UsageError("give the options that suspended it, or the override's name")
+    summary = f"Resume {name or described(selected)}"
+    with writable(way.state_repo, way.signing_key) as repo:
+        end_override(repo, Edit(name or name_of(selected), None, summary, way.reason), way)

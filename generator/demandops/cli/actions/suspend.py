@@ -1,0 +1,60 @@
+"""``demandops suspend``: stop claims without releasing them, by an override that denies them."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+
+import click
+
+from demandops.cli.actions.override import create_override, ends_at, new_override
+from demandops.cli.actions.person_change import Edit, Way, editing, selecting, selector, writable
+
+_LONGEST = 40
+
+
+def name_of(selected: dict[str, tuple[str, ...]]) -> str:
+    """Return the name of the override that suspends a selection; equal selections share it."""
+    chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
+    words = "-".join(value for _, values in chosen for value in values)
+    slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:_LONGEST].rstrip("-")
+    digest = hashlib.sha256(repr(chosen).encode()).hexdigest()[:6]
+    return f"suspend-{slug}-{digest}" if slug else f"suspend-{digest}"
+
+
+@click.command()
+@selecting
+@click.option(
+    "--expires", metavar="TIME", help="When it ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z."
+)
+@editing
+def suspend(
+    expires: str | None,
+    way: Way,
+    **selected: tuple[str, ...],
+) -> None:
+    """Stop applications and connections without releasing them.
+
+    Their claims stay booked, but nothing runs for them, and new demands for them are refused, until
+    `demandops resume` with the same options. This makes an override with `deny`, in your own name.
+
+    \b
+    Examples:
+      demandops suspend --requester vehicle00 -m "In the workshop"
+      demandops suspend --application 'edge/*' --expires 2h -m "The edge is serviced"
+      demandops suspend --connection vehicle00/edge -m "Too much data" --propose
+    """
+    effect = {"expires": ends_at(expires), "deny": True}
+    with writable(way.state_repo, way.signing_key) as repo:
+        name = name_of(selected)
+        text = new_override(repo, name, way, selected, effect)
+        create_override(repo, Edit(name, text, f"Suspend {described(selected)}", way.reason), way)
+
+
+def described(selected: dict[str, tuple[str, ...]]) -> str:
+    """Return a selection as text."""
+    return ", ".join(
+        f"{kind.removesuffix('s')} {value}"
+        for kind, values in selector(selected).items()
+        for value in values
+    )

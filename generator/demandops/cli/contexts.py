@@ -1,0 +1,96 @@
+"""Contexts: the fleets that a person works with, in a file of the user's config folder.
+
+A context replaces options that a person would repeat: the state repo, the access to the clusters,
+the signing key. docs/commands.md describes the file.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints, model_validator
+
+from demandops import strict_yaml
+from demandops.config.base_model import CamelModel, DnsLabel, FileModel, parse, parse_file
+from demandops.errors import InvalidInput, suggestion
+from demandops.field_lines import located_in
+from demandops.settings import API_VERSION
+
+Filled = Annotated[str, StringConstraints(min_length=1)]
+
+
+class Context(CamelModel):
+    """The values that a command uses if no option or environment variable gives them."""
+
+    state_repo: Filled
+    clusters: Filled | None = None
+    signing_key: Filled | None = None
+
+
+class ContextsFile(FileModel):
+    """``~/.config/demandops/contexts.yaml``: contexts by name, and the one in use."""
+
+    kind: Literal["Contexts"]
+    current: DnsLabel | None = None
+    contexts: dict[DnsLabel, Context] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known(self) -> ContextsFile:
+        if self.current is not None and self.current not in self.contexts:
+            raise ValueError(
+                f"current: there is no context '{self.current}'"
+                f"{suggestion(self.current, self.contexts)}"
+            )
+        return self
+
+
+EMPTY = ContextsFile(apiVersion=API_VERSION, kind="Contexts")
+
+
+def path() -> Path:
+    """Return the path of the file."""
+    root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
+    return Path(root) / "demandops" / "contexts.yaml"
+
+
+def read() -> ContextsFile:
+    """Read the file; without one there are no contexts.
+
+    Raises:
+        InvalidInput: with all faults.
+    """
+    try:
+        text = path().read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return EMPTY
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput.at("", f"cannot be read: {error}", file=str(path())) from None
+    with located_in(text):
+        return parse_file(ContextsFile, text, str(path()))
+
+
+def parsed(data: dict[str, Any]) -> ContextsFile:
+    """Return data as contexts; raise if it is not valid."""
+    return parse(ContextsFile, data, str(path()))
+
+
+def write(content: ContextsFile) -> None:
+    """Replace the file, which only its owner may read."""
+    file = path()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    data = content.model_dump(by_alias=True, exclude_none=True)
+    new = file.with_name(f".{file.name}.new")
+    new.write_text(strict_yaml.dump(data), encoding="utf-8")
+    new.chmod(0o600)
+    new.replace(file)
+
+
+def named(name: str) -> Context:
+    """Return a context; raise if there is none of that name."""
+    known = read().contexts
+    if name not in known:
+        message = f"there is no context '{name}'{suggestion(name, known)}"
+        raise InvalidInput.at("--context", message, file=str(path()))
+    return known[name]

@@ -1,0 +1,33 @@
+"""``demandops completion``: the code by which a shell completes commands, options and names."""
+
+from __future__ import annotations
+
+import click
+from click.shell_completion import get_completion_class
+
+from demandops.cli.output import print_lines
+
+VARIABLE = "_DEMANDOPS_COMPLETE"
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]), metavar="bash|zsh|fish")
+def completion(shell: str) -> None:
+    """Print the code that makes a shell complete commands.
+
+    It completes commands, options, and names from the state repo that the command would use: of
+    demands, nodes, releases, applications, requesters, proposals and overrides. It does not fetch a
+    URL, but uses the commit that was fetched last.
+
+    \b
+    Examples:
+      demandops completion bash > ~/.local/share/bash-completion/completions/demandops
+      demandops completion zsh > ~/.zfunc/_demandops
+      demandops completion fish > ~/.config/fish/completions/demandops.fish
+    """
+    root = click.get_current_context().find_root().command
+    made = get_completion_class(shell)
+    assert made is not None  # noqa: S101 - click has these three
+    maker = made(root, {}, "demandops", VARIABLE)
+    code = maker.source_template % maker.source_vars()  # source() would start bash for its version
+    print_lines(code.rstrip("\n").split("\n"))

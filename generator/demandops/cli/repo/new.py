@@ -1,0 +1,315 @@
+"""``demandops new``: files of a state repo for people to edit, valid from the start."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from demandops.cli.json_output import output_option, show
+from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.load import load
+from demandops.config.registry import Image
+from demandops.decision import State, try_configuration
+from demandops.errors import InvalidInput, StateRepoError
+from demandops.ledger.ledger import Ledger
+from demandops.scaffold import new_application, new_entry, new_image
+from demandops.scaffold.new_application import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
+from demandops.settings import data_folder
+from demandops.staterepo import skeleton
+from demandops.staterepo.pull_request import worktree
+
+_IMAGE = re.compile(r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:.*))?")
+_SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
+Files = Mapping[str, str]
+
+directory_option = click.option(
+    "--directory",
+    "-C",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=Path(),
+    metavar="DIR",
+    help="The checked-out state repo. Default: this folder.",
+)
+
+
+@click.group()
+def new() -> None:
+    """Write a new application, node, access domain or override.
+
+    The files are valid as they are: `demandops check` passes. No existing file is changed, and
+    nothing is committed.
+
+    \b
+    Examples:
+      demandops new node vehicle04 --type vehicle --cluster c-its
+      demandops new application tracking
+    """
+
+
+@new.command()
+@click.argument("name")
+@click.option("--description", default="", metavar="TEXT", help="What it does, in a sentence.")
+@click.option(
+    "--input",
+    "inputs",
+    multiple=True,
+    metavar="ROLE=TYPE",
+    help="An input and its message type: camera=sensor_msgs/msg/Image. May be repeated.",
+)
+@click.option(
+    "--service",
+    "services",
+    multiple=True,
+    metavar="NAME=PACKAGE/FILE",
+    help="A service and the launch file that it runs: detector=my_package/detector.launch.py. May "
+    "be repeated; each further service reads the outputs of the one before.",
+)
+@click.option("--image", default="", metavar="IMAGE", help="The image, with a tag or digest.")
+@click.option("--node", default="", metavar="ID", help="The node of the example demand.")
+@directory_option
+@output_option
+def application(  # noqa: PLR0913 - as many as options
+    name: str,
+    *,
+    description: str,
+    inputs: tuple[str, ...],
+    services: tuple[str, ...],
+    image: str,
+    node: str,
+    directory: Path,
+    output: str,
+) -> None:
+    """Write a new application: definition, values, chart, registry, README and a demand.
+
+    On a terminal, it asks for the options that are missing.
+
+    \b
+    Examples:
+      demandops new application tracking
+      demandops new application tracking --input camera=sensor_msgs/msg/Image
+    """
+    inputs = inputs or _prompted("input", "Inputs (role=type, separated by spaces)")
+    services = services or _prompted("service", "Services (name=package/file, separated by spaces)")
+    (image,) = (image,) if image else _prompted("image", "Image, with a tag or digest")
+
+    def made(config: Config) -> Files:
+        plan = ApplicationPlan(
+            name,
+            description or f"Runs {', '.join(one.partition('=')[0] for one in services)}",
+            dict(_pair(one, "--input", "ROLE=TYPE") for one in inputs),
+            tuple(_service(one) for one in services),
+            _image(image),
+            node or _example_node(config),
+        )
+        return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
+
+    then = [
+        "to try it once the files are on main: demandops request --dry-run "
+        f"{directory / 'appdefs' / name / 'demand.yaml'}",
+    ]
+    _lay_down(directory, made, output, then)
+
+
+@new.command()
+@click.argument("id")
+@click.option("--type", "type_", required=True, metavar="WORD", help="vehicle, station, edge, …")
+@click.option("--cluster", required=True, metavar="NAME", help="Its cluster, which may be new.")
+@directory_option
+@output_option
+def node(id: str, type_: str, cluster: str, directory: Path, output: str) -> None:
+    """Write a new node, in a file of its own.
+
+    \b
+    Examples:
+      demandops new node vehicle04 --type vehicle --cluster c-its
+    """
+    _lay_down(directory, lambda config: new_entry.node(id, type_, cluster, config), output)
+
+
+@new.command()
+@click.argument("name")
+@click.option("--namespace", default="", metavar="NAME", help="Default: the access domain's name.")
+@click.option("--node", "nodes", multiple=True, required=True, metavar="PATTERN", help="Its nodes.")
+@click.option(
+    "--requester",
+    "requesters",
+    multiple=True,
+    metavar="PATTERN",
+    help="Who may demand there. Default: everybody.",
+)
+@directory_option
+@output_option
+def policy(
+    name: str,
+    *,
+    namespace: str,
+    nodes: tuple[str, ...],
+    requesters: tuple[str, ...],
+    directory: Path,
+    output: str,
+) -> None:
+    """Write a new access domain: who may demand what on which nodes.
+
+    \b
+    Examples:
+      demandops new policy operations --node cloud --requester "operator*"
+    """
+    _lay_down(
+        directory,
+        lambda config: new_entry.access_domain(name, namespace or name, nodes, requesters, config),
+        output,
+    )
+
+
+@new.command()
+@click.argument("name")
+@click.option("--reason", required=True, metavar="TEXT", help="Why it is needed.")
+@click.option("--owner", required=True, metavar="NAME", help="Who is responsible for it.")
+@click.option("--service", "services", multiple=True, metavar="PATTERN", help="Selects services.")
+@click.option("--application", "apps", multiple=True, metavar="PATTERN", help="Selects by id.")
+@click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Selects by node.")
+@click.option(
+    "--effect",
+    type=click.Choice(["hold", "deny", "keep"]),
+    help="Keep the files as they are, stop and refuse, or keep running without a demand.",
+)
+@click.option("--replicas", type=click.IntRange(min=0), metavar="N", help="How many pods run.")
+@directory_option
+@output_option
+def override(  # noqa: PLR0913 - as many as options
+    name: str,
+    *,
+    reason: str,
+    owner: str,
+    services: tuple[str, ...],
+    apps: tuple[str, ...],
+    nodes: tuple[str, ...],
+    effect: str | None,
+    replicas: int | None,
+    directory: Path,
+    output: str,
+) -> None:
+    """Write a new override with one effect.
+
+    \b
+    Examples:
+      demandops new override calm --node edge --effect deny --reason why --owner petra
+    """
+    given = {"services": services, "applications": apps, "nodes": nodes}
+    select = {field: [*values] for field, values in given.items() if values}
+    if not select:
+        raise click.UsageError("say what it selects: --service, --application or --node")
+    if (effect is None) == (replicas is None):
+        raise click.UsageError("give one effect: --effect or --replicas")
+    does: dict[str, Any] = {"replicas": replicas} if effect is None else {effect: True}
+    _lay_down(
+        directory,
+        lambda config: new_entry.override(name, reason, owner, select, does, config),
+        output,
+    )
+
+
+@new.command()
+@click.argument("name")
+@click.option(
+    "--repository", required=True, metavar="HOST/PATH", help="Where the image is pushed to."
+)
+@click.option(
+    "--state-repo", "url", required=True, metavar="URL", help="The state repo to propose it to."
+)
+@click.option(
+    "--directory",
+    "-C",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=Path(),
+    metavar="DIR",
+    help="The repository of the ROS package. Default: this folder.",
+)
+@output_option
+def image(name: str, repository: str, url: str, directory: Path, output: str) -> None:
+    """Write a container file and pipelines for a ROS package of your own.
+
+    NAME is the image's name in registry/images/. The pipelines, for GitHub and GitLab, test the
+    package. For a tag, they build the image and propose it to the state repo with its digest.
+
+    \b
+    Examples:
+      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:fleet
+    """
+    folder = data_folder("templates") / "scaffold" / "image"
+    texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
+    then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
+    _write(directory, new_image.files(name, repository, url, texts), output, then)
+
+
+def _prompted(option: str, question: str) -> tuple[str, ...]:
+    """Ask for an option's values on the terminal; elsewhere raise that the option is missing."""
+    if not sys.stdin.isatty():
+        raise click.UsageError(f"Missing option '--{option}'.")
+    return tuple(str(click.prompt(question)).split())
+
+
+def _pair(text: str, option: str, form: str) -> tuple[str, str]:
+    name, mark, value = text.partition("=")
+    if not (name and mark and value):
+        raise click.BadParameter(f"'{text}' is not {form}", param_hint=option)
+    return name, value
+
+
+def _service(text: str) -> ServicePlan:
+    found = _SERVICE.fullmatch(text)
+    if not found:
+        raise click.BadParameter(f"'{text}' is not NAME=PACKAGE/FILE", param_hint="--service")
+    return ServicePlan(found["name"], found["package"], found["file"])
+
+
+def _image(text: str) -> Image:
+    found = _IMAGE.fullmatch(text)
+    if not found or not (found["tag"] or found["digest"]):
+        raise click.BadParameter(
+            f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
+        )
+    return Image.model_construct(
+        repository=found["repository"], tag=found["tag"], digest=found["digest"]
+    )
+
+
+def _example_node(config: Config) -> str:
+    """Return the node of the example demand: an edge server, if there is one."""
+    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
+    if not nodes:
+        raise StateRepoError(
+            "the inventory has no node in an access domain, so no demand can be made; add one "
+            "first: demandops new node ID --type edge --cluster NAME"
+        )
+    return nodes[0]
+
+
+def _lay_down(
+    directory: Path, made: Callable[[Config], Files], output: str, then: list[str] | None = None
+) -> None:
+    """Write new files, but only if the whole configuration is valid with them."""
+    files, faults = worktree.files_of(directory)
+    if faults:
+        raise InvalidInput(faults)
+    known = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
+    found = made(load(known))
+    if strange := [path for path in found if ".." in path.split("/") or "//" in path]:
+        raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
+    try_configuration(State.of(load({**known, **found}), Ledger()))
+    _write(directory, found, output, [f"to check it: demandops check {directory}", *(then or [])])
+
+
+def _write(directory: Path, found: Files, output: str, then: list[str]) -> None:
+    if there := [path for path in found if (directory / path).exists()]:
+        raise StateRepoError(f"{directory / there[0]} exists; nothing was changed")
+    for path, text in found.items():
+        (directory / path).parent.mkdir(parents=True, exist_ok=True)
+        (directory / path).write_text(text, encoding="utf-8")
+    lines = [f"new: {directory / path}" for path in sorted(found)]
+    show(output, {"files": sorted(found)}, [*lines, *then])

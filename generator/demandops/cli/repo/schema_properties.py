@@ -1,0 +1,59 @@
+"""A description and an example of each property of a JSON Schema, for editors and the docs."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+from demandops import strict_yaml
+from demandops.settings import API_VERSION, data_folder
+
+_INHERITS = "inherits"
+_COMMON = {
+    "apiVersion": ["Version of the format", API_VERSION],
+    "kind": ["What the file holds"],
+}
+
+
+def describe(schema: dict[str, Any], root: str) -> None:
+    """Add a description and an example to each property of a schema and its definitions.
+
+    Args:
+        schema: the JSON Schema of a model; it is changed.
+        root: the model's name.
+    """
+    for model, part in {root: schema, **schema.get("$defs", {})}.items():
+        for name, field in part.get("properties", {}).items():
+            said = _said(root, model, name)
+            if said:
+                field["description"] = said[0]
+                field["examples"] = [said[1]] if len(said) > 1 else _fixed(field)
+
+
+def _said(root: str, model: str, name: str) -> list[Any]:
+    known = _properties()
+    above = known[_INHERITS].get(model, "")
+    for place in (known.get(f"{root}/{model}"), known.get(model), known.get(above), _COMMON):
+        if place and name in place:
+            found: list[Any] = place[name]
+            return found
+    return []
+
+
+def _fixed(field: dict[str, Any]) -> list[Any]:
+    """Return an example of a property with fixed values."""
+    for part in (field, *field.get("anyOf", ())):
+        if "const" in part:
+            return [part["const"]]
+        if "enum" in part:
+            return [part["enum"][-1]]
+        if part.get("type") == "boolean":
+            return [True]
+    return []
+
+
+@lru_cache(maxsize=1)
+def _properties() -> dict[str, Any]:
+    file = data_folder("templates") / "schemas" / "properties.yaml"
+    properties: dict[str, Any] = strict_yaml.load(file.read_text(encoding="utf-8"), file.name)
+    return properties

@@ -1,0 +1,154 @@
+"""Tables of all commands: plain columns that fit the terminal without cutting a word.
+
+On a terminal, text wraps between words, and columns that do not fit are left out, those that matter
+least first. Elsewhere each row is one line with every column, for programs like awk and grep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from rich.cells import cell_len
+
+from demandops.quoting import one_line
+
+_GAP = "  "
+_COMFORT = 12
+"""A column of text gets at least this width, if it needs it, before a column is left out."""
+
+Cell = str | Sequence[str]
+"""The text of a cell, or its lines."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column: its title, and when it is left out.
+
+    A column with a lower ``rank`` gets room first; one with rank 0 always stays. ``wraps`` says
+    that its cells are text, which may wrap between words.
+    """
+
+    title: str
+    rank: int = 0
+    wraps: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of cells; a cell with several lines is a list."""
+
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[Cell]]
+    title: str = ""
+    empty: str = "(nothing)"
+    styles: dict[str, str] = field(default_factory=dict)
+    """Colors of cells, by their text; used on a terminal with colors."""
+    whole: bool = False
+    """Whether nothing wraps or is left out, however wide that is."""
+
+    def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
+        """Return the table as lines.
+
+        Args:
+            width: that of the terminal; None: one line for each row, however long.
+            style: returns a text in a style (``bold``, ``dim`` or a color); None for plain text.
+        """
+        width = None if self.whole else width
+        paint = style or (lambda text, _: text)
+        title = [paint(self.title, "bold")] if self.title else []
+        if not self.rows:
+            return [*title, self.empty]
+        rows = [[_cell(cell, width) for cell in row] for row in self.rows]
+        shown = range(len(self.columns)) if width is None else self._fitting(rows, width)
+        widths = self._widths(rows, shown, width)
+        head = [[self.columns[at].title.upper()] for at in shown]
+        found = [paint(line, "bold") for line in _laid_out(head, widths)]
+        for row in rows:
+            cells = [_wrapped(row[at], widths[place]) for place, at in enumerate(shown)]
+            found += _laid_out(cells, widths, lambda text: paint(text, self.styles.get(text, "")))
+        left = [
+            column.title.upper()
+            for at, column in enumerate(self.columns)
+            if at not in shown and any(any(row[at]) for row in rows)
+        ]
+        if left:
+            note = f"more columns in a wider terminal: {', '.join(left)}"
+            found += [paint(line, "dim") for line in _wrapped([note], width or 0)]
+        return [*title, *found]
+
+    def _fitting(self, rows: list[list[list[str]]], width: int) -> list[int]:
+        """Return the columns that fit, those that matter most first; empty ones are left out."""
+        used = [at for at in range(len(self.columns)) if any(any(row[at]) for row in rows)]
+        shown = [at for at, column in enumerate(self.columns) if column.rank == 0]
+        room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
+        for at in sorted(set(used) - set(shown), key=lambda at: (self.columns[at].rank, at)):
+            needed = self._least(rows, at) + len(_GAP)
+            if needed <= room:
+                shown.append(at)
+                room -= needed
+        return sorted(shown)
+
+    def _natural(self, rows: list[list[list[str]]], at: int) -> int:
+        lengths = [cell_len(line) for row in rows for line in row[at]]
+        return max([cell_len(self.columns[at].title), *lengths])
+
+    def _least(self, rows: list[list[list[str]]], at: int) -> int:
+        """Return the width that a column needs so that no word of it is cut."""
+        natural = self._natural(rows, at)
+        if not self.columns[at].wraps:
+            return natural
+        words = [cell_len(word) for row in rows for line in row[at] for word in line.split()]
+        return max([cell_len(self.columns[at].title), min(natural, _COMFORT), *words])
+
+    def _widths(
+        self, rows: list[list[list[str]]], shown: Iterable[int], width: int | None
+    ) -> list[int]:
+        natural = [self._natural(rows, at) for at in shown]
+        if width is None:
+            return natural
+        widths = [self._least(rows, at) for at in shown]
+        room = width - sum(widths) - len(_GAP) * (len(widths) - 1)
+        for place, wanted in enumerate(natural):
+            more = min(max(room, 0), wanted - widths[place])
+            widths[place] += more
+            room -= more
+        return widths
+
+
+def _cell(cell: Cell, width: int | None) -> list[str]:
+    """Return the lines of a cell, with escapes for what is not visible."""
+    lines = [one_line(line) for line in ([cell] if isinstance(cell, str) else cell)]
+    return lines if width is not None else [", ".join(filter(None, lines))]
+
+
+def _wrapped(lines: Iterable[str], width: int) -> list[str]:
+    """Return lines wrapped between words; a word that is too long stays whole."""
+    found: list[str] = []
+    for line in lines:
+        if cell_len(line) <= width:
+            found.append(line)
+            continue
+        rest = ""
+        for word in line.split():
+            joined = f"{rest} {word}" if rest else word
+            if rest and cell_len(joined) > width:
+                found.append(rest)
+                rest = word
+            else:
+                rest = joined
+        found.append(rest)
+    return found
+
+
+def _laid_out(
+    cells: Sequence[Sequence[str]], widths: Sequence[int], paint: Callable[[str], str] = str
+) -> Iterator[str]:
+    """Yield the lines of one row."""
+    for number in range(max(len(cell) for cell in cells)):
+        parts = [cell[number] if number < len(cell) else "" for cell in cells]
+        padded = (
+            paint(part) + " " * (width - cell_len(part))
+            for part, width in zip(parts, widths, strict=True)
+        )
+        yield _GAP.join(padded).rstrip()

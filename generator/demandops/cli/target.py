@@ -1,0 +1,178 @@
+"""Which state repo a command works on, and with which access: options, environment, contexts.
+
+The order: the option, ``--context``, the environment variable, the checkout around the current
+folder, the current context. A relative folder in the variable counts only where it exists. A
+command that writes uses the remote of the checkout. Signing key and clusters come from the same
+context, never from another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from click.core import ParameterSource
+
+from demandops.quoting import quoted
+from demandops.staterepo.git.address import is_url
+from demandops.staterepo.git.checkout import checkout_around, origin_of
+
+if TYPE_CHECKING:
+    from demandops.cli.contexts import Context
+
+Command = Callable[..., Any]
+
+_VARIABLE = "DEMANDOPS_STATE_REPO"
+_NAME = "demandops.context-name"
+_CONTEXT = "demandops.context"
+_NO_STATE_REPO = (
+    "Which state repo? Give --state-repo, run the command in a checkout of one, or name it once: "
+    "demandops config set NAME --state-repo URL_OR_DIR"
+)
+
+
+def _chosen(around: Path | None) -> Context | None:
+    """Return the context of --context, of the checkout ``around``, or the current one; keep it."""
+    from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
+
+    ctx = click.get_current_context()
+    name = ctx.meta.get(_NAME)
+    content = contexts.read()
+    found: Context | None
+    if name is not None:
+        found = contexts.named(name)
+    elif around is not None:
+        places = {str(around), origin_of(around)}
+        same = (one for one in content.contexts.values() if one.state_repo in places)
+        found = next(same, None)
+    else:
+        found = content.contexts[content.current] if content.current else None
+    ctx.meta[_CONTEXT] = found
+    return found
+
+
+def _around() -> Path | None:
+    """Return the checkout that the command is run in, unless a context is named."""
+    named = _NAME in click.get_current_context().meta
+    return None if named else checkout_around(Path.cwd())
+
+
+def readable_repo() -> str | None:
+    """Return the state repo for a command that only reads, if no option gives it; or None."""
+    around = _around()
+    context = _chosen(around)
+    return str(around) if around else context.state_repo if context else None
+
+
+def _writable() -> str | None:
+    around = _around()
+    context = _chosen(around)
+    if around is None:
+        return context.state_repo if context else None
+    origin = origin_of(around)
+    if origin is None:
+        raise click.UsageError(
+            f"the checkout {around} has no remote 'origin' to write to; give --state-repo"
+        )
+    return origin
+
+
+def _from_context(field: str) -> Callable[[], str | None]:
+    """Return an option's default: a field of the context that gave the state repo."""
+
+    def default() -> str | None:
+        context = click.get_current_context().meta.get(_CONTEXT)
+        return getattr(context, field) if context else None
+
+    return default
+
+
+def _required(default: Callable[[], str | None]) -> Callable[..., str]:
+    """Return a callback: the address that is given, else the default; without one, the remedy."""
+
+    def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
+        from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
+        if from_environment and (_NAME in ctx.meta or _is_elsewhere(value or "")):
+            if _NAME not in ctx.meta and _around() is None:
+                raise click.UsageError(
+                    f"{_VARIABLE} is {quoted(value or '')}, a relative folder that does not exist "
+                    f"in {Path.cwd()}; set it to an absolute path, or give --state-repo",
+                    ctx,
+                )
+            value = default()
+        if value is None:
+            raise click.UsageError(_NO_STATE_REPO, ctx)
+        return value
+
+    return check
+
+
+def _is_elsewhere(address: str) -> bool:
+    """Return whether this is a relative folder that does not exist from here."""
+    path = Path(address)
+    return not (is_url(address) or path.is_absolute() or path.expanduser().exists())
+
+
+def _note(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+    if value is not None:
+        ctx.meta[_NAME] = value
+
+
+def _names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    from demandops.cli import contexts  # noqa: PLC0415
+
+    return [name for name in contexts.read().contexts if name.startswith(incomplete)]
+
+
+_context_option = click.option(
+    "--context",
+    metavar="NAME",
+    expose_value=False,
+    is_eager=True,
+    callback=_note,
+    shell_complete=_names,
+    help="The context to use, instead of the current one (docs/commands.md).",
+)
+
+
+def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Command], Command]:
+    option = click.option(
+        "--state-repo",
+        envvar=_VARIABLE,
+        metavar="URL_OR_DIR",
+        default=default,
+        is_eager=True,  # what else is left out depends on it
+        callback=_required(default),
+        help=f"The state repo: a bare repository's folder, or a URL that git can clone. Default: "
+        f"{where}, else that of the context [env: {_VARIABLE}].",
+    )
+    return lambda command: option(_context_option(command))
+
+
+state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
+"""The option ``--state-repo`` of a command that only reads; it may name a checkout."""
+
+writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
+"""The option ``--state-repo`` of a command that writes."""
+
+signing_option = click.option(
+    "--signing-key",
+    envvar="DEMANDOPS_SIGNING_KEY",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    default=_from_context("signing_key"),
+    help="Sign the commits with this SSH key: a private key without a passphrase, or the public "
+    "key of a key in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
+)
+
+clusters_option = click.option(
+    "--clusters",
+    "access_file",
+    envvar="DEMANDOPS_CLUSTERS",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    default=_from_context("clusters"),
+    help="How to reach the clusters; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+)

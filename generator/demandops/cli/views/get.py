@@ -1,0 +1,212 @@
+"""``demandops get``: lists of demands, of running services and of people's configuration."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import click
+
+from demandops import strict_yaml
+from demandops.cli.json_output import Json, output_formats, print_json, show
+from demandops.cli.names import names_of
+from demandops.cli.output import at_option, errors, painted, progress, warn_of, warn_of_not_rendered
+from demandops.cli.table import Table
+from demandops.cli.target import state_repo_option
+from demandops.cli.views.kinds import KINDS, Kind, Source
+from demandops.config.policy import matches
+from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.ledger.world import World
+from demandops.quoting import json_escaped, quoted
+from demandops.runtime import REAL
+from demandops.staterepo import reader
+from demandops.staterepo.git.repository import RemoteAway
+from demandops.staterepo.reader import Reader
+from demandops.subject import SubjectKind
+
+FILTERS = ("node", "requester", "application", "domain")
+_POLL_S = 1.0
+_POLL_REMOTE_S = 10.0
+_COLORS = {
+    "drained": "yellow",
+    "expired": "yellow",
+    "held": "green",
+    "in force": "green",
+    "held back": "yellow",
+    "matches nothing": "yellow",
+    "not in the inventory": "red",
+    "not rendered yet": "yellow",
+    "overdue": "yellow",
+    "partly suspended": "yellow",
+    "suspended": "yellow",
+    "waiting": "yellow",
+}
+
+
+def _kind(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    """Return the name of a kind, which may be given in the singular."""
+    for name in (value, f"{value}s"):
+        if name in KINDS:
+            return name
+    raise click.BadParameter(f"there is no kind '{value}'{suggestion(value, KINDS)}")
+
+
+def _kinds(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    return [name for name in KINDS if name.startswith(incomplete)]
+
+
+def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+    kind = ctx.params.get("kind") or ""
+    known = ("connections", "demands", "nodes", "overrides", "proposals")
+    kinds = {"leases": "demands", "services": "releases"} | {name: name for name in known}
+    return names_of(kinds[kind])(ctx, param, incomplete) if kind in kinds else []
+
+
+def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
+    for name in reversed(FILTERS):
+        command = click.option(
+            f"--{name}",
+            metavar="NAME",
+            shell_complete=names_of(f"{name}s"),
+            help=f"Only what belongs to this {name}; * and ? stand for any text.",
+        )(command)
+    return command
+
+
+@click.command()
+@click.argument("kind", callback=_kind, shell_complete=_kinds, metavar="KIND")
+@click.argument("names", nargs=-1, metavar="[NAME…]", shell_complete=_item_names)
+@state_repo_option
+@_filters
+@at_option
+@click.option("-w", "--watch", is_flag=True, help="Print the list again whenever it changes.")
+@output_formats("text", "wide", "name", "json", "yaml")
+def get(
+    kind: str,
+    names: tuple[str, ...],
+    state_repo: str,
+    at: str | None,
+    watch: bool,
+    output: str,
+    **filters: str | None,
+) -> None:
+    """List demands, nodes, services, overrides and so on.
+
+    KIND is demands, leases, nodes, services, connections, claims, proposals or overrides. A
+    proposal is a branch that a person merges to approve its demand, or deletes to refuse it.
+    NAME and the filters may be patterns with * and ?. Of several filters, all must match. The
+    state of an override is `in force`, `not rendered yet` (a generator has yet to write its files),
+    `held back` (a hold of another one keeps the files as they
+    are), `expired` or `matches nothing`.
+
+    \b
+    Examples:
+      demandops get demands --requester vehicle00
+      demandops get services -o wide
+      demandops get nodes --domain perception -o name
+      demandops get leases --watch
+      demandops get overrides --at 2h -o json
+    """
+    if watch and at:
+        raise click.UsageError("--watch shows the newest commit; leave out --at")
+    shown = KINDS[kind]
+    wanted = {name: value for name, value in filters.items() if value is not None}
+    for name in wanted.keys() - shown.filters.keys():
+        can = ", ".join(f"--{one}" for one in FILTERS if one in shown.filters)
+        raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
+    with reader.opened(state_repo) as repo:
+        source = _read(repo, at)
+        _refuse_unknown(shown, source, names, wanted)
+        items = _matching(shown, shown.items(source), names, wanted)
+        _print(kind, source, items, output, watch)
+        while watch:
+            REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
+            if not _moved(repo, source) and kind != "proposals":
+                continue
+            source = _read(repo, None)
+            before, items = items, _matching(shown, shown.items(source), names, wanted)
+            if items != before:
+                _print(kind, source, items, output, watch)
+
+
+def _moved(repo: Reader, source: Source) -> bool:
+    """Return whether there is a newer commit; false if the remote cannot be reached."""
+    try:
+        return repo.refresh() != str(source.snapshot.commit)
+    except RemoteAway as error:
+        errors.print(f"warning: {error}")
+        return False
+
+
+def _read(repo: Reader, at: str | None) -> Source:
+    with progress("reading the ledger") as report:
+        snapshot = repo.snapshot(at, report)
+    warn_of(repo.problems() if at is None else ())
+    not_rendered = repo.not_rendered(snapshot) if at is None else frozenset()
+    warn_of_not_rendered(not_rendered)
+    return Source(repo, snapshot, REAL.now(), not_rendered)
+
+
+def _matching(
+    kind: Kind, items: Iterable[Json], names: tuple[str, ...], wanted: dict[str, str]
+) -> list[Json]:
+    return [
+        item
+        for item in items
+        if (not names or matches(item["name"], names))
+        and all(
+            any(matches(value, (pattern,)) for value in kind.filters[name](item))
+            for name, pattern in wanted.items()
+        )
+    ]
+
+
+def _refuse_unknown(
+    kind: Kind, source: Source, names: tuple[str, ...], wanted: dict[str, str]
+) -> None:
+    """Refuse names and filters that match nothing: they are probably misspelled."""
+    faults: list[Fault] = []
+    items = [item["name"] for item in kind.items(source)] if names else []
+    asked = [(name, "", items) for name in names]
+    asked += [
+        (value, f"--{name}", _known(name, source.snapshot.state)) for name, value in wanted.items()
+    ]
+    for pattern, option, known in asked:
+        if not any(matches(name, (pattern,)) for name in known):
+            message = f"nothing is called {quoted(pattern)}{suggestion(pattern, known)}"
+            faults.append(fault(option, message))
+    if faults:
+        raise InvalidInput(faults)
+
+
+def _known(filter: str, world: World) -> list[str]:
+    if filter == "node":
+        return sorted({*world.config.nodes, *world.ledger.indexed_names("node")})
+    if filter == "domain":
+        return sorted(world.config.domains)
+    if filter == "requester":
+        return sorted(world.ledger.indexed_names("requester"))
+    return sorted(world.ledger.subjects(SubjectKind.APPLICATION))
+
+
+def _print(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
+    commit, shown = str(source.snapshot.commit), KINDS[kind]
+    data = {"kind": kind, "commit": commit, "items": items}
+    plain = json.loads(json.dumps(data))
+    if output == "json" and watch:
+        click.echo(json_escaped(json.dumps(plain, ensure_ascii=False)))
+    elif output == "json":
+        print_json(plain)
+    elif output == "yaml":
+        click.echo(("---\n" if watch else "") + strict_yaml.dump(plain), nl=False)
+    elif output == "name":
+        show(output, None, [item["name"] for item in items])
+    else:
+        wide = output == "wide"
+        columns = [*shown.columns, *(shown.wide if wide else ())]
+        rows = [shown.cells(item, source.now)[: len(columns)] for item in items]
+        table = Table(columns, rows, empty=f"no {kind}", styles=_COLORS, whole=wide)
+        when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
+        note = painted(f"{when}at {commit[:10]}", "dim")
+        show(output, None, [table, *([note] if watch else [])])

@@ -1,0 +1,99 @@
+"""``demandops watch``: releases, demands and the latest commits on the whole screen, live."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping
+from itertools import islice
+from pathlib import Path
+
+import click
+
+from demandops.cli.json_output import commit_data
+from demandops.cli.output import painted
+from demandops.cli.table import Table
+from demandops.cli.target import clusters_option, state_repo_option
+from demandops.cli.views.kinds import KINDS, Source
+from demandops.cli.views.log import log_table
+from demandops.cli.views.status import Status, releases_table
+from demandops.cluster import access
+from demandops.errors import StateRepoError
+from demandops.runtime import REAL
+from demandops.staterepo import reader
+from demandops.staterepo.reader import Reader
+
+_PAUSE_S = 2.0
+_COMMITS = 6
+_TITLES = 6
+"""The lines of the title and of the empty lines between the parts."""
+
+
+@click.command()
+@state_repo_option
+@clusters_option
+def watch(state_repo: str, access_file: Path | None) -> None:
+    """Show releases, demands and the latest commits live.
+
+    Releases that are not healthy come first. The health is known only with --clusters. Ctrl-C ends
+    it.
+
+    \b
+    Examples:
+      demandops watch
+      demandops watch --clusters clusters.yaml
+    """
+    if not sys.stdout.isatty():
+        raise click.UsageError("watch needs a terminal; use `demandops get KIND --watch` instead")
+    from rich.live import Live  # noqa: PLC0415 - only here
+    from rich.text import Text  # noqa: PLC0415
+
+    clusters = access.read(access_file).clusters if access_file else {}
+    try:
+        with reader.opened(state_repo) as repo, Live(screen=True, auto_refresh=False) as live:
+            away = ""
+            while True:
+                shown = _screen(repo, clusters, away)
+                live.update(Text.from_ansi("\n".join(shown), no_wrap=True), refresh=True)
+                REAL.sleep(_PAUSE_S)
+                try:
+                    repo.refresh()
+                    away = ""
+                except StateRepoError as error:
+                    away = str(error)
+    except KeyboardInterrupt:
+        return
+
+
+def _screen(repo: Reader, clusters: Mapping[str, access.ClusterAccess], away: str) -> list[str]:
+    width, height = shutil.get_terminal_size()
+    now = REAL.now()
+    status = Status.of(repo, clusters)
+    source = Source(repo, repo.snapshot(), now)
+    demands = KINDS["demands"]
+    held = demands.items(source)
+    rows = [commit_data(entry) for entry in islice(repo.log(), _COMMITS)]
+    amiss = "; ".join(filter(None, (status.amiss(clusters), away)))
+    health = painted(f"not well: {amiss}", "red") if amiss else painted("all is well", "green")
+    if not clusters and not amiss:
+        health = "the clusters are unknown: give --clusters FILE"
+    head = f"{repo.repository.address} at {status.commit[:10]}, {now:%H:%M:%S} UTC"
+    counts = f"{len(status.rows)} releases, {len(held)} demands"
+    releases = sorted(status.rows, key=lambda row: (row["health"] == "healthy", row["name"]))
+    commits = log_table(rows, now)
+    last = _part("Latest commits", commits, width, height // 3)
+    room = height - _TITLES - len(last)
+    first = _part("Releases", releases_table(releases), width, room * 2 // 3)
+    cells = [demands.cells(item, now)[: len(demands.columns)] for item in held]
+    middle = _part("Demands", Table(demands.columns, cells), width, room - len(first))
+    title = [painted(head, "bold"), f"{counts}; {health}"]
+    return [*title, "", *first, "", *middle, "", *last][: height - 1]
+
+
+def _part(title: str, table: Table, width: int, room: int) -> list[str]:
+    """Return a title and as many lines of a table as there is room for."""
+    lines = [painted(title, "bold"), *table.lines(width, painted)]
+    if len(lines) <= room:
+        return lines
+    kept = max(room - 1, 1)
+    return [*lines[:kept], painted(f"… {len(lines) - kept} more lines", "dim")]

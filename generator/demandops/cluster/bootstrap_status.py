@@ -1,0 +1,60 @@
+"""Which bootstrap files clusters have: those of the state repo, or older ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import ClusterDomain
+from demandops.cluster.object_cache import ObjectCache
+from demandops.render.gitops.bootstrap_digest import digest_in, digest_of
+from demandops.render.gitops.paths import bootstrap_path
+
+
+@dataclass(frozen=True, slots=True)
+class OldBootstrap:
+    """A cluster that has not got the state repo's bootstrap file, and how to apply it."""
+
+    cluster: str
+    file: str
+    domains: tuple[str, ...]
+    """The access domains whose objects are old or missing."""
+    command: str
+
+    def __str__(self) -> str:
+        """Return it as a sentence, with the remedy."""
+        return (
+            f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
+            f"{', '.join(self.domains)}); an administrator of it applies it: {self.command}"
+        )
+
+
+def old_bootstraps(
+    domains: Collection[ClusterDomain],
+    caches: Mapping[str, ObjectCache],
+    read: Callable[[str], str | None],
+) -> list[OldBootstrap]:
+    """Return the clusters with an older bootstrap file, or none, as far as they can be read.
+
+    Args:
+        domains: the access domains on each cluster.
+        caches: the objects of the clusters, which were read.
+        read: returns the text of a file of the state repo, None if there is none.
+    """
+    found = []
+    for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
+        path = bootstrap_path(cluster)
+        digest = digest_in(read(path) or "")
+        store, objects = caches[cluster], caches[cluster].objects()
+        old = tuple(
+            domain.name
+            for domain in domains
+            if domain.cluster == cluster
+            and store.unread(domain) is None
+            and digest_of(objects.get(health_reader(domain).follower(domain)) or {}) != digest
+        )
+        if digest and old:
+            command = f"git show main:{path} | kubectl apply -f -"
+            found.append(OldBootstrap(cluster, path, old, command))
+    return found

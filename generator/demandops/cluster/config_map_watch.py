@@ -1,0 +1,114 @@
+"""A watch on one ConfigMap: it passes on the data at once, and again when they change."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from demandops.cluster.access import ClusterAccess, own_cluster_api
+from demandops.errors import InvalidInput
+from demandops.quoting import one_line
+from demandops.runtime import REAL, Runtime
+
+log = logging.getLogger("demandops")
+
+_WATCH_S = 240
+_CONNECT_S = 5
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
+
+OnData = Callable[[Mapping[str, str]], object]
+
+
+class ConfigMapWatch:
+    """Reads a ConfigMap and follows it. It needs the right to list and watch this object only."""
+
+    def __init__(
+        self,
+        namespace: str,
+        name: str,
+        on_data: OnData,
+        kubeconfig: Path | None,
+        runtime: Runtime = REAL,
+    ) -> None:
+        """Start to watch.
+
+        Args:
+            namespace: the ConfigMap's namespace.
+            name: its name. It need not exist yet; if it is deleted, the last data stay valid.
+            on_data: called with the data, from the thread of the watch.
+            kubeconfig: how to reach the cluster; without one, this process must be a pod there.
+            runtime: provides the threads.
+
+        Raises:
+            InvalidInput: if the kubeconfig cannot be used, or this process is not a pod.
+        """
+        self._name, self._on_data = f"ConfigMap {namespace}/{name}", on_data
+        self._request = {"namespace": namespace, "field_selector": f"metadata.name={name}"}
+        self._client = _client(kubeconfig)
+        self._data: dict[str, str] | None = None
+        self._told = ""
+        self._closed = runtime.event()
+        runtime.keep_running("config-map", self._run)
+
+    def close(self) -> None:
+        """Stop the watch; ``on_data`` is not called again after a call that is under way."""
+        self._closed.set()
+
+    def _run(self) -> None:
+        pause = _FIRST_PAUSE_S
+        while not self._closed.is_set():
+            try:
+                self._read_and_watch()
+                pause = _FIRST_PAUSE_S
+            except Exception as error:  # the library raises errors of many kinds
+                reason = getattr(error, "reason", None) or error or type(error).__name__
+                self._tell(f"cannot be read: {one_line(str(reason))[:300]}; retrying")
+                self._closed.wait(pause)
+                pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+    def _read_and_watch(self) -> None:
+        from kubernetes import client, watch  # noqa: PLC0415 - half a second; only when used
+
+        read = client.CoreV1Api(self._client).list_namespaced_config_map
+        listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))
+        for item in listed.items:
+            self._take(item)
+        if not listed.items:
+            self._tell("does not exist yet")
+        for event in watch.Watch().stream(
+            read,
+            **self._request,
+            resource_version=listed.metadata.resource_version,
+            timeout_seconds=_WATCH_S,
+            _request_timeout=(_CONNECT_S, _WATCH_S + 30),
+        ):
+            if self._closed.is_set():
+                return
+            if event["type"] in ("ADDED", "MODIFIED"):
+                self._take(event["object"])
+            elif event["type"] == "DELETED":
+                self._tell("is gone; its last data stay valid")
+
+    def _take(self, item: Any) -> None:  # noqa: ANN401 - the library has no types
+        self._told = ""
+        data = dict(item.data or {})
+        if data != self._data and not self._closed.is_set():
+            self._data = data
+            self._on_data(data)
+
+    def _tell(self, text: str) -> None:
+        if text != self._told:
+            self._told = text
+            log.warning("%s %s", self._name, text)
+
+
+def _client(kubeconfig: Path | None) -> Any:  # noqa: ANN401 - the library has no types
+    if kubeconfig is None:
+        return own_cluster_api("--kubeconfig").api_client
+    try:
+        return ClusterAccess(kubeconfig=kubeconfig).api().api_client
+    except Exception as error:  # the library raises errors of many kinds
+        reason = f"cannot be used: {one_line(str(error))}"
+        raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None

@@ -1,0 +1,94 @@
+"""The status of releases as their clusters report it, for the command line and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import (
+    ClusterDomain,
+    Health,
+    History,
+    State,
+    Target,
+)
+from demandops.cluster.object_cache import ObjectCache
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseStatus:
+    """What a cluster says about a release.
+
+    ``seen`` is the commit that the cluster has applied, ``since`` when the state last changed; both
+    are empty if the cluster does not say.
+    """
+
+    health: Health
+    seen: str = ""
+    since: str = ""
+
+    @property
+    def state(self) -> State | Literal["unknown"]:
+        """Its state; ``unknown`` if the cluster tells nothing."""
+        return self.health.state if self.seen or self.health.object else "unknown"
+
+
+_NO_ACCESS = ReleaseStatus(Health("waiting", "no access to this cluster"))
+
+
+ChangedPaths = Callable[[str, str], "Collection[str] | None"]
+"""Returns the paths in which two commits differ; None if that is not known."""
+
+
+def statuses(
+    targets: Iterable[Target],
+    commit: str,
+    caches: Mapping[str, ObjectCache],
+    history: History,
+    changed: ChangedPaths = lambda seen, commit: None,
+) -> list[ReleaseStatus]:
+    """Return the status of each release at a commit, from the caches of the clusters.
+
+    With ``changed``, a release counts as applied if its cluster has applied an earlier commit with
+    the same file. So a new commit does not hide the health of releases that it does not change.
+    """
+    changed = cache(changed)
+    known = _Known(history)
+    objects = {name: store.objects() for name, store in caches.items()}
+    unread: dict[ClusterDomain, Health | None] = {}
+    found = []
+    for target in targets:
+        domain = target.domain
+        store = caches.get(domain.cluster)
+        if store is None:
+            found.append(_NO_ACCESS)
+            continue
+        if domain not in unread:
+            unread[domain] = store.unread(domain)
+        if reason := unread[domain]:
+            found.append(ReleaseStatus(reason))
+            continue
+        read, there = health_reader(domain), objects[domain.cluster]
+        health, seen = read.health(target, commit, there, known), read.applied_commit(domain, there)
+        if health.state == "waiting" and not health.failing and seen:
+            paths = changed(seen, commit)
+            if paths is not None and not _is_among(paths, target):
+                health = read.release_health(target, seen, there, known)
+        found.append(ReleaseStatus(health, seen, read.last_transition(target, there)))
+    return found
+
+
+def _is_among(paths: Collection[str], target: Target) -> bool:
+    end = f"/{target.name}.yaml"
+    return any(path.endswith(end) for path in paths)
+
+
+class _Known:
+    """A history that remembers its answers, because the releases of a domain ask the same."""
+
+    def __init__(self, history: History) -> None:
+        self.includes = cache(history.includes)
+        self.unchanged = cache(history.unchanged)

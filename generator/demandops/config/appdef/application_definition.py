@@ -1,0 +1,76 @@
+"""One type of application, as people define it: `appdefs/<name>/appdef.yaml`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from demandops.config.appdef.service_definition import (
+    Input,
+    OwnService,
+    Parameter,
+    size_problems,
+)
+from demandops.config.base_model import Approval, CamelModel, DnsLabel, FileModel, Text, Word
+from demandops.errors import suggestion
+
+VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]
+"""What happens if demands that share an application or a service ask for different versions.
+
+``refuse``: the later one is refused. ``separate``: another version than the default runs in an
+instance of its own (:mod:`demandops.demand.separate_instance`). ``update``: the newest version
+runs; another major version needs a person's approval. ``upgrade``: the newest version runs.
+"""
+
+
+class WireNames(CamelModel):
+    """The names of this application in the reference's ``DeploymentRequest``.
+
+    ``type`` is the number in ``Application.type``. ``inputs`` maps the topic lists of the
+    message's body to roles.
+    """
+
+    type: Annotated[int, Field(ge=1, le=255)]
+    inputs: dict[Literal["ego_data_topics", "pointcloud_topics"], Word]
+
+
+class ApplicationDefinition(FileModel):
+    """One type of application: ``appdefs/<name>/appdef.yaml``.
+
+    ``uses`` maps each shared service to where its inputs come from.
+    """
+
+    kind: Literal["ApplicationDefinition"]
+    name: DnsLabel
+    description: Text = ""
+    inputs: dict[Word, Input]
+    parameters: dict[Word, Parameter] = Field(default_factory=dict)
+    deployment_request: WireNames | None = None
+    uses: dict[DnsLabel, dict[Word, str]] = Field(default_factory=dict)
+    services: dict[DnsLabel, OwnService] = Field(default_factory=dict)
+    approval: Approval = "none"
+    versions: VersionPolicy = "refuse"
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ApplicationDefinition:
+        problems = [
+            f"deploymentRequest.inputs: '{role}' is not an input{suggestion(role, self.inputs)}"
+            for role in (self.deployment_request.inputs if self.deployment_request else {}).values()
+            if role not in self.inputs
+        ]
+        problems += [
+            f"uses.{name}: 'services' has a service of this name too; rename that one"
+            for name in self.uses
+            if name in self.services
+        ]
+        problems += [
+            f"services.{name}.{problem}"
+            for name, service in self.services.items()
+            for problem in size_problems(service.scaling, self.parameters)
+        ]
+        if not self.services and not self.uses:
+            problems.append("services: is empty; list one, or name a shared one under uses")
+        if problems:
+            raise ValueError("; ".join(problems))
+        return self

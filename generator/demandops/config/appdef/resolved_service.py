@@ -1,0 +1,191 @@
+"""The services of an appdef, each with where its inputs come from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from typing import TypeAlias
+
+from pydantic import Field
+
+from demandops.config.appdef.application_definition import ApplicationDefinition
+from demandops.config.appdef.service_definition import (
+    Deployed,
+    OwnService,
+    Parameter,
+    Scope,
+    ServiceDefinition,
+)
+from demandops.errors import suggestion
+
+
+class Service(Deployed):
+    """A service as the applications of one appdef have it.
+
+    ``folder`` is that of its definition in ``appdefs/``. ``inputs`` maps all its inputs to roles of
+    the appdef or ``<service>.<output>``. ``root`` is the role whose topics a service with ``each``
+    runs for; ``roots`` are the roles that it reads from one source at a time. ``runs_at``
+    maps the node of an application to that of the service, if it runs once for each cluster.
+    """
+
+    name: str
+    folder: str
+    shared: bool
+    scope: Scope
+    inputs: dict[str, str]
+    parameters: dict[str, Parameter]
+    root: str | None = None
+    roots: tuple[str, ...] = ()
+    nodes: dict[str, str] = Field(default_factory=dict)
+    runs_at: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def at_source(self) -> bool:
+        """Whether it runs at the sources of its inputs."""
+        return self.placement == "source"
+
+    @property
+    def is_movable(self) -> bool:
+        """Whether an application may have it on another node than its own."""
+        return not self.at_source and not self.nodes
+
+    @property
+    def file(self) -> str:
+        """The file that defines it."""
+        return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"
+
+
+Services: TypeAlias = "Mapping[str, Service]"
+"""The services of an appdef, its own and those that it uses, by name."""
+
+Problem: TypeAlias = "tuple[str, str]"
+"""A field of an appdef, and the message about it."""
+
+
+def resolved_services(
+    appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
+) -> tuple[Services, list[Problem]]:
+    """Return the services of an appdef, its own and those that it uses, or the problems."""
+    services = {
+        name: Service.model_construct(
+            **{**dict(own), "inputs": _with_each(own)},
+            name=name,
+            folder=appdef.name,
+            shared=False,
+            scope="topic" if own.each else "application",
+            parameters=appdef.parameters,
+        )
+        for name, own in appdef.services.items()
+    }
+    for name, bound in appdef.uses.items():
+        if name in definitions:
+            used = {**dict(definitions[name]), "inputs": bound}
+            services[name] = Service.model_construct(**used, folder=name, shared=True)
+    problems = [*_unbound(appdef, definitions), *_unknown(appdef, services)]
+    if problems:
+        return {}, problems
+    graph = {
+        name: [origin.partition(".")[0] for origin in one.inputs.values() if "." in origin]
+        for name, one in services.items()
+    }
+    try:
+        order = list(TopologicalSorter(graph).static_order())
+    except CycleError as error:
+        circle = " reads ".join(f"'{name}'" for name in reversed(error.args[1]))
+        return {}, [("services", f"read in a circle: {circle}; remove one of these inputs")]
+    for name in order:
+        problems += _set_roots(name, services)
+    return ({}, problems) if problems else (services, [])
+
+
+def _with_each(service: OwnService) -> dict[str, str]:
+    return ({service.each: service.each} if service.each else {}) | service.inputs
+
+
+def _unbound(
+    appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
+) -> Iterator[Problem]:
+    for name, bound in appdef.uses.items():
+        if name not in definitions:
+            known = suggestion(name, definitions)
+            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{known}"
+            continue
+        inputs = definitions[name].inputs
+        for role in inputs.keys() - bound.keys():
+            yield f"uses.{name}.{role}", "is missing; name an input, or an output of a service"
+        for role in bound.keys() - inputs.keys():
+            known = suggestion(role, inputs)
+            yield f"uses.{name}.{role}", f"'{name}' has no such input; leave it out{known}"
+
+
+def _unknown(appdef: ApplicationDefinition, services: Services) -> Iterator[Problem]:
+    for service in services.values():
+        for role, origin in service.inputs.items():
+            name, _, output = origin.partition(".")
+            known = services[name].outputs if name in services else services
+            if not output and origin not in appdef.inputs:
+                problem = f"'{origin}' is not an input{suggestion(origin, appdef.inputs)}"
+            elif output and name not in services:
+                problem = f"'{name}' is not a service{suggestion(name, services)}"
+            elif output and output not in known:
+                problem = f"'{name}' has no output '{output}'{suggestion(output, known)}"
+            else:
+                continue
+            yield _place(service, role), problem
+
+
+def _place(service: Service, role: str) -> str:
+    if service.shared:
+        return f"uses.{service.name}.{role}"
+    of_each = role == service.each == service.inputs[role]
+    return f"services.{service.name}.{'each' if of_each else f'inputs.{role}'}"
+
+
+def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
+    """Set the roots of a service from those of the services that it reads."""
+    service, root = services[name], None
+    made_from: dict[str, tuple[str, ...]] = {}
+    for role, origin in service.inputs.items():
+        producer = services.get(origin.partition(".")[0]) if "." in origin else None
+        made_from[role] = producer.roots if producer else (origin,)
+        apart = service.at_source or service.nodes
+        if apart and producer and producer.root and not producer.at_source:
+            other = (
+                "give this one another scope"
+                if service.nodes
+                else "this one at the application's node"
+            )
+            yield (
+                _place(service, role),
+                f"'{origin}' is made at the node of each application, so several nodes may make it "
+                f"under one name; run '{producer.name}' at the source, or {other}",
+            )
+        if role == service.each:
+            root = producer.root if producer else origin
+            if root is None:
+                yield (
+                    _place(service, role),
+                    f"'{origin}' is made once for the application or the node, not for each topic; "
+                    "name another input in 'each', or leave it out",
+                )
+                return
+    roots: tuple[str, ...] = ()
+    if service.scope == "topic":
+        roots = (str(root),)
+        for role, others in made_from.items():
+            if others and root not in others:
+                yield (
+                    _place(service, role),
+                    f"'{service.inputs[role]}' does not belong to one topic of '{root}', for each "
+                    "of which the service runs; read it in a service that runs once for the "
+                    "application or the node",
+                )
+    elif service.at_source:
+        roots = tuple(sorted({one for of in made_from.values() for one in of}))
+        if not roots:
+            yield (
+                f"uses.{name}",
+                "runs at the sources of its inputs, but none of them has a source; bind one to an "
+                "input of the application",
+            )
+    services[name] = service.model_copy(update={"root": root, "roots": roots})

@@ -1,0 +1,115 @@
+"""How many replicas a service has, and what the number follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import timedelta
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from demandops import strict_yaml
+from demandops.config.base_model import CamelModel, Positive, Word
+from demandops.config.policy import Duration, seconds_of
+
+Count = Annotated[int, Field(ge=0, le=1000)]
+"""A number of replicas."""
+
+Percent = Annotated[int, Field(ge=1, le=1000)]
+"""A share of what a pod requests; it may use more than that."""
+
+Measure = Literal["topics", "sources", "claims", "requesters"]
+"""What a service may have replicas for: one for each so many topics, sources and so on."""
+
+Resource = Literal["cpu", "memory"]
+"""What an autoscaler measures."""
+
+
+class Sizes(CamelModel):
+    """The replicas of each size; a parameter of the demands names the size."""
+
+    parameter: Word
+    replicas: Annotated[dict[Word, Count], Field(min_length=1)]
+
+    def replicas_for(self, value: object) -> int | None:
+        """Return the replicas for a parameter's value; of a list, for the largest size.
+
+        ``None`` means that the value is not a size.
+        """
+        names = value if isinstance(value, list) else [value]
+        known = [self.replicas[name] for name in names if name in [*self.replicas]]
+        return max(known) if known and len(known) == len(names) else None
+
+
+class Scaling(CamelModel):
+    """How many replicas a service has: ``min``, if nothing else decides.
+
+    ``per`` gives one replica for that many topics, sources, claims or requesters, ``sizes`` as many
+    as a parameter's value stands for. ``autoscaler`` has the targets of a HorizontalPodAutoscaler,
+    in percent of what the pods request. ``divides_work`` says that replicas publish nothing twice.
+    More replicas start at once; with ``down_after`` the service keeps them for that time after the
+    demands needed them (:mod:`demandops.ledger.kept_replicas`).
+    """
+
+    min: Count = 1
+    max: Annotated[Count, Field(ge=1)] = 1
+    per: Annotated[dict[Measure, Positive], Field(min_length=1)] | None = None
+    sizes: Sizes | None = None
+    autoscaler: Annotated[dict[Resource, Percent], Field(min_length=1)] | None = None
+    may_depend_on_requesters: bool = False
+    divides_work: bool = False
+    down_after: Duration | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, data: object) -> object:
+        if isinstance(data, dict) and "topicsPerReplica" in data:
+            per = strict_yaml.short_repr(data["topicsPerReplica"])
+            raise ValueError(f"topicsPerReplica has a new name; write per: {{topics: {per}}}")
+        return data
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Scaling:
+        if problems := [*self._problems()]:
+            raise ValueError("; ".join(problems))
+        return self
+
+    def _problems(self) -> Iterator[str]:
+        if self.min > self.max:
+            yield f"min {self.min} is above max {self.max}; lower min or raise max"
+        deciding = [f"per: {measure}" for measure in self.per or ()]
+        deciding += [name for name in ("sizes", "autoscaler") if getattr(self, name)]
+        if len(deciding) > 1:
+            yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
+        for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
+            yield f"sizes list every number of replicas, so {name} does nothing; remove it"
+        for name in ("per", "autoscaler"):
+            if getattr(self, name) and self.min == self.max:
+                yield f"{name} has no choice between min {self.min} and max {self.max}; raise max"
+        if self.autoscaler and self.min == 0:
+            yield "an autoscaler keeps at least one replica; raise min to 1"
+        by_requesters = "requesters" in (self.per or {})
+        if by_requesters and not self.may_depend_on_requesters:
+            yield (
+                "per: requesters shows in the rendered files how many requesters there are; allow "
+                "it with mayDependOnRequesters: true"
+            )
+        if self.may_depend_on_requesters and not by_requesters:
+            yield "mayDependOnRequesters does nothing without per: requesters; remove it"
+        if self.down_after and not (self.per or self.sizes):
+            own = "; an autoscaler has a time of its own" if self.autoscaler else ""
+            yield f"downAfter does nothing without per or sizes{own}; remove it"
+        if self.down_after and seconds_of(self.down_after) < 1:
+            yield "downAfter is zero; leave it out"
+
+    @property
+    def kept_for(self) -> timedelta | None:
+        """How long a service keeps replicas that no demand needs any longer."""
+        return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
+
+    @property
+    def most(self) -> int:
+        """The highest number of replicas that it may give."""
+        if self.sizes:
+            return max(self.sizes.replicas.values())
+        return self.max if self.per or self.autoscaler else self.min

@@ -1,0 +1,158 @@
+"""Services as people define them: an appdef's own, and those that several appdefs use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, StringConstraints, model_validator
+
+from demandops import strict_yaml
+from demandops.config.appdef.scaling import Scaling
+from demandops.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
+from demandops.config.inventory import LabelKey, LabelValue, NodeId, Resources
+from demandops.errors import suggestion
+
+TopicPattern = Annotated[
+    str,
+    StringConstraints(
+        pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
+    ),
+]
+"""A topic name; ``{instance}`` is replaced by the service's source or application."""
+
+Scope = Literal["application", "topic", "node", "cluster"]
+"""What a service has one instance for."""
+
+
+class Place(CamelModel):
+    """What the node of a service must have: its type, labels of its selector, capabilities."""
+
+    role: Word | Literal[""] = ""
+    labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
+    capabilities: Items[Word] = ()
+
+
+class Input(CamelModel):
+    """A role of demanded topics, for example ``point_cloud``."""
+
+    description: Text = ""
+    type: Text = ""
+
+
+class Parameter(CamelModel):
+    """A value that demands may set, and how the values of several demands are merged."""
+
+    description: Text = ""
+    default: Any = None
+    merge: Literal["union", "max", "min", "latest"] | None = None
+
+
+class Deployed(CamelModel):
+    """How a service runs: its releases' names, chart and values, and what it publishes.
+
+    ``each`` names an input; the service then runs once for every topic of it. ``place`` is what its
+    node must have, if it gets one of its own (:mod:`demandops.plan.nodes.placement`). ``requests``
+    is what each replica needs of its node (:mod:`demandops.plan.nodes.capacity`).
+    """
+
+    prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
+    description: Text = ""
+    each: Word | None = None
+    outputs: dict[Word, TopicPattern] = Field(default_factory=dict)
+    placement: Literal["application", "source"] = "application"
+    place: Place | None = None
+    scaling: Scaling = Scaling()
+    requests: Resources = Field(default_factory=dict)
+    chart: DnsLabel
+    images: Items[DnsLabel] = ()
+    values: Annotated[str, StringConstraints(pattern=r"^values/[A-Za-z0-9_.-]+$")]
+
+    @model_validator(mode="after")
+    def _published_once(self) -> Deployed:
+        if self.outputs and self.scaling.most > 1 and not self.scaling.divides_work:
+            raise ValueError(
+                f"scaling: gives up to {self.scaling.most} replicas, each of which would publish "
+                "every output; keep one, or say dividesWork: true if the program divides its work"
+            )
+        return self
+
+
+class OwnService(Deployed):
+    """A service of one appdef. Its ``inputs`` name roles of the appdef or ``<service>.<output>``.
+
+    ``each`` names one of these inputs, or a role that is then an input too.
+    """
+
+    inputs: dict[Word, str] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> OwnService:
+        if self.placement == "source" and not self.each:
+            raise ValueError("placement 'source' needs 'each': an application has no single source")
+        if self.each and self.place:
+            raise ValueError(
+                "place needs a service without 'each': with it, one instance serves applications "
+                "that would choose different nodes"
+            )
+        return self
+
+
+class ServiceDefinition(Deployed, FileModel):
+    """A service that several appdefs may use: ``appdefs/<name>/service.yaml``.
+
+    ``nodes`` has the node of each cluster where a service with the scope ``cluster`` runs.
+    """
+
+    kind: Literal["ServiceDefinition"]
+    name: DnsLabel
+    scope: Scope
+    inputs: dict[Word, Input] = Field(default_factory=dict)
+    parameters: dict[Word, Parameter] = Field(default_factory=dict)
+    nodes: dict[DnsLabel, NodeId] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> ServiceDefinition:
+        if bool(self.nodes) is not (self.scope == "cluster"):
+            raise ValueError(
+                "scope 'cluster' needs nodes, the node of each cluster where it runs, and no other "
+                "scope may have them"
+            )
+        if self.placement == "source" and self.scope == "cluster":
+            raise ValueError("scope 'cluster' runs at its nodes; leave out placement")
+        if (self.each is None) is (self.scope == "topic"):
+            raise ValueError("scope 'topic' needs 'each', and no other scope may have it")
+        if self.each and self.each not in self.inputs:
+            known = suggestion(self.each, self.inputs)
+            raise ValueError(f"each: '{self.each}' is not an input{known}")
+        if self.placement == "source" and self.scope == "application":
+            raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
+        if self.place and self.scope != "application":
+            raise ValueError(
+                "place needs the scope 'application': of any other scope, one instance serves "
+                "applications that would choose different nodes"
+            )
+        if problems := [*size_problems(self.scaling, self.parameters)]:
+            raise ValueError("; ".join(problems))
+        return self
+
+
+def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iterator[str]:
+    """Yield the faults of the parameter that names a service's size."""
+    sizes = scaling.sizes
+    if sizes is None:
+        return
+    place, name = "scaling.sizes.parameter", sizes.parameter
+    parameter = parameters.get(name)
+    if parameter is None:
+        yield f"{place}: '{name}' is not a parameter{suggestion(name, parameters)}"
+        return
+    if parameter.merge in ("max", "min"):
+        yield (
+            f"{place}: '{name}' has merge: {parameter.merge}, which is for numbers; with union, "
+            "the largest size counts"
+        )
+    if sizes.replicas_for(parameter.default) is None:
+        default = strict_yaml.short_repr(parameter.default)
+        known = suggestion(str(parameter.default), sizes.replicas)
+        yield f"{place}: '{name}' has the default {default}, which is not a size{known}"

@@ -1,0 +1,141 @@
+"""The request that a goal becomes: parsed, completed, and checked against the configuration."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from datetime import datetime
+
+from demandops.config.config import Config
+from demandops.decision.state import State
+from demandops.demand import (
+    admission,
+    chosen_domain,
+    demand_goal,
+    deployment_request_goal,
+    permission,
+    separate_instance,
+)
+from demandops.demand.demand_request import Decommission, DemandRequest, Put
+from demandops.errors import Fault, Refused
+from demandops.ledger.waiting import Wait, WaitingDemand
+from demandops.plan import implied_connections, output_topics
+from demandops.plan.nodes import placement
+from demandops.plan.nodes.choice import NO_ROOM
+
+_SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
+
+
+Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
+"""Yields a fault if a request comes too soon after others of its requesters."""
+
+
+def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> DemandRequest:
+    """Return the request of a goal; if only room is lacking, the request to wait for it.
+
+    Raises:
+        Refused: if it can neither be booked nor wait. A demand that holds something does not wait.
+    """
+    try:
+        return admit(state, goal, throttle)
+    except Refused as refused:
+        if any(found.code != NO_ROOM for found in refused.faults):
+            raise
+        assert isinstance(goal, dict)  # noqa: S101 - only a demand is placed
+        parsed = separate_instance.with_separate_instances(demand_goal.parse(goal)[0], state.config)
+        known = state.ledger.waiting.get(parsed.demand)
+        mine = known is None or {*known.requesters} & {*parsed.requesters()}
+        holds = state.ledger.claims_of_demand(parsed.demand)
+        if not isinstance(parsed, Put) or holds or not mine:
+            raise
+        if not placement.may_wait(parsed, state):
+            raise
+        if faults := list(throttle(parsed, state.config)):
+            raise Refused(faults) from None
+        since, who = known.since if known else now, tuple(sorted({*parsed.requesters()}))
+        waiting = WaitingDemand(parsed.demand, parsed.id, who, since, parsed.priority, goal)
+        reasons = tuple(found.message for found in refused.faults)
+        return Wait(parsed.id, (), parsed.demand, who, waiting, reasons)
+
+
+def admit(
+    state: State, goal: object, throttle: Throttle = lambda request, config: ()
+) -> DemandRequest:
+    """Parse a goal and check it against the configuration, its access domains and the throttle.
+
+    Raises:
+        Refused: with every fault, of form and of content.
+    """
+    config, ledger = state.config, state.ledger
+    not_placed: list[Fault] = []
+    if isinstance(goal, dict) and Decommission.is_goal(goal):
+        parsed_node = Decommission.parse(goal)
+        return replace(parsed_node, nodes=config.nodes_of(parsed_node.id))
+    if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
+        parsed, faults = demand_goal.parse(goal)
+        _refuse_large(parsed, config)
+        parsed = separate_instance.with_separate_instances(parsed, config)
+        parsed, unclear = chosen_domain.with_chosen_domains(parsed, config, ledger.held)
+        request = output_topics.with_further_topics(parsed, ledger, config)
+        request, not_placed = placement.with_chosen_nodes(request, state, state.usage())
+        request = permission.with_lease_terms(request, config)
+        request = implied_connections.with_implied_connections(request, ledger, config)
+    else:
+        wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
+        if wired is None:
+            raise Refused(faults)
+        _refuse_large(wired, config)
+        wired, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
+        request, not_placed = placement.with_chosen_nodes(wired, state, state.usage())
+        request = permission.with_lease_terms(request, config)
+        request = output_topics.with_further_topics(request, ledger, config)
+    request = admission.with_chosen_types(request, config, ledger.connection)
+    malformed = {found.field for found in faults}
+    around_malformed = {parent for field in malformed for parent in _with_parents(field)}
+    content = [
+        *unclear,
+        *not_placed,
+        *admission.faults(request, config),
+        *permission.faults(request, config),
+    ]
+    # do not report as missing what could not be read
+    unread = bool(malformed & {"apps", "applications", "connections"})
+    faults += [
+        found
+        for found in content
+        if found.field not in around_malformed
+        and malformed.isdisjoint(_with_parents(found.field))
+        and not (unread and found.code == "empty")
+    ]
+    faults = faults or list(throttle(request, config))
+    if faults:
+        raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject_of(found.field)))
+    return request
+
+
+def _refuse_large(request: DemandRequest, config: Config) -> None:
+    """Refuse a request that is too large, before other checks read all that it lists."""
+    faults = list(admission.size_faults(request, config.repo_settings.limits))
+    if faults:
+        raise Refused(faults)
+
+
+def form_faults(goal: object) -> list[Fault]:
+    """Return the faults in a goal's form: unknown fields, wrong types."""
+    if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
+        return demand_goal.form_faults(goal)
+    return deployment_request_goal.form_faults(goal)
+
+
+def _with_parents(field: str) -> Iterator[str]:
+    """Yield a field and every field that contains it."""
+    yield field
+    for match in re.finditer(r"[.\[]", field):
+        yield field[: match.start()]
+
+
+def _subject_of(field: str) -> tuple[str, int]:
+    """Return the subject of a field, to report faults of one subject together."""
+    match = _SUBJECT.match(field)
+    return (match[1], int(match[2])) if match else ("", 0)

@@ -1,0 +1,79 @@
+"""Claims that a person wrote: what follows from them, and why they are refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from itertools import chain
+
+from demandops.decision.state import State
+from demandops.demand import (
+    admission,
+    permission,
+)
+from demandops.errors import Fault, Refused
+from demandops.ledger import claim_file
+from demandops.ledger.claim_changes import Changes, ClaimChange, changes_on
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations import restoration
+from demandops.ledger.world import World
+from demandops.plan.checks import quota, topic_clash
+from demandops.plan.nodes import capacity
+from demandops.plan.release_keys import affected_keys
+from demandops.render.changes import changeset
+from demandops.render.changes.changeset import FileReader
+from demandops.subject import Subject
+
+
+def changeset_of_edit(
+    state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
+) -> changeset.Changeset:
+    """Return the changes to rendered files that follow when a person changes claims."""
+    old = replace(state, ledger=before)
+    keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
+
+
+def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
+    """Yield why claims that a person wrote are refused, each located in the claim's file.
+
+    A claim must be valid, permitted, within the quotas and capacities, and without a topic clash,
+    as if a demand asked for it. An edit that only takes requesters away is always allowed, like a
+    release.
+
+    Args:
+        before, after: the world before and after the edit.
+        changes: each claim as it was booked, and as the person wrote it.
+    """
+    for change in changes:
+        claim = change.after
+        if claim is None or _only_reduces(change):
+            continue
+        wanted, config = restoration.request_for(claim), after.config
+        malformed = list(admission.faults(wanted, config))
+        allowed = chain(
+            permission.faults(wanted, config), quota.faults(before, after, Changes((change,)))
+        )
+        for each in malformed or allowed:
+            yield each.within(claim_file.path_of(claim.key))
+        yield from topic_clash.faults_of_claim(claim, before, after)
+        for each in _above_capacity(change, after):
+            yield each.within(claim_file.path_of(claim.key))
+
+
+def _above_capacity(change: ClaimChange, after: State) -> Iterator[Fault]:
+    """Yield a fault for each capacity that a person's change of a claim exceeds."""
+    without = replace(after, ledger=after.ledger.replace(change.key, change.before))
+    with suppress(Refused):  # other checks report a claim that cannot be planned
+        grown = capacity.growth_by(without, after, [change])
+        usage = after.usage().plus({need: -amount for need, amount in grown.items()})
+        yield from capacity.faults(usage, grown, after.config)
+
+
+def _only_reduces(change: ClaimChange) -> bool:
+    before, after = change.before, change.after
+    if before is None or after is None:
+        return False
+    as_before = replace(after, requesters=before.requesters, partial=before.partial)
+    return as_before == before and {*after.requesters} <= {*before.requesters}

@@ -1,0 +1,228 @@
+"""The decision on one demand: from the goal to the files of a commit.
+
+It composes the stages before it into a pure function: parse, admit, book, plan, render. It reads
+the state repo only through ``read`` and writes nothing. So a dry run, a replay on a moved remote
+and the real run are the same call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Literal
+
+from demandops.config.config import Config
+from demandops.decision.admitted_request import Throttle, admitted
+from demandops.decision.decision_notes import notes_on
+from demandops.decision.state import State
+from demandops.demand import (
+    demand_goal,
+    permission,
+)
+from demandops.demand.demand_request import Decommission, DemandRequest
+from demandops.errors import Refused
+from demandops.ledger.apply import apply
+from demandops.ledger.claim_changes import Changes
+from demandops.ledger.kept_replicas import Instance
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations import restoration
+from demandops.ledger.operations.drain import Drain
+from demandops.ledger.operations.restoration import Restoration
+from demandops.ledger.waiting import Wait
+from demandops.plan import implied_connections
+from demandops.plan import scale_down as scale_downs
+from demandops.plan.checks import denial, quota, topic_clash, version_difference
+from demandops.plan.nodes import capacity, relocation
+from demandops.plan.overrides.claim_overrides import (
+    with_kept_claims,
+    without_kept_claims,
+)
+from demandops.plan.release import ServiceKey
+from demandops.plan.release_keys import affected_keys
+from demandops.render.changes import changeset
+from demandops.render.changes.changeset import FileReader, ReleaseChange
+
+Stage = Literal["admitted", "booked"]
+Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
+
+_OUTCOMES: dict[str, Outcome] = {
+    "join": "booked",
+    "put": "booked",
+    "renew": "booked",
+    "drain": "booked",
+    "rollback": "restored",
+    "wait": "waiting",
+}
+"""Operation → its outcome in the receipt; an operation that is not listed gives ``released``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The effect of a demand. ``files`` is empty if it changes nothing.
+
+    ``approval`` names the access domains, rules and appdefs that require a person's approval first.
+    """
+
+    request: DemandRequest
+    outcome: Outcome
+    state: State
+    changes: Changes
+    files: Mapping[str, str | None]
+    releases: tuple[ReleaseChange, ...]
+    warnings: tuple[str, ...]
+    approval: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
+    """The files of the overrides that shaped the rendered files."""
+    frees: bool = False
+    """Whether services request less of a node than before."""
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """Where the generator placed applications whose node the demand does not name, and why."""
+        if isinstance(self.request, Drain):
+            return self.request.moved
+        return tuple(text for one in self.request.demanded for text in one.placed)
+
+    @property
+    def lease_s(self) -> int | None:
+        """The shortest lease of the demand, in seconds; ``None`` if it has no lease.
+
+        For a waiting demand it is the lease that it may get, so that its client keeps renewing.
+        """
+        waiting = self.state.ledger.waiting.get(self.request.demand)
+        if waiting is not None:
+            put, config = demand_goal.parse(dict(waiting.goal))[0], self.state.config
+            domains = (one for one in config.domains.values() if one.when_full == "wait")
+            terms = (permission.term(put, domain) for domain in domains)
+            return min((term.seconds for term in terms if term), default=None)
+        claims = (
+            self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
+        )
+        claims = claims or tuple(change.after for change in self.changes.claims if change.after)
+        return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
+
+
+def decide(
+    state: State,
+    goal: object,
+    now: datetime,
+    read: FileReader,
+    on_stage: Callable[[Stage], None] = lambda stage: None,
+    throttle: Throttle = lambda request, config: (),
+) -> Decision:
+    """Decide on a goal of the reference's action or of our own.
+
+    Args:
+        state: the configuration and ledger to decide on.
+        goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`,
+            :mod:`demandops.demand.demand_goal`), or a request that the generator makes itself,
+            which is not checked again.
+        now: when the demand was received, with time zone.
+        read: returns the current text of a file in the state repo, or ``None``.
+        on_stage: called when the demand is admitted and when it is booked.
+        throttle: checked last before a request is admitted.
+
+    Raises:
+        Refused: with every fault, by the goal's fields. Nothing may be written then.
+        InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
+    """
+    config = state.config
+    request = goal if isinstance(goal, DemandRequest) else admitted(state, goal, now, throttle)
+    if isinstance(request, Drain):
+        request = relocation.with_moves(request, state, state.usage())
+    if isinstance(request, Restoration):
+        request = relocation.with_restored_moves(request, state)
+        faults = list(restoration.faults(request, state))
+        if faults:
+            raise Refused(faults)
+    on_stage("admitted")
+    ledger, changes = _book(state, request, now)
+    after = replace(state, ledger=ledger)
+    keys = affected_keys(state, after, changes.claims)
+    ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
+    after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
+    clashes = list(topic_clash.faults(request, state, after, keys))
+    for change in changes.claims if isinstance(request, Restoration) else ():
+        clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
+    if clashes:
+        raise Refused(clashes)
+    rendered = changeset.build_changeset(
+        state, after, changes, keys, state.engine, read, state.plans
+    )
+    differing = list(
+        version_difference.differences(request, state, after, changes.claims, rendered.plans)
+    )
+    refused = [found.fault for found in differing if found.is_refused]
+    grown = _growth(config, rendered)
+    if request.adds_claims or isinstance(request, Restoration):
+        refused = refused or list(capacity.faults(state.usage(), grown, config))
+    if refused:
+        raise Refused(refused)
+    after = state.followed_by(ledger, rendered, state.usage().plus(grown))
+    on_stage("booked")
+    outcome: Outcome = "unchanged"
+    if changes.claims or changes.waiting or isinstance(request, Wait):
+        outcome = _OUTCOMES.get(request.operation, "released")
+    return Decision(
+        request=request,
+        outcome=outcome,
+        state=after,
+        changes=changes,
+        files=rendered.files if changes.claims or changes.waiting else {},
+        releases=rendered.releases,
+        warnings=(
+            *notes_on(request, after, changes, rendered),
+            *filter(None, (found.warning() for found in differing)),
+        ),
+        approval=(
+            *permission.approval_reasons(
+                request, ((c.before, c.after) for c in changes.claims), config
+            ),
+            *filter(None, (found.approval_reason() for found in differing)),
+        ),
+        overrides=rendered.overrides,
+        frees=any(amount < 0 for amount in grown.values()),
+    )
+
+
+def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+    """Book a request. Its claims replace kept ones; overrides may keep claims that it releases.
+
+    Raises:
+        Refused: if existing claims, an override or a quota forbid it.
+    """
+    subjects = request.subjects()
+    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    if isinstance(request, Decommission):
+        ledger, changes = implied_connections.without_idle_deliveries(
+            state.ledger, replace(state, ledger=ledger), changes
+        )
+    after = replace(state, ledger=ledger)
+    refusals = list(denial.faults(request, after, changes))
+    refusals = refusals or list(quota.faults(state, after, changes))
+    if refusals:
+        raise Refused(refusals)
+    return with_kept_claims(state.ledger, after, changes, subjects, now)
+
+
+def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
+    """Return how much more services request of each node; empty if no node has a capacity."""
+    return (
+        capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
+    )
+
+
+def scale_down(
+    state: State, instance: Instance, now: datetime, read: FileReader
+) -> tuple[State, changeset.Changeset]:
+    """Return the state without a service's expired extra replicas, and the files that change.
+
+    Raises:
+        Refused, InvalidInput: if the service cannot be planned or rendered.
+    """
+    after = replace(state, ledger=scale_downs.without_ended(state, instance, now))
+    changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
+    change = changeset.build_changeset(state, after, changes, keys, state.engine, read, state.plans)
+    usage = state.usage().plus(_growth(state.config, change))
+    return state.followed_by(after.ledger, change, usage), change

@@ -1,0 +1,80 @@
+"""What a requester is told about a decision beside its outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from demandops.config.override import format_time
+from demandops.demand import separate_instance
+from demandops.demand.application import Application
+from demandops.demand.demand_request import DemandRequest
+from demandops.ledger.claim_changes import Changes
+from demandops.ledger.operations.drain import Drain
+from demandops.ledger.waiting import Wait
+from demandops.ledger.world import World
+from demandops.plan.checks import denial
+from demandops.plan.flows import flows
+from demandops.plan.overrides.claim_overrides import (
+    without_suspended,
+)
+from demandops.plan.planner import is_bridged
+from demandops.plan.release import Release, ServiceKey, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey
+from demandops.render.changes.changeset import Changeset
+
+
+def notes_on(
+    request: DemandRequest, after: World, changes: Changes, rendered: Changeset
+) -> Iterator[str]:
+    """Yield what the requester should know of a demand, once it is booked and rendered."""
+    yield from separate_instance.notes(request)
+    yield from _connection_warnings(request, after)
+    yield from rendered.blocked
+    yield from _repeat(changes)
+    if isinstance(request, Drain):
+        yield from request.stays
+    if isinstance(request, Wait):
+        yield from request.reasons
+    yield from denial.warnings(request, after)
+    yield from _kept_replicas(changes, rendered.plans)
+
+
+def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
+    """Yield warnings: inputs without a connection, topics that are bridged already, and notes."""
+    ledger = without_suspended(world).ledger
+    for one in request.demanded if request.adds_claims else ():
+        held = one.held
+        if isinstance(held, Application):
+            for flow in flows(world.config, held):
+                if not ledger.is_carried_to(flow.receiver, flow.target):
+                    yield (
+                        f"application '{held.id}': no connection carries {flow.name} "
+                        f"{flow.topic} of '{flow.sender}' to '{flow.receiver}'"
+                    )
+            continue
+        if one.note:
+            yield f"connection '{held.id}' {one.note}"
+        for route in held.topics:
+            if is_bridged(route, *held.nodes, world.config):
+                yield (
+                    f"connection '{held.id}': {route.read_topic} is bridged between "
+                    f"'{held.source}' and '{held.target}' already, so no client carries it"
+                )
+
+
+def _repeat(changes: Changes) -> Iterator[str]:
+    """Yield a warning if the same shutdown was carried out before."""
+    if changes.repeats is not None:
+        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
+        yield f"the same shutdown was carried out at {at}; this one releases nothing more"
+
+
+def _kept_replicas(changes: Changes, plans: Mapping[ReleaseKey, Release | None]) -> Iterator[str]:
+    """Yield a note for each service that has more replicas now than its demands need."""
+    for release in (plans.get(ServiceKey.of(instance)) for instance in changes.kept):
+        if isinstance(release, ServiceRelease) and release.keeps:
+            until = format_time(release.keeps.until)
+            yield (
+                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter), then "
+                "as many as its demands need"
+            )

@@ -1,0 +1,89 @@
+"""The world at one commit, with what earlier decisions planned and rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from rpds import HashTrieMap
+
+from demandops.config.config import Config
+from demandops.errors import Refused
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
+from demandops.plan.nodes import capacity
+from demandops.plan.nodes.capacity import Usage
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey, all_keys
+from demandops.render import trial_render
+from demandops.render.changes import changeset
+from demandops.render.engine import Engine
+
+
+@dataclass(frozen=True, slots=True)
+class State(World):
+    """The world at one commit, with the engine that renders its configuration's templates.
+
+    ``plans`` are the releases that earlier decisions on this configuration planned. A copy made
+    with ``replace`` has none: only :func:`decide` knows which of them are still right.
+    """
+
+    engine: Engine
+    plans: HashTrieMap[ReleaseKey, Release] = field(
+        default_factory=HashTrieMap, init=False, compare=False, repr=False
+    )
+    _usage: Usage | None = field(default=None, init=False, compare=False, repr=False)
+
+    @classmethod
+    def of(cls, config: Config, ledger: Ledger) -> State:
+        """Return a state with a fresh engine for ``config``."""
+        return cls(config, ledger, Engine(config.files))
+
+    def usage(self) -> Usage:
+        """Return what services request of each node; only the first call counts them all."""
+        if self._usage is None:
+            object.__setattr__(self, "_usage", capacity.whole_usage(self))
+        assert self._usage is not None  # noqa: S101 - set above
+        return self._usage
+
+    def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
+        """Return the state after a decision, with the releases that the decision planned."""
+        known = self.plans
+        for key, release in rendered.plans.items():
+            known = known.insert(key, release) if release else known.discard(key)
+        state = replace(self, ledger=ledger)
+        object.__setattr__(state, "plans", known)
+        object.__setattr__(state, "_usage", usage)
+        return state
+
+    def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
+        """Return the state with another ledger; only changed claims are counted anew."""
+        state = replace(self, ledger=ledger)
+        if self._usage is not None:
+            with suppress(Refused):  # a definition is gone; then ``usage`` counts all anew
+                usage = self._usage.plus(capacity.growth_by(self, state, changes))
+                object.__setattr__(state, "_usage", usage)
+        return state
+
+
+def rendered_files(
+    state: State, current: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, str]:
+    """Return every generated file that the state requires, path → text.
+
+    Args:
+        current: the current generated files; an override with ``hold`` keeps some of them.
+    """
+    return changeset.render_all(state, state.engine, all_keys(state), current)
+
+
+def try_configuration(state: State) -> None:
+    """Render trial demands for every appdef and every override in effect.
+
+    Raises:
+        Refused, InvalidInput: with the template, the values or the override that does not work.
+    """
+    trial_render.render_trial_demands(state, state.engine)

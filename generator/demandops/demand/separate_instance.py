@@ -1,0 +1,48 @@
+"""Separate instances: an application of another version runs beside the one of the default version.
+
+With ``versions: separate`` a demand for another version than the default gets an application of its
+own. Its id names the version (``edge/fusion@1.1.0``), so its services, topics and connections have
+names of their own, and it is removed with its last claim. Services that several definitions share
+run once for all versions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from demandops.config.config import Config
+from demandops.demand.application import Application
+from demandops.demand.demand_request import AnyRequest, DemandRequest
+
+
+def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
+    """Return the request; applications not of the default version become separate instances."""
+    demanded = (
+        replace(one, held=_separated(one.held, config))
+        if isinstance(one.held, Application) and one.held.version
+        else one
+        for one in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))
+
+
+def _separated(app: Application, config: Config) -> Application:
+    appdef = config.appdefs.get(app.appdef)
+    known = config.application_versions.get(app.appdef, {})
+    version = known.get(app.version)
+    if appdef is None or appdef.versions != "separate" or version is None:
+        return app
+    if version.rank == known[""].rank:
+        return app
+    suffix = f"@{version.name}"
+    id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
+    return replace(app, id=id, version=version.name, separate=True)
+
+
+def notes(request: DemandRequest) -> Iterator[str]:
+    """Yield a note for each separate instance that a request lists."""
+    for one in request.demanded:
+        if isinstance(one.held, Application) and one.held.separate:
+            id, _, version = one.held.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{one.held.id}'"

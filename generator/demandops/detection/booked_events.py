@@ -1,0 +1,39 @@
+"""The events that had started before a restart, found from the demands that are booked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from demandops.detection.events.detection_state import Key
+from demandops.detection.rules.rule_demand import BookedDemand, Goal
+from demandops.detection.rules.rule_file import RuleFile
+
+
+def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
+    """Return the events whose demands are booked, and a goal by which each can be ended.
+
+    Args:
+        file: the rules.
+        bookkeeping: the bookkeeping as ``demandops bookkeeping --output json`` prints it.
+    """
+    found: dict[Key, Goal] = {}
+    for booked in _demands(bookkeeping):
+        for rule in file.rules:
+            values = rule.template.subjects_of(booked, rule.subjects, rule.name)
+            if values is not None:
+                subjects = tuple(str(values[name]) for name in rule.subjects)
+                if rule.is_for(*subjects):
+                    goal = rule.template.outline({"rule": rule.name, **values})
+                    found[rule.name, subjects] = goal
+                    break
+    return found
+
+
+def _demands(bookkeeping: Mapping[str, Any]) -> Iterator[BookedDemand]:
+    """Yield the demands that hold something, and those that wait for room."""
+    for id, entry in bookkeeping.get("demands", {}).items():
+        own_id = id if entry["action"] == "Demand" else ""
+        yield BookedDemand(own_id, entry["request"], tuple(entry["requesters"]))
+    for entry in bookkeeping.get("waiting", ()):
+        yield BookedDemand(entry["demand"], "", tuple(entry["requesters"]))

@@ -1,0 +1,112 @@
+"""The detector without ROS: from observations to the goals that its rules want.
+
+It holds the rules in effect and the engine's state. The caller reads files and clocks, and sends
+the goals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from demandops.config.policy import seconds_of
+from demandops.detection.events.detection_state import Event, Key, Observation
+from demandops.detection.events.event_engine import EventEngine
+from demandops.detection.rules.rule_demand import Goal
+from demandops.detection.rules.rule_file import Rule, RuleFile
+from demandops.detection.rules.rule_template import Values
+
+
+@dataclass(frozen=True, slots=True)
+class Want:
+    """The goal that an event wants from now on; ``None`` ends its demand."""
+
+    key: Key
+    goal: Goal | None
+    retry_s: float = 30.0
+    renew_s: float = 0.0
+
+
+class Detector:
+    """The rules in effect, the entities that were seen, and the events that last."""
+
+    def __init__(self, file: RuleFile, now: float) -> None:
+        self.file = file
+        self._rules = {rule.name: rule for rule in file.rules}
+        self._engine = EventEngine(file)
+        self._state = self._engine.start(now)
+        self._values: dict[Key, Values] = {}
+
+    @property
+    def lasting(self) -> frozenset[Key]:
+        """The events that have started and not stopped."""
+        return self._state.lasting
+
+    @property
+    def entities(self) -> int:
+        """How many entities are seen now."""
+        return len(self._state.seen)
+
+    def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
+        """Go on with events whose demands were booked before the start; return what each wants.
+
+        Args:
+            booked: a goal for each event; events for which there is no rule any longer are ended.
+            now: the time.
+            settle_s: how long their entities may stay unseen until they count as gone.
+        """
+        self._state = self._engine.start(now, booked, settle_s)
+        lasting = self._state.lasting
+        return [self._want(key, goal if key in lasting else None) for key, goal in booked.items()]
+
+    def step(self, observations: Iterable[Observation], now: float) -> list[tuple[Event, Want]]:
+        """Return the events that observations and passing time cause, each with what it wants."""
+        self._state, events = self._engine.step(self._state, observations, now)
+        found = []
+        for event in events:
+            goal = None
+            if event.starts:
+                self._values[event.key] = event.values
+                goal = self._rules[event.rule].template.goal(event.values)
+            else:
+                self._values.pop(event.key, None)
+            found.append((event, self._want(event.key, goal)))
+        return found
+
+    def set_clock(self, seconds: float) -> None:
+        """Adjust all times, because the clock was set forward by ``seconds``; negative: back."""
+        self._state = self._state.shifted(seconds)
+
+    def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
+        """Replace the rules; return what changes for the events that last.
+
+        An event ends if its rule is gone or is no longer for its entities. If the rule demands
+        something else now, that is wanted instead.
+        """
+        before, old = self._state.lasting, self._rules
+        self.file, self._engine = file, EventEngine(file)
+        self._rules = {rule.name: rule for rule in file.rules}
+        self._state = self._engine.start(now, sorted(before), settle_s)
+        changed = []
+        for key in sorted(before):
+            if key not in self._state.lasting:
+                self._values.pop(key, None)
+                changed.append(Want(key, None))
+            elif old[key[0]] != self._rules[key[0]]:
+                values = self._values_of(self._rules[key[0]], key)
+                if values is not None:
+                    changed.append(self._want(key, self._rules[key[0]].template.goal(values)))
+        return changed
+
+    def _values_of(self, rule: Rule, key: Key) -> Values | None:
+        """Return the values of an event's start; ``None`` if the rule needs one that is unknown."""
+        named = dict(zip(rule.subjects, key[1], strict=True))
+        values: Values = {**self._values.get(key, {}), "rule": rule.name, **named}
+        return values if rule.template.names() <= set(values) else None
+
+    def _want(self, key: Key, goal: Goal | None) -> Want:
+        rule = self._rules.get(key[0])
+        if rule is None:
+            return Want(key, goal)
+        renew_s = seconds_of(rule.renew) if rule.renew else 0
+        return Want(key, goal, seconds_of(rule.retry), renew_s)

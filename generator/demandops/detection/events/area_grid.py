@@ -1,0 +1,48 @@
+"""An index of areas by place, so that an entity is compared with the areas near it only."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from math import floor
+from statistics import median
+from typing import Generic, TypeVar
+
+from demandops.detection.rules.area import Area
+
+Item = TypeVar("Item")
+
+_SMALLEST_CELL_M = 10.0
+_MOST_CELLS = 4096
+"""An area that covers more cells is compared with every entity."""
+
+
+class AreaGrid(Generic[Item]):
+    """Items with areas, indexed by the squares of the map that each area and its margin touch."""
+
+    def __init__(self, items: Iterable[tuple[Item, Area, float]]) -> None:
+        """Index items, each with its area and the margin around it in metres."""
+        boxes = [(item, _box(area, around)) for item, area, around in items]
+        sizes = [max(box[2] - box[0], box[3] - box[1]) for _, box in boxes]
+        self._size = max(_SMALLEST_CELL_M, median(sizes) if sizes else 0.0)
+        cells = defaultdict[tuple[int, int], list[Item]](list)
+        large: list[Item] = []
+        for item, box in boxes:
+            low_x, low_y, high_x, high_y = (floor(edge / self._size) for edge in box)
+            if (high_x - low_x + 1) * (high_y - low_y + 1) > _MOST_CELLS:
+                large.append(item)
+                continue
+            for x in range(low_x, high_x + 1):
+                for y in range(low_y, high_y + 1):
+                    cells[x, y].append(item)
+        self._large = tuple(large)
+        self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
+
+    def at(self, x: float, y: float) -> Sequence[Item]:
+        """Return all items whose area or margin contains a position, and some others near by."""
+        return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
+
+
+def _box(area: Area, around: float) -> tuple[float, float, float, float]:
+    low_x, low_y, high_x, high_y = area.bounds
+    return low_x - around, low_y - around, high_x + around, high_y + around

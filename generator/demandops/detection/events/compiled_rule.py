@@ -1,0 +1,197 @@
+"""Rules, prepared for quick checks of each observation; one class for each kind of condition."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, MutableMapping
+from fnmatch import translate
+from math import floor, hypot
+from typing import NamedTuple
+
+from demandops.config.policy import seconds_of
+from demandops.detection.events.detection_state import Cell, Key, Observation, Who
+from demandops.detection.rules.condition import Count, Hours, Near, Threshold, Together
+from demandops.detection.rules.rule_file import Rule
+from demandops.detection.rules.rule_template import Values
+
+Seen = Mapping[Who, Observation]
+
+
+class Facts(NamedTuple):
+    """The values of an event for the rule's template, and a sentence for people."""
+
+    values: Values
+    text: str
+
+
+class CompiledRule:
+    """The base class of all compiled rules."""
+
+    def __init__(self, rule: Rule) -> None:
+        self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
+        self.dwell = float(seconds_of(rule.dwell))
+        patterns = [pattern.replace("[", "[[]") for pattern in rule.entities]
+        self._names = None if "*" in patterns else re.compile("|".join(map(translate, patterns)))
+
+    def is_for(self, entity: str) -> bool:
+        """Return whether the rule is for an entity."""
+        return self._names is None or self._names.match(entity) is not None
+
+    def takes(self, who: Who) -> bool:
+        """Return whether the rule is for an entity, which one of its sources reports."""
+        return self.is_for(who[1])
+
+    def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
+        """Return the entities that an event names, each with its source."""
+        return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
+
+    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
+        """Return the current values and text of an event.
+
+        Args:
+            subjects: the entities of the event, which are all seen.
+            seen: the last observation of each entity.
+            count: how many entities the rule counts.
+        """
+        raise NotImplementedError
+
+    def _named(self, subjects: tuple[str, ...]) -> dict[str, str | float]:
+        return {"rule": self.name, **dict(zip(self.subjects, subjects, strict=True))}
+
+
+class HoursRule(CompiledRule):
+    """A rule that holds at some hours."""
+
+    def __init__(self, rule: Rule, hours: Hours) -> None:
+        super().__init__(rule)
+        self.schedule = hours.schedule
+
+    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
+        """Return no values but the rule's name."""
+        return Facts(self._named(subjects), "the hours of the schedule")
+
+
+class ThresholdRule(CompiledRule):
+    """A rule on a number that an entity reports."""
+
+    def __init__(self, rule: Rule, limits: Threshold) -> None:
+        super().__init__(rule)
+        self.field, self._limits = limits.field, limits
+
+    def starts(self, value: float) -> bool:
+        """Return whether the condition starts at a value."""
+        above, below = self._limits.above, self._limits.below
+        return (above is not None and value > above) or (below is not None and value < below)
+
+    def stops(self, value: float) -> bool:
+        """Return whether the condition stops at a value."""
+        is_low = value <= self._limits.stop
+        return is_low if self._limits.above is not None else value >= self._limits.stop
+
+    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
+        """Return the value."""
+        value = seen[self.sources[0], subjects[0]].values.get(self.field, 0.0)
+        named = {**self._named(subjects), "value": value}
+        return Facts(named, f"{self.field} of {subjects[0]} is {value:g}")
+
+
+class AreaRule(CompiledRule):
+    """A rule on the distance to an area: an entity is near it, or is counted there."""
+
+    def __init__(self, rule: Rule, condition: Near | Count) -> None:
+        super().__init__(rule)
+        self.area = condition.area
+        self.count = condition if isinstance(condition, Count) else None
+        self.start: float = condition.radius if isinstance(condition, Count) else condition.start
+        self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
+
+    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
+        """Return the position and the distance, or how many there are."""
+        named = self._named(subjects)
+        if self.count is not None:
+            return Facts({**named, "count": count}, f"{count} are there")
+        x, y = seen[self.sources[0], subjects[0]].position or (0.0, 0.0)
+        distance = self.area.distance(x, y)
+        text = f"{subjects[0]} is {distance:.1f} m away"
+        return Facts({**named, "x": x, "y": y, "distance": distance}, text)
+
+
+class PairRule(CompiledRule):
+    """A rule on the distance of two entities. Squares as wide as its stop distance find them."""
+
+    def __init__(self, rule: Rule, condition: Together) -> None:
+        super().__init__(rule)
+        self.start, self.stop = condition.start, condition.stop
+        self._first, self._second = self.sources[0], self.sources[-1]
+
+    def takes(self, who: Who) -> bool:
+        """Return whether an entity may be in a pair; the patterns are for the first source."""
+        return who[0] != self._first or self.is_for(who[1])
+
+    def key(self, one: Who, other: Who) -> Key:
+        """Return the key of a pair's event; entities of the same source are sorted by name."""
+        if self._first == self._second:
+            return self.name, (min(one[1], other[1]), max(one[1], other[1]))
+        return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
+
+    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
+        """Return the position of the first entity, and the distance."""
+        one, other = (seen[who] for who in self.entities_of(subjects))
+        (x, y), away = one.position or (0.0, 0.0), distance(one, other)
+        text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
+        return Facts({**self._named(subjects), "x": x, "y": y, "distance": away}, text)
+
+    def _cell(self, one: Observation | None) -> Cell | None:
+        if one is None or one.position is None:
+            return None
+        x, y = one.position
+        return self.name, one.source, floor(x / self.stop), floor(y / self.stop)
+
+    def move(
+        self,
+        cells: MutableMapping[Cell, frozenset[str]],
+        entity: str,
+        before: Observation | None,
+        after: Observation | None,
+    ) -> None:
+        """Move an entity from its square to another one; ``None`` is nowhere."""
+        left, entered = self._cell(before), self._cell(after)
+        if left == entered:
+            return
+        if left is not None:
+            cells[left] = cells[left] - {entity}
+            if not cells[left]:
+                del cells[left]
+        if entered is not None:
+            cells[entered] = cells.get(entered, frozenset()) | {entity}
+
+    def around(self, cells: Mapping[Cell, frozenset[str]], one: Observation) -> Iterator[Who]:
+        """Yield the possible partners of an entity: all that are near enough, and some others."""
+        cell = self._cell(one)
+        if cell is None:
+            return
+        source = self._second if one.source == self._first else self._first
+        _, _, at_x, at_y = cell
+        for x in (at_x - 1, at_x, at_x + 1):
+            for y in (at_y - 1, at_y, at_y + 1):
+                for entity in cells.get((self.name, source, x, y), ()):
+                    if (source, entity) != one.who:
+                        yield source, entity
+
+
+def distance(one: Observation, other: Observation) -> float:
+    """Return the metres between two entities that have positions."""
+    assert one.position is not None and other.position is not None  # noqa: S101 - rules need them
+    return hypot(one.position[0] - other.position[0], one.position[1] - other.position[1])
+
+
+def compiled(rule: Rule) -> CompiledRule:
+    """Return a rule in the class of its condition."""
+    condition = rule.condition
+    if isinstance(condition, Near | Count):
+        return AreaRule(rule, condition)
+    if isinstance(condition, Together):
+        return PairRule(rule, condition)
+    if isinstance(condition, Threshold):
+        return ThresholdRule(rule, condition)
+    return HoursRule(rule, condition)

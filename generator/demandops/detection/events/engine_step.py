@@ -1,0 +1,228 @@
+"""One step of the engine: takes a copy of a state, applies observations and time, collects events.
+
+Copies are cheap: the values in the mappings are immutable, and a step takes many observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from math import inf
+from typing import TYPE_CHECKING
+
+from demandops.detection.events.compiled_rule import AreaRule, CompiledRule, PairRule, distance
+from demandops.detection.events.detection_state import Event, Key, Observation, Phase, State, Who
+
+if TYPE_CHECKING:
+    from demandops.detection.events.event_engine import EventEngine
+
+_NONE: frozenset[Key] = frozenset()
+_NO_RULES: frozenset[str] = frozenset()
+
+
+class EngineStep:
+    """The work of one step."""
+
+    def __init__(self, engine: EventEngine, state: State) -> None:
+        self._engine, self._before = engine, state
+        self._now, self._due, self._hours_due = state.now, state.due, state.hours_due
+        self._seen, self._awaited = dict(state.seen), dict(state.awaited)
+        self._phases, self._engaged = dict(state.phases), dict(state.engaged)
+        self._counted, self._counts = dict(state.counted), dict(state.counts)
+        self._cells = dict(state.cells)
+        self.events: list[Event] = []
+
+    def result(self) -> State:
+        """Return the state after the step."""
+        return replace(
+            self._before,
+            now=self._now,
+            due=self._due,
+            hours_due=self._hours_due,
+            seen=self._seen,
+            awaited=self._awaited,
+            phases=self._phases,
+            engaged=self._engaged,
+            counted=self._counted,
+            counts=self._counts,
+            cells=self._cells,
+        )
+
+    def resume(self, key: Key) -> None:
+        """Take up an event from before the start, and wait for its entities."""
+        rule = self._engine.rules.get(key[0])
+        if rule is None or len(rule.subjects) != len(key[1]):
+            return
+        entities = rule.entities_of(key[1])
+        if all(map(rule.takes, entities)):
+            self._enter(key, rule, Phase(self._now, lasts=True))
+            self._awaited |= dict.fromkeys(entities, self._before.settled)
+
+    # ---- time ----
+
+    def pass_time(self, until: float) -> None:
+        """Do what is due until then: end dwell times, lose silent entities, follow schedules."""
+        while until >= self._due:
+            for at, act in sorted(self._all_due(), key=lambda one: one[0]):
+                if at > until:
+                    break
+                self._now = max(self._now, at)
+                act()
+            self._due = min((at for at, _ in self._all_due()), default=inf)
+        self._now = max(self._now, until)
+
+    def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
+        """Yield (when, action) for each change that passing time alone will cause."""
+        for key, phase in self._phases.items():
+            if not phase.lasts:
+                at = phase.since + self._engine.rules[key[0]].dwell
+                yield at, partial(self._end_dwell, key, phase)
+        if self._engine.hours:
+            yield self._hours_due, self._look_at_hours
+        if self._now < self._before.settled:
+            yield self._before.settled, self._look_at_counts
+        timeouts = self._engine.timeouts
+        for who, one in self._seen.items():
+            yield one.at + timeouts[one.source], partial(self._lose_silent, who, one)
+        for who, until in self._awaited.items():
+            yield until, partial(self._give_up, who)
+
+    def _end_dwell(self, key: Key, phase: Phase) -> None:
+        if self._phases.get(key) is phase:
+            self._begin(key, self._engine.rules[key[0]])
+
+    def _look_at_hours(self) -> None:
+        for rule in self._engine.hours:
+            is_on = rule.schedule.is_on(self._now)
+            self._latch((rule.name, ()), rule, is_on, not is_on)
+        self._hours_due = min(rule.schedule.next_check(self._now) for rule in self._engine.hours)
+
+    def _look_at_counts(self) -> None:
+        for rule in self._engine.rules.values():
+            if isinstance(rule, AreaRule) and rule.count:
+                self._latch_count(rule)
+
+    def _lose_silent(self, who: Who, last: Observation) -> None:
+        if self._seen.get(who) is last:
+            self._lose(who, f"{who[1]} is silent for {self._engine.timeouts[who[0]]:g} s")
+
+    def _give_up(self, who: Who) -> None:
+        if self._awaited.pop(who, None) is not None:
+            self._lose(who, f"{who[1]} was not seen since the start")
+
+    def _lose(self, who: Who, why: str) -> None:
+        """Forget an entity, and end all events that it takes part in."""
+        last = self._seen.pop(who, None)
+        for key in sorted(self._engaged.get(who, _NONE)):
+            self._leave(key, self._engine.rules[key[0]], why)
+        for name in sorted(self._counted.pop(who, _NO_RULES)):
+            self._count(name, -1)
+        for pair in self._engine.pairs[who[0]]:
+            pair.move(self._cells, who[1], last, None)
+
+    # ---- observations ----
+
+    def observe(self, one: Observation) -> None:
+        """Apply an observation at the current time of the step."""
+        if one.at != self._now:
+            one = one._replace(at=self._now)
+        before = self._seen.get(one.who)
+        self._seen[one.who] = one
+        self._awaited.pop(one.who, None)
+        self._due = min(self._due, one.at + self._engine.timeouts[one.source])
+        for rule in self._engine.thresholds[one.source]:
+            value = one.values.get(rule.field)
+            if value is not None and rule.is_for(one.entity):
+                key = (rule.name, (one.entity,))
+                self._latch(key, rule, rule.starts(value), rule.stops(value))
+        if one.position is not None:
+            self._compare_with_areas(one, *one.position)
+            for pair in self._engine.pairs[one.source]:
+                if pair.takes(one.who):
+                    pair.move(self._cells, one.entity, before, one)
+                    self._compare_with_others(pair, one)
+
+    def _compare_with_areas(self, one: Observation, x: float, y: float) -> None:
+        compared, counted = set[str](), set[str]()
+        for rule in self._engine.areas[one.source].at(x, y):
+            if not rule.is_for(one.entity):
+                continue
+            away = rule.area.distance(x, y)
+            if rule.count is None:
+                compared.add(rule.name)
+                near: Key = (rule.name, (one.entity,))
+                self._latch(near, rule, away <= rule.start, away > rule.stop)
+            elif away <= rule.start:
+                counted.add(rule.name)
+        for key in sorted(self._engaged.get(one.who, _NONE)):
+            rule_left = self._engine.rules[key[0]]
+            if isinstance(rule_left, AreaRule) and key[0] not in compared:
+                self._latch(key, rule_left, False, True)
+        before = self._counted.get(one.who, _NO_RULES)
+        if counted != before:
+            self._counted[one.who] = frozenset(counted)
+            for name in sorted(counted ^ before):
+                self._count(name, 1 if name in counted else -1)
+
+    def _compare_with_others(self, rule: PairRule, one: Observation) -> None:
+        compared = set[Key]()
+        for other in sorted(rule.around(self._cells, one)):
+            key, away = rule.key(one.who, other), distance(one, self._seen[other])
+            compared.add(key)
+            self._latch(key, rule, away <= rule.start, away > rule.stop)
+        for key in sorted(self._engaged.get(one.who, _NONE)):
+            is_left = key[0] == rule.name and key not in compared
+            if is_left and all(who in self._seen for who in rule.entities_of(key[1])):
+                self._latch(key, rule, False, True)
+
+    def _count(self, name: str, more: int) -> None:
+        rule = self._engine.rules[name]
+        self._counts[name] = self._counts.get(name, 0) + more
+        if isinstance(rule, AreaRule):
+            self._latch_count(rule)
+
+    def _latch_count(self, rule: AreaRule) -> None:
+        count = self._counts.get(rule.name, 0)
+        if rule.count is not None:
+            stops = count <= rule.count.stop and self._now >= self._before.settled
+            self._latch((rule.name, ()), rule, count >= rule.count.start, stops)
+
+    # ---- events ----
+
+    def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
+        """Start or stop a condition; if it neither starts nor stops, keep it as it is."""
+        phase = self._phases.get(key)
+        if stops and phase is not None:
+            self._leave(key, rule, "")
+        elif starts and phase is None:
+            if rule.dwell:
+                self._enter(key, rule, Phase(self._now, lasts=False))
+                self._due = min(self._due, self._now + rule.dwell)
+            else:
+                self._begin(key, rule)
+
+    def _begin(self, key: Key, rule: CompiledRule) -> None:
+        self._enter(key, rule, Phase(self._now, lasts=True))
+        self._report(key, rule, True, "")
+
+    def _enter(self, key: Key, rule: CompiledRule, phase: Phase) -> None:
+        self._phases[key] = phase
+        for who in rule.entities_of(key[1]):
+            self._engaged[who] = self._engaged.get(who, _NONE) | {key}
+
+    def _leave(self, key: Key, rule: CompiledRule, why: str) -> None:
+        phase = self._phases.pop(key)
+        for who in rule.entities_of(key[1]):
+            self._engaged[who] -= {key}
+            if not self._engaged[who]:
+                del self._engaged[who]
+        if phase.lasts:
+            self._report(key, rule, False, why)
+
+    def _report(self, key: Key, rule: CompiledRule, starts: bool, why: str) -> None:
+        if why:
+            self.events.append(Event(*key, starts, self._now, why))
+        else:
+            facts = rule.facts(key[1], self._seen, self._counts.get(key[0], 0))
+            self.events.append(Event(*key, starts, self._now, facts.text, facts.values))

@@ -1,0 +1,88 @@
+"""Reads messages: which entity a message is about, where it is, and what it reports.
+
+It takes any object with attributes, so messages of rclpy and of a recorded bag are read alike.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from math import isfinite
+from typing import Any
+
+from demandops.detection.events.detection_state import Observation
+from demandops.detection.rules.rule_file import RuleFile
+from demandops.detection.rules.rule_template import is_entity
+
+_FARTHEST_M = 1e9
+_PART = re.compile(r"(\w+)|\[(\d+)\]")
+
+Getter = Callable[[Any], Any]
+
+
+class Unreadable(Exception):
+    """Raised for a message without a usable value for a field; the text names it on one line."""
+
+
+class MessageReader:
+    """Reads the messages of one source."""
+
+    def __init__(self, file: RuleFile, source: str) -> None:
+        """Make a reader of the fields that the rules in ``file`` use of the source's messages."""
+        definition = file.sources[source]
+        self._source = source
+        self._entity = definition.entity and _getter(definition.entity)
+        self._position = definition.position and tuple(map(_getter, definition.position))
+        limits = (rule.threshold for rule in file.rules)
+        fields = {one.field for one in limits if one is not None and one.source == source}
+        self._fields = {field: _getter(field) for field in sorted(fields)}
+
+    def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
+        """Return the observation that a message makes.
+
+        Args:
+            message: the message.
+            entity: the entity that its topic names; empty if a field names it.
+            at: the time of its arrival.
+
+        Raises:
+            Unreadable: if a field is missing or has the wrong kind of value.
+        """
+        if self._entity:
+            entity = str(self._entity(message)).strip("/")
+            if not is_entity(entity):
+                raise Unreadable(f"{entity[:60]!r} is not a name of an entity")
+        position = None
+        if self._position:
+            x, y = (_number(get(message)) for get in self._position)
+            if abs(x) > _FARTHEST_M or abs(y) > _FARTHEST_M:
+                raise Unreadable(f"the position {x:g}, {y:g} is not on the map")
+            position = x, y
+        values = {field: _number(get(message)) for field, get in self._fields.items()}
+        return Observation(self._source, entity, at, position, values)
+
+
+def _number(value: object) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise Unreadable(f"{str(value)[:60]!r} is not a number") from None
+    if not isfinite(number):
+        raise Unreadable(f"{number} is not a finite number")
+    return number
+
+
+def _getter(path: str) -> Getter:
+    """Return a function that reads a field of a message by its path."""
+    parts = [(name, int(index or 0)) for name, index in _PART.findall(path)]
+
+    def get(message: Any) -> Any:  # noqa: ANN401
+        value = message
+        try:
+            for name, index in parts:
+                value = getattr(value, name) if name else value[index]
+        except (AttributeError, IndexError, TypeError):
+            raise Unreadable(f"it has no field {path}") from None
+        return value
+
+    return get

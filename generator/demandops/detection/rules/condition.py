@@ -1,0 +1,166 @@
+"""The conditions of rules: distances, counts, limits and hours.
+
+Each one starts at one value and stops at another, so that a value near the limit does not start and
+stop it again and again.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import time
+from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo
+
+from pydantic import Field, field_validator, model_validator
+
+from demandops.config.base_model import CamelModel, DnsLabel, Positive, readable_by, without
+from demandops.config.inventory import Position
+from demandops.detection.rules.area import Area
+from demandops.detection.rules.schedule import DAYS, Schedule
+from demandops.quoting import quoted
+
+_FIELD = re.compile(r"[A-Za-z]\w*(\[\d+\])*(\.[A-Za-z]\w*(\[\d+\])*)*")
+
+
+def _field_problem(path: str) -> str:
+    if _FIELD.fullmatch(path):
+        return ""
+    return f"{quoted(path)} is not a field; write it like pose.position.x or ranges[0]"
+
+
+FieldPath = Annotated[str, without(_field_problem)]
+"""A field of a message: ``pose.position.x`` or ``state.continuous_state[0]``."""
+
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+Metres = Annotated[float, Field(ge=0, le=1e6)]
+
+
+class _InArea(CamelModel):
+    """A condition on the distance to a point or a polygon."""
+
+    source: DnsLabel
+    point: Position | None = None
+    polygon: Annotated[tuple[Position, ...], Field(strict=False, min_length=3)] | None = None
+
+    @model_validator(mode="after")
+    def _has_one_shape(self) -> _InArea:
+        if (self.point is None) == (self.polygon is None):
+            raise ValueError("needs either point or polygon")
+        return self
+
+    @property
+    def area(self) -> Area:
+        """The point or the polygon."""
+        corners = self.polygon or ((self.point,) if self.point else ())
+        return Area(tuple((corner.x, corner.y) for corner in corners))
+
+
+def _refuse_distances(start: float, stop: float) -> None:
+    if stop <= start:
+        raise ValueError(
+            f"stop {stop:g} must be above start {start:g}: between them nothing changes, so that "
+            "an entity on the edge does not start and stop again and again"
+        )
+
+
+class Near(_InArea):
+    """An entity is at most ``start`` metres away; it ends when it is more than ``stop`` away."""
+
+    start: Metres
+    stop: Metres
+
+    @model_validator(mode="after")
+    def _has_hysteresis(self) -> Near:
+        _refuse_distances(self.start, self.stop)
+        return self
+
+
+class Together(CamelModel):
+    """Two entities are at most ``start`` metres apart; it ends when more than ``stop``.
+
+    They are of the same source, or the second one is of the source ``other``.
+    """
+
+    source: DnsLabel
+    other: DnsLabel | None = None
+    start: Metres
+    stop: Annotated[float, Field(ge=0.01, le=1e6)]
+
+    @model_validator(mode="after")
+    def _has_hysteresis(self) -> Together:
+        _refuse_distances(self.start, self.stop)
+        return self
+
+
+class Count(_InArea):
+    """At least ``start`` entities are within ``radius`` of an area; it ends at ``stop`` or less."""
+
+    radius: Metres = 0.0
+    start: Positive
+    stop: Annotated[int, Field(ge=0)]
+
+    @model_validator(mode="after")
+    def _has_hysteresis(self) -> Count:
+        if self.stop >= self.start:
+            raise ValueError(f"stop {self.stop} must be below start {self.start}")
+        if self.point is not None and not self.radius:
+            raise ValueError("radius is missing: nothing is exactly at a point")
+        return self
+
+
+class Threshold(CamelModel):
+    """A number is above or below a limit; it ends when it is back at ``stop``."""
+
+    source: DnsLabel
+    field: FieldPath
+    above: Number | None = None
+    below: Number | None = None
+    stop: Number
+
+    @model_validator(mode="after")
+    def _has_hysteresis(self) -> Threshold:
+        if (self.above is None) == (self.below is None):
+            raise ValueError("needs either above or below")
+        if self.above is not None and self.stop > self.above:
+            raise ValueError(f"stop {self.stop:g} must be at most above {self.above:g}")
+        if self.below is not None and self.stop < self.below:
+            raise ValueError(f"stop {self.stop:g} must be at least below {self.below:g}")
+        return self
+
+
+def _clock(text: str) -> time:
+    if not re.fullmatch(r"([01]\d|2[0-3]):[0-5]\d", text):
+        raise ValueError(f"'{text}' is not a time of day; write it like \"07:30\", in quotes")
+    return time.fromisoformat(text)
+
+
+def _zone(text: str) -> ZoneInfo:
+    try:
+        return ZoneInfo(text)
+    except (OSError, ValueError, KeyError):  # unknown, or not a name
+        raise ValueError(f"'{text}' is not a time zone; write it like Europe/Berlin") from None
+
+
+class Hours(CamelModel):
+    """From a time of day to another one, on some days of the week."""
+
+    days: Annotated[
+        tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],
+        Field(strict=False, min_length=1),
+    ] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+    start: Annotated[str, readable_by(_clock)]
+    stop: Annotated[str, readable_by(_clock)]
+    zone: Annotated[str, readable_by(_zone)] = "UTC"
+
+    @field_validator("stop")
+    @classmethod
+    def _is_another_time(cls, stop: str, info: Any) -> str:  # noqa: ANN401 - pydantic's
+        if stop == info.data.get("start"):
+            raise ValueError("must differ from start")
+        return stop
+
+    @property
+    def schedule(self) -> Schedule:
+        """The hours as a schedule."""
+        days = frozenset(DAYS.index(day) for day in self.days)
+        return Schedule(days, _clock(self.start), _clock(self.stop), _zone(self.zone))

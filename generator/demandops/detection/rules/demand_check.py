@@ -1,0 +1,89 @@
+"""The check of what a rule demands: its names, its form and its ids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from demandops.demand import demand_goal, deployment_request_goal
+from demandops.detection.rules import rule_template
+from demandops.detection.rules.rule_demand import RuleDemand
+from demandops.detection.rules.rule_template import Values, filled, names
+from demandops.errors import Fault, fault
+from demandops.settings import API_VERSION
+
+_HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
+_SAMPLE: Values = {
+    "rule": "rule",
+    "entity": "entity",
+    "other": "other",
+    "x": 0.0,
+    "y": 0.0,
+    "distance": 0.0,
+    "value": 0.0,
+    "count": 1,
+}
+
+
+def faults_of_demand(
+    template: RuleDemand, field: str, subjects: tuple[str, ...], momentary: frozenset[str]
+) -> list[Fault]:
+    """Return the faults of a rule's demand.
+
+    Args:
+        template: the demand.
+        field: its place in the file.
+        subjects: the names of the entities that an event of the rule is about.
+        momentary: the names of values that change; a ``Demand`` may use them, but not in its ids.
+    """
+    stable = {"rule", *subjects}
+    known = stable | (momentary if template.action == "demand" else set())
+    if found := rule_template.faults(template.data, field, known):
+        return found
+    data = filled(template.data, _SAMPLE)
+    if template.action == "demand":
+        fixed = [name for name in ("apiVersion", "kind", "operation") if name in data]
+        formed = demand_goal.form_faults({**_HEAD, **data})
+    else:
+        fixed = ["shutdown"] if "shutdown" in data else []
+        formed = deployment_request_goal.form_faults(data)
+    found = [fault(f"{field}.{name}", "is set by the detector; remove it") for name in fixed]
+    for one in formed:
+        found.append(fault(f"{field}.{one.field}" if one.field else field, one.message))
+    return found or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
+
+
+def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
+    """Yield a fault for each id that is missing, changes, or is the same for two entities."""
+    data = template.data
+    if template.action == "demand":
+        yield from _missing(data, field, "demand", "requesters")
+        listed = [("demand", [data.get("demand", "")], "or two events would share one demand")]
+        stable = [("demand", data.get("demand", "")), ("requesters", data.get("requesters", ()))]
+        for name, value in stable:
+            for path, text in rule_template.texts(value, f"{field}.{name}"):
+                if changing := sorted(names(text) - {"rule", "entity", "other"}):
+                    yield fault(path, f"'{{{changing[0]}}}' changes; an id must stay the same")
+    else:
+        yield from _missing(data, field, "id")
+        why = "a shutdown finds its claims by their requesters"
+        listed = [(path, who, why) for path, who in _requesters_by_field(data)]
+    for path, values, why in listed:
+        missing = needed - {f"{{{name}}}" for value in values for name in names(value)}
+        if missing and any(values):
+            yield fault(f"{field}.{path}", f"must name {' and '.join(sorted(missing))}: {why}")
+
+
+def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: ANN401 - plain data
+    for name in needed:
+        if not data.get(name):
+            yield fault(f"{field}.{name}", "is missing; add it")
+
+
+def _requesters_by_field(data: Any) -> Iterator[tuple[str, list[str]]]:  # noqa: ANN401
+    """Yield the requesters of each item of a ``DeploymentRequest``, and their field."""
+    for index, app in enumerate(data.get("apps", ())):
+        field = "object_detection_fusion_app"
+        yield f"apps[{index}].{field}.requester_ids", app.get(field, {}).get("requester_ids", [])
+    for index, connection in enumerate(data.get("connections", ())):
+        yield f"connections[{index}].requester_ids", connection.get("requester_ids", [])

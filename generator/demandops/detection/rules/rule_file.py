@@ -1,0 +1,194 @@
+"""The file of rules for the event detector, and the checks across its parts.
+
+:func:`read` reports all faults of a file together, each with its line and field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from demandops.config.base_model import (
+    CamelModel,
+    DnsLabel,
+    FileModel,
+    Items,
+    Text,
+    parse_file,
+    without,
+)
+from demandops.config.policy import Duration, Patterns, matches, seconds_of
+from demandops.detection.rules.condition import Count, FieldPath, Hours, Near, Threshold, Together
+from demandops.detection.rules.demand_check import faults_of_demand
+from demandops.detection.rules.rule_demand import RuleDemand
+from demandops.detection.rules.topic_pattern import topic_pattern_problem
+from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.field_lines import located_in
+from demandops.identifiers import message_type_problem
+
+POSITIONS: Mapping[str, tuple[str, str]] = {
+    "geometry_msgs/msg/PoseStamped": ("pose.position.x", "pose.position.y"),
+    "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
+    "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
+}
+"""Where the messages of a type have x and y, unless the source says it."""
+
+
+class Source(CamelModel):
+    """The topics of one kind of entity.
+
+    The entity is the part of the topic that ``{entity}`` stands for, or the text in the field
+    ``entity``. ``x`` and ``y`` are the fields with its position. An entity that is silent for
+    ``timeout`` is gone.
+    """
+
+    topic: Annotated[Text, without(topic_pattern_problem)]
+    type: Annotated[Text, without(message_type_problem)]
+    entity: FieldPath | None = None
+    x: FieldPath | None = None
+    y: FieldPath | None = None
+    timeout: Duration = "5s"
+
+    @model_validator(mode="after")
+    def _names_entities(self) -> Source:
+        if ("{entity}" in self.topic) == bool(self.entity):
+            raise ValueError(
+                "needs the name of the entity once: {entity} as a part of topic, or the field with "
+                "it in entity"
+            )
+        if bool(self.x) != bool(self.y):
+            raise ValueError("names x or y alone; give both, or neither")
+        if seconds_of(self.timeout) < 1:
+            raise ValueError("timeout must be one second or more")
+        return self
+
+    @property
+    def position(self) -> tuple[str, str] | None:
+        """The fields with x and y, or ``None`` if its entities have no position."""
+        return (self.x, self.y) if self.x and self.y else POSITIONS.get(self.type)
+
+
+CONDITIONS = ("near", "together", "count", "threshold", "schedule")
+
+
+class Rule(CamelModel):
+    """A condition, and what is demanded while it holds.
+
+    ``entities`` limits it to entities whose names match. The condition must hold for ``dwell``
+    before anything is demanded. A refused demand is sent again after ``retry``. A
+    ``deploymentRequest`` is repeated every ``renew``, for domains where it has a lease.
+    """
+
+    name: DnsLabel
+    entities: Patterns = ("*",)
+    near: Near | None = None
+    together: Together | None = None
+    count: Count | None = None
+    threshold: Threshold | None = None
+    schedule: Hours | None = None
+    dwell: Duration = "0s"
+    demand: dict[str, Any] | None = None
+    deployment_request: dict[str, Any] | None = None
+    retry: Duration = "30s"
+    renew: Duration | None = None
+
+    @model_validator(mode="after")
+    def _has_one_condition_and_one_demand(self) -> Rule:
+        given = [name for name in CONDITIONS if getattr(self, name) is not None]
+        if len(given) != 1:
+            listed = f"; it has {', '.join(given)}" if given else ""
+            raise ValueError(f"needs one of {', '.join(CONDITIONS)}{listed}")
+        if (self.demand is None) == (self.deployment_request is None):
+            raise ValueError("needs either demand or deploymentRequest")
+        if self.renew and self.demand is not None:
+            raise ValueError("renew is for a deploymentRequest; a demand is renewed by its lease")
+        if seconds_of(self.retry) < 1 or (self.renew and seconds_of(self.renew) < 1):
+            raise ValueError("retry and renew must be one second or more")
+        return self
+
+    @property
+    def condition(self) -> Near | Together | Count | Threshold | Hours:
+        """Its only condition."""
+        found = self.near or self.together or self.count or self.threshold or self.schedule
+        assert found is not None  # noqa: S101 - validated above
+        return found
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The sources that its condition reads: none, one, or two for ``together``."""
+        named = (getattr(self.condition, name, None) for name in ("source", "other"))
+        return tuple(name for name in named if name)
+
+    @property
+    def subjects(self) -> tuple[str, ...]:
+        """The names of the entities that an event of the rule is about."""
+        if self.together is not None:
+            return ("entity", "other")
+        return () if self.count or self.schedule else ("entity",)
+
+    @property
+    def momentary(self) -> frozenset[str]:
+        """The names of values that an event has only when it starts, like ``distance``."""
+        if self.near is not None or self.together is not None:
+            return frozenset(("x", "y", "distance"))
+        return frozenset({"value"} if self.threshold else {"count"} if self.count else ())
+
+    @property
+    def template(self) -> RuleDemand:
+        """The template of its demand or deploymentRequest."""
+        if self.demand is not None:
+            return RuleDemand("demand", self.demand)
+        return RuleDemand("deployment_request", self.deployment_request or {})
+
+    def is_for(self, *entities: str) -> bool:
+        """Return whether the rule is for an event about these entities.
+
+        In a pair from two sources, ``entities`` limits only the entity of the first source.
+        """
+        limited = entities[:1] if self.together and self.together.other else entities
+        return all(matches(entity, self.entities) for entity in limited)
+
+
+class RuleFile(FileModel):
+    """Sources by name, and the rules that read them."""
+
+    kind: Literal["DetectorRules"]
+    sources: dict[DnsLabel, Source] = Field(default_factory=dict)
+    rules: Items[Rule]
+
+
+def read(text: str, file: str) -> RuleFile:
+    """Return the rules in the text of a file.
+
+    Raises:
+        InvalidInput: with every fault; each has its line.
+    """
+    with located_in(text):
+        rules = parse_file(RuleFile, text, file)
+        if found := list(_faults(rules)):
+            raise InvalidInput(one.within(file) for one in found)
+    return rules
+
+
+def _faults(rules: RuleFile) -> Iterator[Fault]:
+    seen: set[str] = set()
+    for index, rule in enumerate(rules.rules):
+        where = f"rules[{index}]"
+        if rule.name in seen:
+            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule a name")
+        seen.add(rule.name)
+        kind = next(name for name in CONDITIONS if getattr(rule, name) is not None)
+        for part in ("source", "other"):
+            name = getattr(rule.condition, part, None)
+            if name is not None and name not in rules.sources:
+                known = suggestion(name, rules.sources)
+                yield fault(f"{where}.{kind}.{part}", f"'{name}' is not in sources{known}")
+            elif name is not None and kind != "threshold" and not rules.sources[name].position:
+                message = f"'{name}' has no position; name its fields in sources.{name}.x and y"
+                yield fault(f"{where}.{kind}.{part}", message)
+        field = "demand" if rule.demand is not None else "deploymentRequest"
+        yield from faults_of_demand(
+            rule.template, f"{where}.{field}", rule.subjects, rule.momentary
+        )

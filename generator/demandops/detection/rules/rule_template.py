@@ -1,0 +1,101 @@
+"""The template of a rule's demand: plain data in whose texts ``{entity}`` stands for a value.
+
+Values are put in after parsing, so a value cannot change the structure of the demand. A text that
+is only a name in braces becomes the value itself: a number for ``{x}``. ``{{`` and ``}}`` stand
+for braces. A template has no expressions, attributes or formats.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from demandops.errors import Fault, fault, suggestion
+
+Values = Mapping[str, str | float]
+"""The values of the names in a template."""
+
+_TOKEN = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
+_ENTITY = r"[A-Za-z0-9_.-]+"
+"""What an entity may be called."""
+
+
+def is_entity(name: str) -> bool:
+    """Return whether text can be the name of an entity."""
+    return bool(re.fullmatch(_ENTITY, name))
+
+
+def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
+    """Return a template with values for its names.
+
+    Raises:
+        KeyError: for a name that has no value; :func:`faults` finds it before.
+    """
+    if isinstance(template, str):
+        alone = _TOKEN.fullmatch(template)
+        if alone and alone[1] is not None:
+            return values[alone[1]]
+        return _TOKEN.sub(lambda found: _written(found, values), template)
+    if isinstance(template, Mapping):
+        return {filled_text(key, values): filled(value, values) for key, value in template.items()}
+    if isinstance(template, list | tuple):
+        return [filled(item, values) for item in template]
+    return template
+
+
+def filled_text(template: str, values: Values) -> str:
+    """Return a text with values for its names."""
+    return str(filled(template, values))
+
+
+def _written(found: re.Match[str], values: Values) -> str:
+    return str(values[found[1]]) if found[1] is not None else found[0][0]
+
+
+def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN401
+    """Yield the path and the text of each text and key in a template; ``field`` is its path."""
+    if isinstance(template, str):
+        yield field, template
+    elif isinstance(template, Mapping):
+        for key, value in template.items():
+            yield f"{field}.{key}", key
+            yield from texts(value, f"{field}.{key}")
+    elif isinstance(template, list | tuple):
+        for index, item in enumerate(template):
+            yield from texts(item, f"{field}[{index}]")
+
+
+def names(text: str) -> set[str]:
+    """Return the names in a text."""
+    return {found[1] for found in _TOKEN.finditer(text) if found[1] is not None}
+
+
+def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
+    """Return a fault for each brace that is alone, and for each name that is not ``known``."""
+    found = []
+    for path, text in texts(template, field):
+        for token in _TOKEN.finditer(text):
+            if token[0] in "{}":
+                message = f"has a single '{token[0]}'; write '{token[0] * 2}' for one brace"
+                found.append(fault(path, message))
+            elif token[1] is not None and token[1] not in known:
+                message = f"'{{{token[1]}}}' has no value in this rule"
+                found.append(fault(path, message + suggestion(token[1], known)))
+    return found
+
+
+def candidates(template: str, text: str) -> Mapping[str, str]:
+    """Return name → entity with which the template becomes ``text``; empty if none fits."""
+    seen: set[str] = set()
+    pattern, end = "", 0
+    for token in _TOKEN.finditer(template):
+        pattern += re.escape(template[end : token.start()])
+        end = token.end()
+        if token[1] is None:
+            pattern += re.escape(token[0][0])
+        else:
+            pattern += f"(?P={token[1]})" if token[1] in seen else f"(?P<{token[1]}>{_ENTITY})"
+            seen.add(token[1])
+    matched = re.fullmatch(pattern + re.escape(template[end:]), text)
+    return matched.groupdict() if matched else {}

@@ -1,0 +1,42 @@
+"""Schedules: the days and hours at which a rule's demand is wanted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, time, timedelta, tzinfo
+
+DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """A span of hours on some days of the week; past midnight if ``end`` is before ``start``."""
+
+    days: frozenset[int]
+    start: time
+    end: time
+    zone: tzinfo
+
+    def is_on(self, now: float) -> bool:
+        """Return whether ``now``, in seconds since 1970 UTC, is in its hours."""
+        local = datetime.fromtimestamp(now, self.zone)
+        clock, today = local.time(), local.weekday()
+        if self.start < self.end:
+            return today in self.days and self.start <= clock < self.end
+        yesterday = (today - 1) % 7
+        return (today in self.days and clock >= self.start) or (
+            yesterday in self.days and clock < self.end
+        )
+
+    def next_check(self, now: float) -> float:
+        """Return a time before which nothing changes; it is later than ``now``.
+
+        It is at most an hour ahead, because summer time moves the hours.
+        """
+        local = datetime.fromtimestamp(now, self.zone)
+        ahead = [now + 3600.0]
+        for day in (0, 1):
+            for at in (self.start, self.end):
+                date = local.date() + timedelta(days=day)
+                ahead.append(datetime.combine(date, at, self.zone).timestamp())
+        return min(moment for moment in ahead if moment > now)

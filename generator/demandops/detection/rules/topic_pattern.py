@@ -1,0 +1,26 @@
+"""Patterns of topics with the name of an entity in them: ``/vehicles/{entity}/pose``."""
+
+from __future__ import annotations
+
+import re
+
+from demandops.identifiers import topic_problem
+
+ENTITY = "{entity}"
+_PART = r"(?P<entity>[A-Za-z0-9_]+)"
+
+
+def topic_pattern_problem(pattern: str) -> str:
+    """Return why a text is not a pattern of topics, or an empty string."""
+    if pattern.count(ENTITY) > 1:
+        return "has {entity} twice; name the entity once"
+    return topic_problem(pattern.replace(ENTITY, "entity"))
+
+
+def entity_in(pattern: str, topic: str) -> str | None:
+    """Return the entity in a topic, "" if the pattern has none, ``None`` if they do not match."""
+    before, found, after = pattern.partition(ENTITY)
+    if not found:
+        return "" if topic == pattern else None
+    matched = re.fullmatch(f"{re.escape(before)}{_PART}{re.escape(after)}", topic)
+    return matched["entity"] if matched else None

@@ -1,0 +1,175 @@
+"""Which demands are wanted, which are held, and which goal to send next.
+
+It sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the outcome.
+Each event has at most one goal under way. If an event ends before its demand was sent, nothing is
+sent for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from heapq import heappop, heappush
+from math import inf
+from typing import Literal
+
+from demandops.detection.detector import Want
+from demandops.detection.events.detection_state import Key
+from demandops.detection.rules.rule_demand import Goal
+
+Purpose = Literal["start", "renew", "end"]
+
+_RENEW_AFTER = 1 / 3
+"""The part of a lease after which it is renewed; two more attempts fit before its end."""
+_RETRY_S = 5.0
+_NOT_SENT = frozenset({"no-server", "rejected"})
+"""The codes of goals that the node did not accept."""
+_UNKNOWN = "timeout"
+"""The code of a goal whose outcome is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sending:
+    """A goal to send for an event."""
+
+    key: Key
+    purpose: Purpose
+    goal: Goal
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The answer to a goal: an empty code if it succeeded. ``lease_s`` is 0 without a lease."""
+
+    code: str = ""
+    message: str = ""
+    lease_s: float = 0.0
+
+
+@dataclass(slots=True)
+class _Entry:
+    """One event. ``held`` is the goal that the node has booked; ``is_sure`` unless it timed out."""
+
+    wanted: Goal | None = None
+    held: Goal | None = None
+    is_sure: bool = True
+    is_under_way: bool = False
+    not_before: float = -inf
+    renew_at: float = inf
+    retry_s: float = 30.0
+    renew_s: float = 0.0
+    refusal: str = ""
+
+    def next(self, now: float) -> tuple[Purpose, Goal] | None:
+        """Return the goal to send at ``now`` and its purpose, or ``None``."""
+        if self.is_under_way or now < self.not_before:
+            return None
+        if self.held is not None and (self.wanted is None or not self._replaces(self.held)):
+            return "end", self.held.ended()
+        if self.wanted is None:
+            return None
+        if self.wanted != self.held or not self.is_sure:
+            return "start", self.wanted
+        return ("renew", self.wanted.renewed()) if now >= self.renew_at else None
+
+    def _replaces(self, held: Goal) -> bool:
+        """Return whether the wanted goal changes the held demand in place, or is the same."""
+        assert self.wanted is not None  # noqa: S101 - asked for a wanted one only
+        is_put = self.wanted.action == held.action == "demand" and self.wanted.id == held.id
+        return is_put or self.wanted == held
+
+    def due(self) -> float:
+        """Return when :meth:`next` may have a goal to send."""
+        if self.is_under_way:
+            return inf
+        is_steady = self.wanted is not None and self.wanted == self.held and self.is_sure
+        return max(self.not_before, self.renew_at if is_steady else -inf)
+
+
+class WantedDemands:
+    """The demands of all events."""
+
+    def __init__(self) -> None:
+        self._entries: dict[Key, _Entry] = {}
+        self._queue: list[tuple[float, int, Key]] = []
+        self._number = 0
+
+    def want(self, want: Want) -> None:
+        """Record the goal that an event wants now, or that it wants none any longer."""
+        entry = self._entries.setdefault(want.key, _Entry())
+        entry.wanted, entry.not_before, entry.refusal = want.goal, -inf, ""
+        entry.retry_s, entry.renew_s = want.retry_s, want.renew_s
+        self._enqueue(want.key, entry)
+
+    def hold(self, key: Key, goal: Goal) -> None:
+        """Record that a demand was booked before the start; call :meth:`want` for it next.
+
+        It is renewed at once, to learn its lease.
+        """
+        entry = self._entries.setdefault(key, _Entry())
+        entry.held, entry.renew_at = goal, -inf
+        self._enqueue(key, entry)
+
+    def next(self, now: float) -> Sending | None:
+        """Return a goal to send now, or ``None``; it counts as under way until it is answered."""
+        while self._queue and self._queue[0][0] <= now:
+            _, _, key = heappop(self._queue)
+            entry = self._entries.get(key)
+            if entry is not None and (found := entry.next(now)):
+                entry.is_under_way = True
+                return Sending(key, *found)
+        return None
+
+    def next_at(self) -> float:
+        """Return when to call :meth:`next` again, if no event or answer comes earlier."""
+        return self._queue[0][0] if self._queue else inf
+
+    def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:
+        """Record the outcome of a goal; return a new problem for the log, else an empty text."""
+        entry = self._entries[sending.key]
+        entry.is_under_way = False
+        text = self._record(entry, sending, outcome, now)
+        self._enqueue(sending.key, entry)
+        return text
+
+    def _record(self, entry: _Entry, sending: Sending, outcome: Outcome, now: float) -> str:
+        is_over = outcome.code == "not-held" and sending.purpose != "start"
+        if outcome.code and not is_over:
+            if outcome.code == _UNKNOWN and sending.purpose == "start":
+                entry.held, entry.is_sure = sending.goal, False
+            is_away = outcome.code in {*_NOT_SENT, _UNKNOWN}
+            entry.not_before = now + (_RETRY_S if is_away else entry.retry_s)
+            is_new = outcome.message != entry.refusal
+            entry.refusal = outcome.message
+            return f"{outcome.message}" if is_new else ""
+        entry.refusal = ""
+        if sending.purpose == "end" or is_over:
+            entry.held, entry.is_sure = None, True
+            return ""
+        if sending.purpose == "start":
+            entry.held, entry.is_sure = sending.goal, True
+        pause = outcome.lease_s * _RENEW_AFTER or entry.renew_s
+        entry.renew_at = now + pause if pause else inf
+        return ""
+
+    def _enqueue(self, key: Key, entry: _Entry) -> None:
+        if entry.wanted is None and entry.held is None and not entry.is_under_way:
+            del self._entries[key]
+        elif (at := entry.due()) < inf:
+            self._number += 1
+            heappush(self._queue, (at, self._number, key))
+
+    # ---- for people ----
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def unanswered(self) -> int:
+        """Return how many events have a demand that is not yet booked or released as wanted."""
+        return sum(one.wanted != one.held or not one.is_sure for one in self._entries.values())
+
+    def refusals(self) -> Iterator[tuple[Key, str]]:
+        """Yield the events whose last goal failed, and why."""
+        for key, entry in self._entries.items():
+            if entry.refusal:
+                yield key, entry.refusal

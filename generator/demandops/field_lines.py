@@ -1,0 +1,76 @@
+"""On which lines of a file its fields are, so that a fault can name its line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from itertools import islice
+
+import yaml
+
+from demandops.errors import Fault, InvalidInput
+from demandops.strict_yaml import LOADER, load_all
+
+
+def lines(text: str, document: int = 0) -> dict[str, int]:
+    """Return the line of each field of a document, by its path: ``nodes[3].cluster``.
+
+    Without any, if :func:`load_all` does not take the text: the fault has its line.
+    """
+    found: dict[str, int] = {}
+    with suppress(InvalidInput, yaml.YAMLError):
+        for _ in load_all(text):
+            pass
+        nodes = yaml.compose_all(text, Loader=LOADER)
+        _add_lines(next(islice(nodes, document, None), None), "", found)
+    return found
+
+
+def _add_lines(node: yaml.Node | None, path: str, found: dict[str, int]) -> None:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            field = f"{path}.{key.value}" if path else str(key.value)
+            found[field] = key.start_mark.line + 1
+            _add_lines(value, field, found)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, item in enumerate(node.value):
+            found[f"{path}[{index}]"] = item.start_mark.line + 1
+            _add_lines(item, f"{path}[{index}]", found)
+
+
+class FieldLines:
+    """The lines of the fields of files, each of which is read once."""
+
+    def __init__(self, text_of: Callable[[str], str | None]) -> None:
+        """Look into the texts that ``text_of`` returns by file, None if there is none."""
+        self._text_of = text_of
+        self._known: dict[str, Mapping[str, int]] = {}
+
+    def of(self, file: str, field: str) -> int | None:
+        """Return the line of a field, or of the nearest part around it, if any is known."""
+        if field and file not in self._known:
+            self._known[file] = lines(self._text_of(file) or "")
+        return nearest(field, self._known.get(file, {}))
+
+
+def nearest(field: str, known: Mapping[str, int]) -> int | None:
+    """Return the line of a field, or of the nearest part around it."""
+    while field and field not in known:
+        field = field[: max(field.rfind("."), field.rfind("["), 0)]
+    return known[field] if field else None
+
+
+def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
+    """Return faults with their lines, as far as they can be told."""
+    known = FieldLines(text_of)
+    return [replace(one, line=one.line or known.of(one.file, one.field)) for one in faults]
+
+
+@contextmanager
+def located_in(text: str) -> Iterator[None]:
+    """Give the faults of a block, which are all of one text, their lines."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise InvalidInput(with_lines(error.faults, lambda _: text)) from None

@@ -1,0 +1,75 @@
+"""What a request changed in the ledger: claims before and after, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from demandops.demand.claim import Claim, ClaimKey
+from demandops.ledger.kept_replicas import Instance
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.recent_shutdowns import RecentShutdown
+from demandops.subject import Subject
+
+
+@dataclass(frozen=True, slots=True)
+class ClaimChange:
+    """One claim before and after: ``None`` before it is booked and after it is released."""
+
+    before: Claim | None
+    after: Claim | None
+
+    @property
+    def key(self) -> ClaimKey:
+        """The key of the changed claim."""
+        claim = self.after or self.before
+        assert claim is not None  # noqa: S101 - a change has at least one side
+        return claim.key
+
+    @property
+    def only_renews(self) -> bool:
+        """Whether the claim existed before and at most its lease changed."""
+        return bool(self.before and self.after and self.before.booked == self.after.booked)
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """The claims that a request changed.
+
+    ``not_held``: what a shutdown lists and nobody holds. ``shutdowns``: the digests of shutdowns
+    that the ledger now records or forgets. ``repeats``: the earlier shutdown that this one repeats.
+    ``kept``: the service instances whose kept replicas changed.
+    ``waiting``: the demands that begin or cease to wait.
+    """
+
+    claims: tuple[ClaimChange, ...] = ()
+    not_held: tuple[str, ...] = ()
+    shutdowns: tuple[str, ...] = ()
+    repeats: RecentShutdown | None = None
+    kept: tuple[Instance, ...] = ()
+    waiting: tuple[str, ...] = ()
+
+    def subjects(self) -> tuple[Subject, ...]:
+        """Return the subjects whose claims changed, each once."""
+        return tuple(dict.fromkeys(change.key.subject for change in self.claims))
+
+
+def changes_on(
+    before: Ledger, after: Ledger, subjects: Iterable[Subject]
+) -> tuple[ClaimChange, ...]:
+    """Return the claims on these subjects that differ between two ledgers."""
+    claims = (
+        claim
+        for subject in subjects
+        for ledger in (before, after)
+        for claim in ledger.claims_on(subject)
+    )
+    return claim_changes(before, after, (claim.key for claim in claims))
+
+
+def claim_changes(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> tuple[ClaimChange, ...]:
+    """Return the claims at ``keys`` that differ between two ledgers."""
+    changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
+    return tuple(change for change in changes if change.before != change.after)

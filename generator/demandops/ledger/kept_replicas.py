@@ -1,0 +1,172 @@
+"""Replicas that services keep for a while after the demands for them ended.
+
+A definition may name how long a service keeps them (``scaling.downAfter``). Then the service has
+the most replicas that its demands needed in that time. Each record is one file and names the
+numbers that are above the present need, each with its end: ``ledger/replicas/<hh>/<name>.yaml``.
+A service gets fewer replicas only by the commit that removes a number from the record, not when
+its end passes. So a replay gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from itertools import pairwise
+from typing import Literal, NamedTuple, TypeAlias
+
+from pydantic import Field
+from rpds import HashTrieMap, HashTrieSet
+
+from demandops import strict_yaml
+from demandops.config.base_model import FrozenModel, parse_file
+from demandops.errors import InvalidInput
+from demandops.ledger.claim_file import (
+    LEDGER_ROOT,
+    Timestamp,
+    format_timestamp,
+    parse_timestamp,
+    segment,
+)
+from demandops.settings import LEDGER_API_VERSION
+
+REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
+
+Instance: TypeAlias = "tuple[str, ...]"
+"""A service instance: ``replicas``, then its :data:`_FIELDS`."""
+
+_FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
+
+
+class Kept(NamedTuple):
+    """A number of replicas that a service has at least, until ``until``."""
+
+    replicas: int
+    until: datetime
+
+
+Steps: TypeAlias = "tuple[Kept, ...]"
+"""What one service keeps; each step has fewer replicas, and lasts longer, than the one before."""
+
+
+def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
+    """Return the steps that a service keeps after the need of its demands changed.
+
+    Args:
+        steps: what it kept before.
+        needed, was_needed: the replicas that its demands need now and needed before.
+        now, until: the time, and until when it keeps what was needed.
+    """
+    if was_needed > needed:
+        steps = (*(one for one in steps if one.replicas > was_needed), Kept(was_needed, until))
+    left: list[Kept] = []
+    for one in steps:
+        # the clock may have been set back, so a later step may end first
+        if one.replicas > needed and one.until > (left[-1].until if left else now):
+            left.append(one)
+    return tuple(left)
+
+
+def _minute(moment: datetime) -> str:
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+
+
+@dataclass(frozen=True, slots=True)
+class KeptReplicas:
+    """The steps of each instance, and the instances by the minute in which a first step ends."""
+
+    steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
+    by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
+
+    def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
+        """Return the records with these steps of an instance; without steps, with no record."""
+        known = self.steps.get(instance) or ()
+        if known == steps:
+            return self
+        all_steps, by_minute = self.steps, self.by_minute
+        if known:
+            minute = _minute(known[0].until)
+            left = by_minute[minute].remove(instance)
+            by_minute = by_minute.insert(minute, left) if left else by_minute.remove(minute)
+            all_steps = all_steps.remove(instance)
+        if steps:
+            minute = _minute(steps[0].until)
+            others = by_minute.get(minute) or HashTrieSet()
+            by_minute = by_minute.insert(minute, others.insert(instance))
+            all_steps = all_steps.insert(instance, steps)
+        return KeptReplicas(all_steps, by_minute)
+
+    def due(self, now: datetime) -> list[Instance]:
+        """Return the instances with a step that has ended, sorted."""
+        minutes = [minute for minute in self.by_minute if minute <= _minute(now)]
+        instances = (one for minute in minutes for one in self.by_minute[minute])
+        return sorted(one for one in instances if self.steps[one][0].until <= now)
+
+    def next_end(self) -> datetime | None:
+        """Return when the first step ends, or ``None`` if there is no record."""
+        if not self.by_minute:
+            return None
+        return min(self.steps[one][0].until for one in self.by_minute[min(self.by_minute)])
+
+
+def path_of(instance: Instance) -> str:
+    """Return the path of an instance's file."""
+    exact = json.dumps(instance[1:], ensure_ascii=True)
+    fan = hashlib.sha256(exact.encode()).hexdigest()[:2]
+    return f"{REPLICAS_ROOT}/{fan}/{segment(exact)}.yaml"
+
+
+def text_of(instance: Instance, steps: Steps) -> str:
+    """Return the text of an instance's file."""
+    named = zip(_FIELDS, instance[1:], strict=True)
+    return strict_yaml.dump(
+        {
+            "apiVersion": LEDGER_API_VERSION,
+            "kind": "KeptReplicas",
+            **{name: value for name, value in named if value},
+            "keeps": [
+                {"replicas": one.replicas, "until": format_timestamp(one.until)} for one in steps
+            ],
+        }
+    )
+
+
+class _Kept(FrozenModel):
+    replicas: int = Field(ge=1, le=1000)
+    until: Timestamp
+
+
+class _KeptReplicasFile(FrozenModel):
+    apiVersion: Literal["demandops.ledger/v2"]
+    kind: Literal["KeptReplicas"]
+    service: str
+    node: str
+    application: str = ""
+    source: str = ""
+    topic: str = ""
+    version: str = ""
+    scope: Literal["", "cluster"] = ""
+    keeps: tuple[_Kept, ...] = Field(min_length=1, strict=False)
+
+
+def read(text: str, path: str) -> tuple[Instance, Steps] | None:
+    """Return the record in a file, or ``None`` if the file is not valid."""
+    try:
+        file = parse_file(_KeptReplicasFile, text, path)
+    except InvalidInput:
+        return None
+    instance = ("replicas", *(getattr(file, name) for name in _FIELDS))
+    steps = tuple(Kept(one.replicas, parse_timestamp(one.until)) for one in file.keeps)
+    falls = all(a.replicas > b.replicas and a.until < b.until for a, b in pairwise(steps))
+    return (instance, steps) if falls and path == path_of(instance) else None
+
+
+def read_all(files: Mapping[str, str]) -> KeptReplicas:
+    """Return the records in these files, path → text."""
+    kept = KeptReplicas()
+    for path, text in files.items():
+        if record := read(text, path):
+            kept = kept.replace(*record)
+    return kept

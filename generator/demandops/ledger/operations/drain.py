@@ -1,0 +1,35 @@
+"""A drain: moves placed applications, with their connections, off a node that is drained.
+
+The generator requests it. :mod:`demandops.plan.nodes.relocation` works out the claims that change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from demandops.demand.demand_request import DemandRequest
+from demandops.ledger.claim_changes import Changes, ClaimChange, claim_changes
+from demandops.ledger.ledger import Ledger
+
+
+@dataclass(frozen=True, slots=True)
+class Drain(DemandRequest):
+    """The generator moves applications that it placed off the drained node ``id``.
+
+    ``moves`` are the changes of claims, ``moved`` says what is placed where, ``stays`` what is not
+    moved and why.
+    """
+
+    moves: tuple[ClaimChange, ...] = ()
+    moved: tuple[str, ...] = ()
+    stays: tuple[str, ...] = ()
+
+    operation = "drain"
+
+
+def drain(ledger: Ledger, request: Drain) -> tuple[Ledger, Changes]:
+    """Return the ledger with the moved claims, and the changes."""
+    start = ledger
+    for move in request.moves:
+        ledger = ledger.replace(move.key, move.after)
+    return ledger, Changes(claims=claim_changes(start, ledger, [m.key for m in request.moves]))

@@ -1,0 +1,127 @@
+"""Waiting demands: those that no node has room for, kept until one has.
+
+A waiting demand holds nothing. When room may be free, the generator decides waiting demands again:
+those of the highest priority first, and among these the one that came first. A demand that still
+does not fit does not hold up the others.
+
+Each is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal, TypeAlias
+
+from pydantic import Field
+from rpds import HashTrieMap
+
+from demandops import strict_yaml
+from demandops.config.base_model import FrozenModel, parse_file
+from demandops.demand.demand_request import DemandRequest
+from demandops.errors import InvalidInput
+from demandops.ledger.claim_file import (
+    LEDGER_ROOT,
+    Timestamp,
+    format_timestamp,
+    parse_timestamp,
+    segment,
+)
+from demandops.settings import LEDGER_API_VERSION
+
+WAITING_ROOT = f"{LEDGER_ROOT}/waiting"
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingDemand:
+    """A demand that waits, its goal as plain data, and when it was received first."""
+
+    demand: str
+    request: str
+    requesters: tuple[str, ...]
+    since: datetime
+    priority: int
+    goal: Mapping[str, Any]
+
+    @property
+    def turn(self) -> tuple[int, datetime, str]:
+        """The key by which waiting demands are sorted: the lowest is tried first."""
+        return -self.priority, self.since, self.demand
+
+
+WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
+"""The waiting demands by their ids."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wait(DemandRequest):
+    """The request of a demand that must wait; ``reasons`` say why."""
+
+    waiting: WaitingDemand | None = None
+    reasons: tuple[str, ...] = ()
+
+    operation = "wait"
+
+
+def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
+    """Return the demands in the order in which they are tried."""
+    return sorted(waiting.values(), key=lambda one: one.turn)
+
+
+def path_of(demand: str) -> str:
+    """Return the path of a waiting demand's file."""
+    fan = hashlib.sha256(demand.encode()).hexdigest()[:2]
+    return f"{WAITING_ROOT}/{fan}/{segment(demand)}.yaml"
+
+
+def text_of(waiting: WaitingDemand) -> str:
+    """Return the text of a waiting demand's file."""
+    return strict_yaml.dump(
+        {
+            "apiVersion": LEDGER_API_VERSION,
+            "kind": "WaitingDemand",
+            "demand": waiting.demand,
+            "request": waiting.request,
+            "requesters": list(waiting.requesters),
+            "since": format_timestamp(waiting.since),
+            "priority": waiting.priority,
+            "goal": dict(waiting.goal),
+        }
+    )
+
+
+class _WaitingFile(FrozenModel):
+    apiVersion: Literal["demandops.ledger/v2"]
+    kind: Literal["WaitingDemand"]
+    demand: str = Field(min_length=1)
+    request: str
+    requesters: tuple[str, ...] = Field(min_length=1, strict=False)
+    since: Timestamp
+    priority: int = 0
+    goal: dict[str, Any]
+
+
+def read(text: str, path: str) -> WaitingDemand | None:
+    """Return the demand in a file; ``None`` if the file is not valid, so that it is ignored."""
+    try:
+        file = parse_file(_WaitingFile, text, path)
+    except InvalidInput:
+        return None
+    since = parse_timestamp(file.since)
+    found = WaitingDemand(
+        file.demand, file.request, file.requesters, since, file.priority, file.goal
+    )
+    return found if path == path_of(file.demand) else None
+
+
+def read_all(files: Mapping[str, str]) -> WaitingDemands:
+    """Return the waiting demands in these files, path → text."""
+    found = (one for path, text in files.items() if (one := read(text, path)))
+    return HashTrieMap({one.demand: one for one in found})
+
+
+def of_requester(waiting: WaitingDemands, requester: str) -> Iterator[WaitingDemand]:
+    """Yield the demands that wait for a requester alone."""
+    return (one for one in waiting.values() if one.requesters == (requester,))

@@ -1,0 +1,1 @@
+"""Nodes: what runs where: the choice, its capacity, and moves to other nodes."""

@@ -1,0 +1,244 @@
+"""Capacity: how much the running services request of each node, and whether the node has it.
+
+Each replica of a service requests what the definition says, on the node where it runs. A shared
+service counts once. A change of :class:`Usage` looks only at the releases that a demand affects, so
+a demand costs what it changes. Communication clients request nothing.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from rpds import HashTrieMap
+
+from demandops.config.config import NODES_FILE, Config
+from demandops.config.inventory import Node, amount_of, amount_text
+from demandops.demand.claim import Claim
+from demandops.errors import Fault, Refused, fault
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.world import World
+from demandops.plan.planner import plan
+from demandops.plan.release import Release, ServiceKey, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey, affected_keys, keys_of, keys_of_claims
+from demandops.plan.replicas import most_replicas
+from demandops.subject import Subject, SubjectKind
+
+Need = tuple[str, str]
+"""A node and a resource."""
+Plans = Mapping[ReleaseKey, Release | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """How much services request of each node and resource, in thousandths."""
+
+    amounts: HashTrieMap[Need, int] = field(default_factory=HashTrieMap)
+
+    def of(self, node: str, resource: str) -> int:
+        """Return how much services request of a node's resource."""
+        return self.amounts.get((node, resource)) or 0
+
+    def plus(self, more: Mapping[Need, int]) -> Usage:
+        """Return the usage with these amounts added; negative ones are given back."""
+        amounts = self.amounts
+        for need, amount in more.items():
+            total = (amounts.get(need) or 0) + amount
+            amounts = amounts.insert(need, total) if total else amounts.discard(need)
+        return Usage(amounts)
+
+
+def whole_usage(world: World) -> Usage:
+    """Return what all services request; empty without planning if no node has a capacity."""
+    if not world.config.limits_capacity:
+        return Usage()
+    keys: dict[ReleaseKey, None] = {}
+    for subject in world.ledger.claims:
+        if subject.kind is SubjectKind.APPLICATION:
+            keys |= dict.fromkeys(keys_of(world, subject))
+    return Usage().plus(_requests(_plan_leniently(world, keys), world.config))
+
+
+def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
+    """Return how much more is requested ``after``, for each node and resource that differs."""
+    change = _requests(after, config)
+    change.subtract(_requests(before, config))
+    return {need: amount for need, amount in change.items() if amount}
+
+
+def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
+    """Return how much more is requested after claims changed.
+
+    A release that cannot be planned requests nothing.
+
+    Raises:
+        Refused: if an application definition that ``after`` needs is missing.
+    """
+    if not after.config.limits_capacity:
+        return {}
+    keys = affected_keys(before, after, changes)
+    planned = _plan_leniently(before, keys), _plan_leniently(after, keys)
+    return growth(*planned, after.config)
+
+
+def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
+    planned: dict[ReleaseKey, Release | None] = {}
+    for key in keys:
+        try:
+            planned[key] = plan(world, key)
+        except Refused:
+            planned[key] = None
+    return planned
+
+
+def _requests(plans: Plans, config: Config) -> Counter[Need]:
+    """Return what releases request of each node, added up over its access domains."""
+    total: Counter[Need] = Counter()
+    for release in plans.values():
+        if isinstance(release, ServiceRelease) and release.service.requests:
+            replicas = most_replicas(release.replicas)
+            for resource, quantity in release.service.requests.items():
+                total[config.host_of(release.node.id), resource] += amount_of(quantity) * replicas
+    return total
+
+
+def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
+    """Yield each node that lacks room for the growth, and a sentence that says why.
+
+    A node that is above its capacity, but whose requests do not grow, is left out.
+
+    Args:
+        usage: what is requested before the growth.
+        grown: by how much the requests grow.
+        config: has the nodes.
+    """
+    for (id, resource), amount in sorted(grown.items()):
+        known = config.nodes.get(id)
+        most = known.most(resource) if known else None
+        used = usage.of(id, resource)
+        if most is None or amount <= 0 or used + amount <= most:
+            continue
+        free, all_of_it = (amount_text(each, resource) for each in (max(most - used, 0), most))
+        asked = amount_text(amount, resource)
+        yield id, f"has {free} of {all_of_it} {resource} free, but {asked} is asked for"
+
+
+def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[Fault]:
+    """Yield a fault for each capacity that would be exceeded; see :func:`excesses`."""
+    for node, excess in excesses(usage, grown, config):
+        message = (
+            f"'{node}' {excess}; choose another node, release something first, or have "
+            f"{config.place_of(NODES_FILE)} changed"
+        )
+        yield fault("", message, code="capacity")
+
+
+class Room:
+    """The room that nodes have left while applications are placed one by one.
+
+    The claims in ``given_back`` count as released from the start.
+    """
+
+    def __init__(self, world: World, usage: Usage, given_back: Iterable[Claim]) -> None:
+        self._world, self._usage = world, usage
+        self._own: dict[tuple[Subject, str], dict[str, int]] = {}
+        self.soon: Counter[str] = Counter()
+        """How many applications were placed on each node."""
+        self._change((one for one in given_back if one.is_on_application), give_back=True)
+
+    def take(self, claim: Claim) -> None:
+        """Book a claim on an application at its node, and count the application there."""
+        self.soon[claim.application.node] += 1
+        self.book([claim])
+
+    def book(self, claims: Iterable[Claim]) -> None:
+        """Book claims on applications at their nodes."""
+        self._change(claims)
+
+    def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
+        """Return which resources a node lacks for an application with these claims, in words.
+
+        If ``service`` names one, only that service is placed there.
+        """
+        known = self._world.config.nodes.get(node)
+        if known is None or known.capacity is None:
+            return []
+        claims, host = list(claims), self._world.config.host_of(node)
+        least = {(host, resource): most for resource, most in self.least(claims, service).items()}
+        short = [excess for _, excess in excesses(self._usage, least, self._world.config)]
+        if short:
+            return short
+        _, grown = self._after(claims)
+        found = excesses(self._usage, grown, self._world.config)
+        return [excess for id, excess in found if id == host]
+
+    def is_full(self, node: Node, least: Mapping[str, int]) -> bool:
+        """Return whether a node has too little for what :meth:`least` returns."""
+        host = self._world.config.host_of(node.id)
+        return any(
+            most is not None and self._usage.of(host, resource) + amount > most
+            for resource, amount in least.items()
+            for most in [node.most(resource)]
+        )
+
+    def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
+        """Return what an application's own services request, which is the same on each node.
+
+        It shows that a node is full without planning all services there. It is empty if there are
+        overrides whose effects may differ by node.
+        """
+        subject, world = claims[0].subject, self._world
+        if any(one.node or one.deny or one.replicas is not None for one in world.overrides):
+            return {}
+        if (subject, service) not in self._own:
+            after, _ = self._booked(claims)
+            apart = claims[0].application.services
+            keys = [
+                key
+                for key in keys_of_claims(after, claims)
+                if isinstance(key, ServiceKey)
+                and key.application is not None
+                and (key.service == service if service else key.service not in apart)
+            ]
+            total: Counter[str] = Counter()
+            own = _requests(_plan_leniently(after, keys), after.config)
+            for (_, resource), amount in own.items():
+                total[resource] += amount
+            self._own[subject, service] = dict(total)
+        return self._own[subject, service]
+
+    def _change(self, claims: Iterable[Claim], *, give_back: bool = False) -> None:
+        if self._world.config.limits_capacity:
+            self._world, grown = self._after(claims, give_back=give_back)
+            self._usage = self._usage.plus(grown)
+
+    def _booked(
+        self, claims: Iterable[Claim], *, give_back: bool = False
+    ) -> tuple[World, list[ClaimChange]]:
+        ledger, changes = self._world.ledger, list[ClaimChange]()
+        for claim in claims:
+            change = ClaimChange(ledger.get(claim.key), None if give_back else claim)
+            ledger = ledger.replace(claim.key, change.after)
+            changes.append(change)
+        return replace(self._world, ledger=ledger), changes
+
+    def _after(
+        self, claims: Iterable[Claim], *, give_back: bool = False
+    ) -> tuple[World, Mapping[Need, int]]:
+        """Return the world with these claims (or without them), and the growth of requests."""
+        after, changes = self._booked(claims, give_back=give_back)
+        try:
+            return after, growth_by(self._world, after, changes)
+        except Refused:  # admission reports why it cannot run
+            return after, {}
+
+
+def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
+    """Yield each node on which services request more than it has, and the amounts in words."""
+    for (id, resource), used in sorted(usage.amounts.items()):
+        node = world.config.nodes.get(id)
+        most = node.most(resource) if node else None
+        if node and most is not None and used > most:
+            used_text, most_text = amount_text(used, resource), amount_text(most, resource)
+            yield node, f"services request {used_text} {resource} of {most_text}"

@@ -1,0 +1,255 @@
+"""The choice of one node: for an application, or for one of its services.
+
+A service that its definition places gets a node of its own: that of its application if it fits,
+else the first of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from math import fsum, inf
+from types import MappingProxyType
+
+from demandops.config.appdef import Place, Service
+from demandops.config.config import NODES_FILE, Config
+from demandops.config.inventory import Node, Position
+from demandops.demand import permission
+from demandops.demand.application import Application, Requirement
+from demandops.demand.claim import Claim
+from demandops.demand.demand_request import Demanded
+from demandops.errors import Fault, suggestion
+from demandops.ledger.world import World
+from demandops.plan.nodes.capacity import Room
+from demandops.plan.overrides.claim_overrides import moved_by_overrides
+from demandops.quoting import quoted
+
+_MOST_SHOWN = 5
+NO_ROOM = "no-room"
+"""The code of a fault: there are suitable nodes for an application, but none has room."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A node, and why it is this one, for people."""
+
+    node: str
+    why: str
+
+
+Positions = Mapping[str, Position]
+"""Where nodes are that have no position in the inventory."""
+
+
+def requirement_of(service: Service) -> Requirement:
+    """Return what a service that its definition places requires of its node."""
+    place = service.place or Place()
+    return Requirement(
+        place.role, tuple(sorted(place.labels.items())), tuple(sorted({*place.capabilities}))
+    )
+
+
+def on_node(app: Application, node: str, service: Service | None, world: World) -> Application:
+    """Return an application on a node, or with one of its services there."""
+    if service is None:
+        app = replace(app, node=node)
+    else:
+        app = replace(app, services=MappingProxyType({**app.services, service.name: node}))
+    return with_overridden_nodes(app, world)
+
+
+def with_overridden_nodes(app: Application, world: World) -> Application:
+    """Return an application with its services where overrides move them."""
+    return replace(app, moved=MappingProxyType(moved_by_overrides(app, world)))
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The choice of the node of one application, or of one of its services.
+
+    ``claims`` are the claims to book for it; their node does not matter.
+    """
+
+    one: Demanded
+    requirement: Requirement
+    world: World
+    room: Room
+    claims: tuple[Claim, ...]
+    service: Service | None = None
+
+    @property
+    def config(self) -> Config:
+        """The configuration."""
+        return self.world.config
+
+    @property
+    def app(self) -> Application:
+        """The application."""
+        assert isinstance(self.one.held, Application)  # noqa: S101 - only these are placed
+        return self.one.held
+
+    def fits(self, node: str) -> bool:
+        """Return whether a node has what is required, and new services may be placed there."""
+        known = self.config.nodes.get(node)
+        if known is None or any(lacks(known, self.requirement)):
+            return False
+        return not self._closed(known) and self._is_permitted(known)
+
+    def candidates(self, positions: Positions) -> Iterator[Chosen]:
+        """Yield the nodes that fit and have room, the best first."""
+        fitting = self._fitting()
+        centre = self._centre(positions)
+        fitting.sort(key=lambda node: self._rank(node, centre, positions))
+        skipped: dict[str, None] = {}
+        least: Mapping[str, int] | None = None
+        for node in fitting:
+            if node.capacity is not None and least is None:
+                least = self.room.least(self._claims_on(node), self._name)
+            if node.capacity is not None and self.room.is_full(node, least or {}):
+                skipped["that has room"] = None
+            elif not self._is_permitted(node):
+                skipped["that its requesters may use"] = None
+            elif self._shortage(node):
+                skipped["that has room"] = None
+            else:
+                merit = self._merit(node, centre, positions)
+                which = " ".join(filter(None, (merit, " and ".join(skipped))))
+                why = f"{which} of {len(fitting)} nodes that fit"
+                yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
+
+    def nodes(self) -> list[str]:
+        """Return the nodes that fit and that the requesters may use, whatever room they have."""
+        return [node.id for node in self._fitting() if self._is_permitted(node)]
+
+    def _fitting(self) -> list[Node]:
+        return [
+            node
+            for node in self.config.nodes_by_role.get(self.requirement.role, ())
+            if not any(lacks(node, self.requirement)) and not self._closed(node)
+        ]
+
+    def _shortage(self, node: Node) -> list[str]:
+        """Return which resources a node lacks for the application, in words."""
+        if node.capacity is None:
+            return []
+        return self.room.lacks(self._claims_on(node), node.id, self._name)
+
+    @property
+    def _name(self) -> str:
+        return self.service.name if self.service else ""
+
+    def _claims_on(self, node: Node) -> list[Claim]:
+        return [
+            replace(one, held=on_node(one.application, node.id, self.service, self.world))
+            for one in self.claims
+        ]
+
+    def _merit(self, node: Node, centre: Position | None, positions: Positions) -> str:
+        """Return why a node is the first choice, in words: ``the nearest to its sources``."""
+        if self._is_home(node):
+            return "the node of its application"
+        choose = self.config.repo_settings.placement
+        if choose == "nearest" and self._distance(node, centre, positions) < inf:
+            return "the nearest to its sources"
+        return f"with the {'most' if choose == 'pack' else 'fewest'} applications"
+
+    def _is_home(self, node: Node) -> bool:
+        """Return whether a service is placed, and this is the node of its application."""
+        return self.service is not None and node.id == self.app.node
+
+    def _rank(
+        self, node: Node, centre: Position | None, positions: Positions
+    ) -> tuple[bool, float, float, str]:
+        """Return a node's sort key: its distance and number of applications, then its id."""
+        distance = self._distance(node, centre, positions)
+        booked = self.world.ledger.applications_on.get(node.id) or 0
+        booked += self.room.soon[node.id]
+        away = not self._is_home(node)
+        match self.config.repo_settings.placement:
+            case "spread":
+                return away, booked, distance, node.id
+            case "pack":
+                return away, -booked, distance, node.id
+        return away, distance, booked, node.id
+
+    def _distance(self, node: Node, centre: Position | None, positions: Positions) -> float:
+        """Return a node's squared distance from ``centre``; infinity if either is unknown."""
+        position = self._position(node.id, positions)
+        if centre is None or position is None:
+            return inf
+        return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
+
+    def _centre(self, positions: Positions) -> Position | None:
+        """Return the middle of the sources whose position is known."""
+        sources = sorted({topic.source for _, topic in self.app.all_inputs()})
+        known = [found for source in sources if (found := self._position(source, positions))]
+        if not known:
+            return None
+        x, y = (fsum(getattr(one, axis) for one in known) / len(known) for axis in "xy")
+        return Position(x=x, y=y)
+
+    def _position(self, node: str, positions: Positions) -> Position | None:
+        """Return where a node is, by the inventory, else by the demand."""
+        listed = self.config.nodes.get(node)
+        return (listed.position if listed else None) or positions.get(node)
+
+    def _closed(self, node: Node) -> str:
+        """Return why a node accepts no application at all, or an empty text."""
+        if node.drained:
+            return "is drained"
+        return "" if node.id in self.config.domain_of else "is in no access domain"
+
+    def _is_permitted(self, node: Node) -> bool:
+        return permission.may_place(self.one, self.app.appdef, node.id, self.config)
+
+    def none_fits(self, positions: Positions) -> Fault:
+        """Return the fault for an application that gets no node; it lists the nearest misses."""
+        role, roles = self.requirement.role, self.config.nodes_by_role.keys() - {""}
+        if role and role not in roles:
+            message = f"no node has the role {quoted(role)}{suggestion(role, roles)}"
+            return self._fault(message, "no-node")
+        centre, code = self._centre(positions), "no-node"
+        misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
+        for node in self.config.nodes_by_role.get(role, ()):
+            missing = list(lacks(node, self.requirement))
+            reasons = [f"lacks {joined(missing)}"] if missing else []
+            reasons += filter(None, [self._closed(node)])
+            if not reasons and not self._is_permitted(node):
+                domain = self.config.domain_of[node.id].name
+                reasons.append(f"is in access domain '{domain}', which does not permit it")
+            elif not reasons:
+                reasons += self._shortage(node)
+                code = NO_ROOM
+            text = f"'{node.id}' {joined(reasons)}"
+            count = len(missing) + len(reasons) - bool(missing)
+            misses.append((count, self._rank(node, centre, positions), text))
+        shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
+        more = [f"{len(misses) - len(shown)} more do not"] if len(misses) > len(shown) else []
+        message = f"no node fits: {'; '.join([*shown, *more]) or 'there is none'}"
+        less = f"change place in {self.service.file}" if self.service else "ask for less"
+        message += f"; {less}, or have {self.config.place_of(NODES_FILE)} changed"
+        return self._fault(message, code)
+
+    def _fault(self, message: str, code: str) -> Fault:
+        if self.service is None:
+            return self.one.fault("place", message, code=code)
+        return self.one.fault("appdef", f"{self.service.name}: {message}", code=code)
+
+
+def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
+    """Yield each part of a requirement that a node does not meet."""
+    if requirement.role not in ("", node.type):
+        yield f"the role {quoted(requirement.role)}"
+    labels = node.labels() if requirement.labels else {}
+    for key, value in requirement.labels:
+        if labels.get(key) != value:
+            yield f"the label {quoted(f'{key}={value}')}"
+    for capability in requirement.capabilities:
+        if capability not in node.capabilities:
+            yield f"the capability {quoted(capability)}"
+
+
+def joined(reasons: list[str]) -> str:
+    """Return reasons as one text."""
+    *first, last = reasons
+    return f"{', '.join(first)} and {last}" if first else last

@@ -1,0 +1,250 @@
+"""Placement: the nodes of a demand's applications and services, where it does not name them.
+
+They are decided before the booking, by the configuration and the claims at that commit alone. The
+claim holds the nodes as if the demand had named them, so nothing after this knows the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import datetime, timezone
+from types import MappingProxyType
+
+from demandops.config.appdef import Service
+from demandops.demand import permission
+from demandops.demand.application import Application
+from demandops.demand.claim import Claim, demand_id
+from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
+from demandops.errors import Fault
+from demandops.ledger.world import World
+from demandops.plan.nodes.capacity import Room, Usage
+from demandops.plan.nodes.choice import (
+    Choice,
+    Chosen,
+    Positions,
+    joined,
+    lacks,
+    on_node,
+    requirement_of,
+    with_overridden_nodes,
+)
+from demandops.quoting import quoted
+
+_LAST = datetime.max.replace(tzinfo=timezone.utc)
+"""The booking time of a claim that is not booked yet: later than all others."""
+
+
+def with_chosen_nodes(
+    request: AnyRequest, world: World, usage: Usage
+) -> tuple[AnyRequest, list[Fault]]:
+    """Return the request with a node for each application and service that is to be placed.
+
+    What is booked stays where it is, if the node has what is required. Otherwise it gets one of the
+    nodes that fit and have room, the first by ``placement`` of the settings. Last, overrides move
+    services.
+
+    Args:
+        request: the request.
+        world: the claims and the configuration before it.
+        usage: how much services request of the nodes in ``world``.
+
+    Returns:
+        The request, and a fault for each application that gets no node.
+    """
+    if not request.adds_claims:
+        return request, []
+    faults: list[Fault] = []
+    apps = [one.held for one in request.demanded if isinstance(one.held, Application)]
+    if any(app.place or _services_to_place(app, world) for app in apps):
+        request, faults = _placed(request, world, usage)
+    demanded = (
+        replace(one, held=_overridden(one.held, world))
+        if isinstance(one.held, Application)
+        else one
+        for one in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded)), faults
+
+
+def _services_to_place(app: Application, world: World) -> list[Service]:
+    """Return the services of an application that get nodes of their own."""
+    return [one for one in world.config.services.get(app.appdef, {}).values() if one.place]
+
+
+def _overridden(app: Application, world: World) -> Application:
+    """Return an application with its services where overrides move them.
+
+    What is booked there stays as it is: only a changed override or definition moves it.
+    """
+    booked = world.ledger.application(app.id)
+    if booked is not None and replace(app, moved=booked.moved).decided_like(booked):
+        return replace(app, moved=booked.moved)
+    return with_overridden_nodes(app, world)
+
+
+def _placed(request: AnyRequest, world: World, usage: Usage) -> tuple[AnyRequest, list[Fault]]:
+    """Return the request with nodes, first of the applications, then of their services."""
+    ledger, faults = world.ledger, list[Fault]()
+    kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
+    room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept])
+    demanded = [_without_services(one, world) for one in request.demanded]
+    for one in demanded:
+        if isinstance(one.held, Application) and one.held.place is None:
+            room.take(_claim(request, one))
+    for index, one in enumerate(demanded):
+        if isinstance(one.held, Application) and one.held.place is not None:
+            choice = Choice(one, one.held.place, world, room, (_claim(request, one),))
+            placed = _with_node(request, one, choice)
+            if isinstance(placed, Fault):
+                faults.append(placed)
+            else:
+                demanded[index] = placed
+                room.take(_claim(request, placed))
+    for index, one in enumerate(demanded):
+        if isinstance(one.held, Application) and one.held.node:
+            demanded[index], more = _with_services(request, one, world, room)
+            faults += more
+    return replace(request, demanded=tuple(demanded)), faults
+
+
+def _without_services(one: Demanded, world: World) -> Demanded:
+    """Return an application whose services that get nodes of their own are nowhere yet."""
+    if not isinstance(one.held, Application):
+        return one
+    services = {service.name: "" for service in _services_to_place(one.held, world)}
+    return replace(one, held=replace(one.held, services=MappingProxyType(services)))
+
+
+def may_wait(request: DemandRequest, world: World) -> bool:
+    """Return whether a demand that lacks room may wait.
+
+    Each of its applications and services that is placed fits a node of a domain that lets it wait,
+    and needs no approval there: a person approves what is there to be booked.
+    """
+    return all(
+        any(_waits_for(node, request, choice) for node in choice.nodes())
+        for one in request.demanded
+        for choice in _choices(request, one, world)
+    )
+
+
+def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
+    config = choice.config
+    if config.domain_of[node].when_full != "wait":
+        return False
+    app = on_node(choice.app, node, choice.service, choice.world)
+    claim = _claim(request, replace(choice.one, held=app))
+    changes: list[tuple[Claim | None, Claim | None]] = [(None, claim)]
+    return not permission.approval_reasons(request, changes, config)
+
+
+def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Choice]:
+    """Yield the choices of nodes that a demanded application needs, with all room free."""
+    if not isinstance(one.held, Application):
+        return
+    free, claims = Room(world, Usage(), ()), (_claim(request, one),)
+    if one.held.place and not one.held.node:
+        yield Choice(one, one.held.place, world, free, claims)
+    for service in _services_to_place(one.held, world):
+        yield Choice(one, requirement_of(service), world, free, claims, service)
+
+
+def _claim(request: DemandRequest, one: Demanded) -> Claim:
+    """Return the claim that books an application, as if it were booked after all others."""
+    demand = request.demand or demand_id(request.id, one.requesters)
+    return Claim(one.held.booked(), demand, request.id, one.requesters, _LAST)
+
+
+def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demanded | Fault:
+    """Return a demanded application with its node, or why it gets none."""
+    app = choice.app
+    if app.node:
+        return _named(choice) or replace(one, held=replace(app, place=None))
+    found = _booked(choice, request.demand)
+    if found is None:
+        positions = _positions(request)
+        found = next(choice.candidates(positions), None) or choice.none_fits(positions)
+    if isinstance(found, Fault):
+        return found
+    placed = f"application '{app.id}' is placed on {quoted(found.node)}, {found.why}"
+    return replace(one, held=replace(app, node=found.node), placed=(placed,))
+
+
+def _positions(request: DemandRequest) -> Positions:
+    return request.positions if isinstance(request, Put) else {}
+
+
+def _named(choice: Choice) -> Fault | None:
+    """Return why the node that the demand names lacks what the demand requires as well."""
+    node = choice.config.nodes.get(choice.app.node)
+    lacking = list(lacks(node, choice.requirement)) if node else []  # admission reports no node
+    if not lacking:
+        return None
+    message = (
+        f"{quoted(choice.app.node)} lacks {joined(lacking)}; name another node, or leave out node "
+        "or place"
+    )
+    return choice.one.fault("place", message, code="no-node")
+
+
+def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
+    """Return the node where it is booked; ``None`` if ``demand`` may get another one."""
+    app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
+    if not claims:
+        return None
+    id = claims[0].application.node
+    node = choice.config.nodes.get(id)
+    stays = Chosen(id, "where it is booked already")
+    other = _of_another(claims, demand)
+    if other is None:
+        return stays if choice.fits(id) else None
+    lacking = list(lacks(node, choice.requirement)) if node else []
+    if not lacking:
+        return stays
+    message = (
+        f"'{app.id}' is held by {', '.join(other.requesters)} on '{id}', which "
+        f"lacks {joined(lacking)}; ask for what that node has, or use another application id"
+    )
+    return choice.one.fault("place", message, code="conflict")
+
+
+def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
+    """Return a claim of another demand; what an override keeps is nobody's."""
+    return next((c for c in claims if c.demand != demand and not c.keeping_override), None)
+
+
+def _with_services(
+    request: DemandRequest, one: Demanded, world: World, room: Room
+) -> tuple[Demanded, list[Fault]]:
+    """Return a demanded application with its services on nodes of their own, and what does not fit.
+
+    What others hold as well, or a join adds to, stays as it is booked.
+    """
+    app = one.held
+    assert isinstance(app, Application)  # noqa: S101 - the caller knows
+    claims, faults = world.ledger.claims_on(app.subject), list[Fault]()
+    first = claims[0].application if claims and claims[0].application.appdef == app.appdef else None
+    fixed = first if request.is_reference or _of_another(claims, request.demand) else None
+    if fixed is not None:
+        services = {name: node for name, node in fixed.services.items() if name in app.services}
+        one = replace(one, held=replace(app, services=MappingProxyType(services)))
+        room.book([_claim(request, one)])
+        return one, faults
+    for service in _services_to_place(app, world):
+        choice = Choice(one, requirement_of(service), world, room, (_claim(request, one),), service)
+        known = first.services.get(service.name, "") if first else ""
+        found: Chosen | Fault = Chosen(known, "where it is booked already")
+        if not choice.fits(known):
+            positions = _positions(request)
+            found = next(choice.candidates(positions), None) or choice.none_fits(positions)
+        if isinstance(found, Fault):
+            faults.append(found)
+            continue
+        text = f"service '{service.name}' of application '{app.id}' is placed on "
+        told = f"{text}{quoted(found.node)}, {found.why}"
+        held = on_node(choice.app, found.node, service, world)
+        one = replace(one, held=held, placed=(*one.placed, told))
+        room.soon[found.node] += 1
+        room.book([_claim(request, one)])
+    return one, faults

@@ -1,0 +1,274 @@
+"""Relocation: what was placed on a drained node, or is moved by an override, gets other nodes.
+
+Only what the generator placed leaves a drained node: a demand that names the node keeps it. What is
+required of the node is in the claims and definitions, so the demands are not needed. The
+connections follow (:mod:`demandops.plan.nodes.moved_connections`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+
+from demandops.config.appdef import Service
+from demandops.demand import admission, permission
+from demandops.demand.application import Requirement
+from demandops.demand.claim import Claim, ClaimKey, requesters_of
+from demandops.demand.demand_request import Demanded
+from demandops.errors import Fault
+from demandops.ledger.claim_changes import Changes, ClaimChange, claim_changes
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.operations.conflicts import conflicts
+from demandops.ledger.operations.drain import Drain
+from demandops.ledger.operations.restoration import Restoration, request_for
+from demandops.ledger.world import World
+from demandops.plan.checks import quota, topic_clash
+from demandops.plan.nodes.capacity import Room, Usage
+from demandops.plan.nodes.choice import (
+    Choice,
+    Chosen,
+    on_node,
+    requirement_of,
+    with_overridden_nodes,
+)
+from demandops.plan.nodes.moved_connections import Move, renaming, with_moved
+from demandops.plan.overrides.claim_overrides import suspended_by
+from demandops.quoting import quoted
+from demandops.subject import Subject, SubjectKind
+
+_ANY = Requirement()
+
+
+def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
+    """Return the request with the moves of all applications and services that can leave the node.
+
+    Args:
+        request: names the node.
+        world: the claims and the configuration.
+        usage: how much services request of the nodes in ``world``.
+    """
+    start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
+    room = Room(world, usage, ())
+    for id in applications_of(world.ledger, request.id):
+        for service in _placed_at(request.id, id, world):
+            claims = world.ledger.application_claims(id)
+            what = f"application '{id}'"
+            what = f"service '{service.name}' of {what}" if service else what
+            found: _Moved | str = next(filter(None, map(_why_fixed, claims)), "")
+            if service is not None or not found:
+                found = _moved(world, claims, room, service)
+            if isinstance(found, str):
+                stays.append(f"{what} stays, because {found}")
+                continue
+            world, chosen, touched = found
+            # ``world`` has the application on its new node; ``room`` must count it there too
+            room.book(world.ledger.application_claims(id))
+            keys += touched
+            moved.append(f"{what} is placed on {quoted(chosen.node)}, {chosen.why}")
+    moves = claim_changes(start.ledger, world.ledger, keys)
+    return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays))
+
+
+_Moved = tuple[World, Chosen, list[ClaimKey]]
+
+
+def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
+    """Return what of an application was placed on a node; ``None`` stands for the application."""
+    app = world.ledger.application(id)
+    if app is None:
+        return []
+    known = world.config.services.get(app.appdef, {})
+    services = [
+        known[one] for one, on in sorted(app.services.items()) if on == node and one in known
+    ]
+    return [*([None] if app.node == node else []), *services]
+
+
+def _why_fixed(claim: Claim) -> str:
+    """Return why a claim's application must stay on its node, or an empty text."""
+    if claim.keeping_override:
+        return f"the override '{claim.keeping_override}' keeps it"
+    return "" if claim.application.place else f"demand '{claim.demand}' names the node"
+
+
+def applications_of(ledger: Ledger, node: str) -> list[str]:
+    """Return the applications that run on a node, or have a service placed there, sorted."""
+    if not ledger.applications_on.get(node):
+        return []
+    apps = ((id, ledger.application(id)) for id in ledger.applications_at(node))
+    return [id for id, app in apps if app and node in app.chosen_nodes]
+
+
+def _moved(
+    world: World, claims: tuple[Claim, ...], room: Room, service: Service | None
+) -> _Moved | str:
+    """Return the world with an application or service on the best other node, or why it stays.
+
+    The node and the keys of the changed claims come with the world.
+    """
+    required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
+    required = requirement_of(service) if service else required
+    roles = dict.fromkeys(role for one in claims for role in one.application.inputs)
+    inputs = {
+        role: tuple(dict.fromkeys(t for c in claims for t in c.application.inputs.get(role, ())))
+        for role in roles
+    }
+    app = claims[0].application.with_inputs(inputs)
+    demanded = Demanded(app, requesters_of(claims), str)
+    choice = Choice(demanded, required, world, room, claims, service)
+    reasons: list[str] = []
+    renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
+    for chosen in choice.candidates({}):
+        if route := renamed.get(chosen.node):
+            names = f"'{route.read_topic}' would no longer become '{route.written_topic}'"
+            reasons.append(f"on {quoted(chosen.node)} {names}")
+            continue
+        move = partial(on_node, node=chosen.node, service=service, world=world)
+        after, changes = with_moved(world, claims, move)
+        fault = next(_faults(world, after, changes), None)
+        if fault is None:
+            return after, chosen, [change.key for change in changes]
+        reasons.append(f"on {quoted(chosen.node)} {fault.message}")
+    return "; ".join(reasons) or choice.none_fits({}).message
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """The ledger in which services are where overrides want them.
+
+    ``keys`` are the claims that may have changed, ``stays`` says what cannot be moved and why.
+    """
+
+    ledger: Ledger
+    keys: tuple[ClaimKey, ...]
+    stays: tuple[tuple[str, str], ...]
+    """The file of an override, and which application stays as it is, and why."""
+
+
+def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> Followed:
+    """Return the ledger with services, and their connections, where overrides move them to.
+
+    Args:
+        world: the claims and the configuration.
+        subjects: those whose claims changed; without them, all applications.
+    """
+    ids = [one.id for one in subjects or () if one.kind is SubjectKind.APPLICATION]
+    if subjects is None:
+        ids = [*world.ledger.moved_applications()]
+        if any(one.node for one in world.overrides):
+            ids = sorted(world.ledger.subjects(SubjectKind.APPLICATION))
+    change = partial(with_overridden_nodes, world=world)
+    wanted = [
+        id
+        for id in dict.fromkeys(ids)
+        for app in [world.ledger.application(id)]
+        if app is not None and change(app) != app
+    ]
+    together, left = wanted, list[str]()
+    while together:  # what shares a service must move at once
+        after, changes = _all_moved(world, together, change)
+        wrong = [id for id, of in changes.items() if next(_faults(world, after, of), None)]
+        if not wrong:
+            break
+        together, left = [id for id in together if id not in wrong], [*left, *wrong]
+    keys, stays = list[ClaimKey](), list[tuple[str, str]]()
+    for ids in filter(None, (together, *([one] for one in left))):
+        after, changes = _all_moved(world, ids, change)
+        faults = (found for of in changes.values() for found in _faults(world, after, of))
+        fault = None if ids is together else next(faults, None)
+        if fault is None:
+            world, keys = after, [*keys, *(one.key for of in changes.values() for one in of)]
+        else:
+            stays += _unmoved(ids[0], world, fault)
+    return Followed(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
+
+
+def with_restored_moves(request: Restoration, world: World) -> Restoration:
+    """Return a rollback of which the claims have services where overrides move them to now."""
+    moves = any(one.node for one in world.overrides)
+    if not moves and not any(
+        one.is_on_application and one.application.moved for one in request.claims
+    ):
+        return request
+    ledger = Ledger(ended=world.ledger.ended)
+    for claim in request.claims:
+        ledger = ledger.replace(claim.key, claim)
+    return replace(request, claims=tuple(following_overrides(replace(world, ledger=ledger)).ledger))
+
+
+def _all_moved(
+    world: World, applications: Iterable[str], move: Move
+) -> tuple[World, dict[str, tuple[ClaimChange, ...]]]:
+    """Return the world with these applications moved, and what changes for each."""
+    changes: dict[str, tuple[ClaimChange, ...]] = {}
+    for id in applications:
+        world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
+    return world, changes
+
+
+def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
+    """Yield for each override that would move a service of an application that it does not."""
+    app = world.ledger.application(id)
+    assert app is not None  # noqa: S101 - it is claimed
+    wanted = with_overridden_nodes(app, world).moved
+    changed = {name for name in {*wanted, *app.moved} if wanted.get(name) != app.moved.get(name)}
+    nodes = {wanted[name] for name in changed if name in wanted}
+    for override in world.overrides:
+        if override.node in nodes:
+            services = " and ".join(sorted(n for n in changed if wanted.get(n) == override.node))
+            yield (
+                override.path,
+                f"does not move {services} of application '{app.id}' to '{override.node}': "
+                f"{fault.message}",
+            )
+
+
+def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> Iterator[Fault]:
+    """Yield the faults of moved claims, checked as if their demands asked for them."""
+    for change in changes:
+        claim = change.after
+        if claim is None:
+            continue
+        wanted, others = request_for(claim), after.ledger.replace(claim.key, None)
+        yield from admission.faults(wanted, after.config)
+        yield from permission.faults(wanted, after.config)
+        yield from conflicts(wanted.demanded[0], others)
+        override = suspended_by(claim, after)
+        if override and change.before and not suspended_by(change.before, before):
+            yield Fault("denied", "", f"it is denied there by {override.path}")
+    yield from quota.faults(before, after, Changes(changes))
+    for change in changes:
+        if change.after:
+            yield from topic_clash.faults_of_claim(change.after, before, after)
+            yield from _brought_twice(change.after, after)
+
+
+def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
+    """Yield a fault for each output that comes to a node by this connection and from another node.
+
+    Inputs may: the demands say which sources they want.
+    """
+    if claim.is_on_application:
+        return
+    apps = (
+        one.application
+        for one in after.ledger.claims_of_demand(claim.demand)
+        if one.is_on_application
+    )
+    inputs = {(topic.source, topic.topic) for app in apps for _, topic in app.all_inputs()}
+    for route in claim.connection.topics:
+        sender, receiver = route.sender_and_receiver(*claim.connection.nodes)
+        if (sender, route.read_topic) not in inputs:
+            for other in _senders(after.ledger, receiver, route.written_topic) - {sender}:
+                topic = quoted(route.written_topic)
+                words = f"{topic} would come from {quoted(sender)} and from {quoted(other)}"
+                yield Fault("conflict", "", words)
+
+
+def _senders(ledger: Ledger, receiver: str, topic: str) -> set[str]:
+    """Return the nodes from which connections bring a topic to a node."""
+    connections = map(ledger.connection, ledger.connections_bringing(receiver, topic))
+    routes = ((one, route) for one in connections if one for route in one.topics)
+    ends = ((*route.sender_and_receiver(*one.nodes), route.written_topic) for one, route in routes)
+    return {sender for sender, *target in ends if target == [receiver, topic]}

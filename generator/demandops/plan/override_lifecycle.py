@@ -1,0 +1,133 @@
+"""Changes to the ledger when overrides change or end: kept claims, moved services, markers.
+
+An override whose end had passed when it was merged never applies. The generator ends an override
+that was in effect with a commit of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+from demandops.config.override import Override, format_time
+from demandops.demand.claim import ClaimKey
+from demandops.ledger import claim_file, ended_override_file
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
+from demandops.plan.nodes.relocation import following_overrides
+from demandops.plan.overrides.claim_overrides import kept_subjects, update_kept_claims
+from demandops.subject import Subject
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerUpdate:
+    """The ledger after overrides changed, and its files to write.
+
+    ``keys`` are the claims that may have changed.
+    """
+
+    ledger: Ledger
+    keys: tuple[ClaimKey, ...]
+    files: Mapping[str, str | None]
+    stays: tuple[tuple[str, str], ...] = ()
+    """The files of overrides that do not move a service, and why."""
+
+
+def update_ledger(
+    before: World,
+    after: World,
+    subjects: Iterable[Subject],
+    markers: Mapping[str, str],
+    now: datetime,
+) -> LedgerUpdate:
+    """Return the update that a change of the configuration requires.
+
+    Args:
+        before, after: the world before and after the change.
+        subjects: the subjects whose claims a person changed.
+        markers: the current markers, path → text.
+        now: the time; new overrides whose end has passed do not apply.
+    """
+    known = {one.name: one for one in before.overrides}
+    expired = [
+        one
+        for one in expired_overrides(after, now)
+        if one.name not in known or known[one.name].end != one.end
+    ]
+    stale = ended_override_file.stale_markers(markers, after.config.overrides)
+    ended = {
+        name: end
+        for name, end in after.ledger.ended.items()
+        if ended_override_file.path_of(name) not in stale
+    }
+    ended |= {one.name: format_time(one.end) for one in expired if one.end}
+    files: dict[str, str | None] = dict.fromkeys(stale)
+    for override in expired:
+        files |= _marker(override)
+    after = replace(after, ledger=replace(after.ledger, ended=ended))
+    kept = (*kept_subjects(before.ledger), *kept_subjects(after.ledger))
+    update = update_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
+    moved = following_overrides(replace(after, ledger=update.ledger))
+    keys = (*update.keys, *moved.keys)
+    files |= changed_claim_files(after.ledger, moved.ledger, keys)
+    return LedgerUpdate(moved.ledger, keys, files, moved.stays)
+
+
+def update_claims(
+    before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
+) -> LedgerUpdate:
+    """Return the update that changed claims require, without a changed configuration.
+
+    Args:
+        before: the ledger before the change.
+        after: the world after it.
+        subjects: the subjects whose claims changed.
+        now: the booking time of new kept claims.
+    """
+    subjects = tuple(subjects)
+    ledger, kept = update_kept_claims(before, after, subjects, now)
+    moved = following_overrides(replace(after, ledger=ledger), subjects)
+    keys = (*kept, *moved.keys)
+    files = changed_claim_files(after.ledger, moved.ledger, keys)
+    return LedgerUpdate(moved.ledger, keys, files, moved.stays)
+
+
+def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
+    """Return the update that ends an override."""
+    if override.end is None:
+        raise ValueError(f"{override.path} has no end")
+    ended = {**world.ledger.ended, override.name: format_time(override.end)}
+    after = replace(world, ledger=replace(world.ledger, ended=ended))
+    update = update_ledger(world, after, (), {}, now)
+    return replace(update, files={**update.files, **_marker(override)})
+
+
+def _marker(override: Override) -> dict[str, str]:
+    return {ended_override_file.path_of(override.name): ended_override_file.text_of(override)}
+
+
+def changed_claim_files(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> dict[str, str | None]:
+    """Return the claim files at ``keys`` that differ, path → text; ``None`` removes a file."""
+    files: dict[str, str | None] = {}
+    for key in keys:
+        claim = after.get(key)
+        if claim != before.get(key):
+            files[claim_file.path_of(key)] = claim_file.text_of(claim) if claim else None
+    return files
+
+
+def expired_overrides(world: World, now: datetime) -> list[Override]:
+    """Return the overrides in effect whose end has passed, sorted by their end."""
+    expired = [(one.end, one.name, one) for one in world.overrides if one.end and one.end <= now]
+    return [one for _, _, one in sorted(expired, key=lambda item: item[:2])]
+
+
+def changed_override_files(before: World, after: World) -> list[str]:
+    """Return the files of the overrides that took effect, changed or stopped applying."""
+    old = {one.name: one for one in before.overrides}
+    new = {one.name: one for one in after.overrides}
+    names = [name for name in {*old, *new} if old.get(name) != new.get(name)]
+    return sorted((new.get(name) or old[name]).path for name in names)

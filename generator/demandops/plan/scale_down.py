@@ -1,0 +1,70 @@
+"""When a service gets fewer replicas: at once, or after the time that its definition names.
+
+A decision records what a service keeps when its demands need fewer replicas
+(:mod:`demandops.ledger.kept_replicas`). When that time is over, the generator removes the record in
+a commit of its own, as it ends an override.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import datetime
+
+from demandops.errors import Refused
+from demandops.ledger.kept_replicas import Instance, Steps, extended
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
+from demandops.plan.planner import without_kept
+from demandops.plan.release import ServiceKey, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey
+
+
+def with_kept_replicas(
+    before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
+) -> tuple[Ledger, tuple[Instance, ...]]:
+    """Return the ledger with the replicas that services keep after a demand, and their instances.
+
+    Args:
+        before, after: the world before and after the demand.
+        keys: the releases that the demand may change.
+        now: when the demand was received.
+
+    Raises:
+        Refused: if a release cannot be planned.
+    """
+    kept, changed = after.ledger.kept, list[Instance]()
+    for key in keys:
+        if not isinstance(key, ServiceKey):
+            continue
+        known = kept.steps.get(key.instance) or ()
+        if not known and key.service not in after.config.services_with_down_after:
+            continue
+        steps = _steps(before, after, key, known, now)
+        if steps != known:
+            kept = kept.replace(key.instance, steps)
+            changed.append(key.instance)
+    return replace(after.ledger, kept=kept) if changed else after.ledger, tuple(changed)
+
+
+def _steps(before: World, after: World, key: ServiceKey, known: Steps, now: datetime) -> Steps:
+    release = without_kept(after, key)
+    kept_for = release.service.scaling.kept_for if release else None
+    if release is None or kept_for is None:
+        return ()
+    try:
+        old = without_kept(before, key)
+    except Refused:  # the former release can no longer be planned
+        old = None
+    return extended(known, _number(release), _number(old), now, now + kept_for)
+
+
+def _number(release: ServiceRelease | None) -> int:
+    return release.replicas if release and isinstance(release.replicas, int) else 0
+
+
+def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
+    """Return the ledger without the steps of an instance that have ended."""
+    kept = world.ledger.kept
+    left = tuple(one for one in kept.steps.get(instance) or () if one.until > now)
+    return replace(world.ledger, kept=kept.replace(instance, left))

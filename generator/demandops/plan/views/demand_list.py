@@ -1,0 +1,114 @@
+"""The demands that hold something, as a list for people."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+from demandops.config.config import Config
+from demandops.demand.claim import Claim, requesters_of
+from demandops.demand.lease import Lease
+from demandops.ledger.waiting import WaitingDemand
+from demandops.ledger.world import World
+from demandops.plan.overrides.claim_overrides import suspended_by
+from demandops.subject import SubjectKind
+
+State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
+"""A claim is held by its demand, kept by an override, or suspended by one. A demand that waits for
+room has no claim."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldDemand:
+    """A demand and what it holds. Its lease is the one of its claims that ends first."""
+
+    name: str
+    state: State
+    requests: tuple[str, ...]
+    requesters: tuple[str, ...]
+    applications: tuple[str, ...]
+    connections: tuple[str, ...]
+    nodes: tuple[str, ...]
+    domains: tuple[str, ...]
+    since: datetime
+    lease: Lease | None
+    suspended_by: tuple[str, ...]
+
+
+def state_of(claim: Claim, world: World) -> State:
+    """Return whether a claim is held, kept or suspended."""
+    if suspended_by(claim, world) is not None:
+        return "suspended"
+    return "kept" if claim.keeping_override else "held"
+
+
+def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
+    """Return the access domains of nodes, sorted; a node that is gone has none."""
+    return tuple(sorted({config.domain_of[id].name for id in nodes if id in config.domain_of}))
+
+
+def nodes_of(claim: Claim) -> tuple[str, ...]:
+    """Return the nodes that a claim needs, sorted: where it runs, and where its inputs are."""
+    held = claim.held
+    if claim.is_on_application:
+        sources = (topic.source for _, topic in claim.application.all_inputs())
+        delivered = (one.node for one in claim.application.deliver)
+        return tuple(sorted({*held.nodes, *sources, *delivered}))
+    return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
+
+
+def demands(world: World) -> list[HeldDemand]:
+    """Return every demand that holds something or waits for room, the oldest first."""
+    by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
+    for claim in world.ledger:
+        by_demand[claim.demand].append(claim)
+    found = [held_demand(claims, world) for claims in by_demand.values()]
+    found += [waiting_demand(one) for one in world.ledger.waiting.values()]
+    return sorted(found, key=lambda one: (one.since, one.name))
+
+
+def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
+    """Return the demand that has these claims."""
+    states = {state_of(claim, world) for claim in claims}
+    (state,) = states if len(states) == 1 else ("partly suspended",)
+    suspending = filter(None, (suspended_by(claim, world) for claim in claims))
+    nodes = {node for claim in claims for node in nodes_of(claim)}
+    leases = [claim.lease for claim in claims if claim.lease]
+    return HeldDemand(
+        name=claims[0].demand,
+        state=state,  # type: ignore[arg-type]  # one of the words
+        requests=tuple(sorted({claim.request for claim in claims})),
+        requesters=requesters_of(claims),
+        applications=tuple(ids_of(claims, SubjectKind.APPLICATION)),
+        connections=tuple(ids_of(claims, SubjectKind.CONNECTION)),
+        nodes=tuple(sorted(nodes)),
+        domains=domains_of(nodes, world.config),
+        since=min(claim.booked for claim in claims),
+        lease=min(leases, key=lambda lease: lease.until) if leases else None,
+        suspended_by=tuple(sorted({override.path for override in suspending})),
+    )
+
+
+def waiting_demand(one: WaitingDemand) -> HeldDemand:
+    """Return a demand that waits: it holds nothing yet."""
+    return HeldDemand(
+        name=one.demand,
+        state="waiting",
+        requests=(one.request,),
+        requesters=tuple(sorted(one.requesters)),
+        applications=(),
+        connections=(),
+        nodes=(),
+        domains=(),
+        since=one.since,
+        lease=None,
+        suspended_by=(),
+    )
+
+
+def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
+    """Yield the ids of the claimed subjects of a kind, sorted."""
+    yield from sorted(claim.subject.id for claim in claims if claim.subject.kind is kind)

@@ -1,0 +1,75 @@
+"""Topics that applications need and that nothing brings any longer. Pure.
+
+A demand that needs a connection gets one, or is warned. Later an override may suspend it, others
+may release it, or people may take a node or an output out of the configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from demandops.config.config import Config
+from demandops.demand.application import Application
+from demandops.errors import Fault, fault
+from demandops.ledger import claim_file
+from demandops.ledger.world import World
+from demandops.plan.flows import flows
+from demandops.plan.overrides.claim_overrides import without_suspended
+
+
+@dataclass(frozen=True, slots=True)
+class MissingInput:
+    """A topic that does not arrive: the application, the claim that needs it, and why."""
+
+    application: str
+    file: str
+    reason: str
+
+    @property
+    def warning(self) -> Fault:
+        """Return it as a warning, in the claim's file."""
+        return fault(f"application '{self.application}'", self.reason).within(self.file)
+
+
+def missing_inputs(world: World) -> list[MissingInput]:
+    """Return what does not arrive, sorted; suspended claims need nothing."""
+    active = without_suspended(world)
+    found = {
+        MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)
+        for claim in active.ledger
+        if claim.is_on_application
+        for reason in _reasons(claim.application, active)
+    }
+    return sorted(found, key=lambda one: (one.application, one.reason, one.file))
+
+
+def _reasons(app: Application, active: World) -> Iterator[str]:
+    config = active.config
+    for role, topic in app.all_inputs():
+        if topic.source not in config.nodes:
+            where = f"'{topic.source}' is not in the inventory"
+            yield f"{role} {topic.topic} does not arrive: {where}"
+    for flow in flows(config, app):
+        carried = active.ledger.is_carried_to(flow.receiver, flow.target)
+        bridged = flow.topic == flow.target and _is_bridged(
+            flow.topic, flow.sender, flow.receiver, config
+        )
+        if flow.sender in config.nodes and not carried and not bridged:
+            yield (
+                f"{flow.name} {flow.topic} does not arrive: no connection carries it from "
+                f"'{flow.sender}' to '{flow.receiver}'"
+            )
+    services = config.services.get(app.appdef, {})
+    for delivery in app.deliver:
+        name, _, output = delivery.output.partition(".")
+        if name not in services or output not in services[name].outputs:
+            yield (
+                f"{delivery.output} is no longer delivered to '{delivery.node}': the application "
+                f"definition '{app.appdef}' has no such output"
+            )
+
+
+def _is_bridged(topic: str, sender: str, receiver: str, config: Config) -> bool:
+    node = config.nodes.get(sender)
+    return node is not None and topic in node.bridged.get(receiver, ())

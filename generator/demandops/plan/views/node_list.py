@@ -1,0 +1,66 @@
+"""The nodes and what they are used for, as a list for people."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from demandops.config.inventory import Position
+from demandops.demand.claim import Claim, requesters_of
+from demandops.ledger.world import World
+from demandops.plan.release import Release
+from demandops.plan.views.demand_list import ids_of, nodes_of
+from demandops.subject import SubjectKind
+
+
+@dataclass(frozen=True, slots=True)
+class UsedNode:
+    """A node of the inventory, or one that claims still name, and what it is used for.
+
+    ``releases`` run there. ``applications``, ``connections`` and ``requesters`` come from the
+    claims that need the node, even if they only take an input from it.
+    """
+
+    name: str
+    type: str | None
+    cluster: str | None
+    domain: str | None
+    drained: bool
+    capabilities: tuple[str, ...]
+    position: Position | None
+    releases: tuple[str, ...]
+    applications: tuple[str, ...]
+    connections: tuple[str, ...]
+    requesters: tuple[str, ...]
+
+
+def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
+    """Return every node, sorted by id; ``releases`` are those that run."""
+    running: defaultdict[str, list[str]] = defaultdict(list)
+    for release in releases:
+        running[release.node.id].append(release.name)
+    needing: defaultdict[str, list[Claim]] = defaultdict(list)
+    for claim in world.ledger:
+        for id in nodes_of(claim):
+            needing[id].append(claim)
+    known = world.config.nodes
+    found = []
+    for id in sorted({*known, *needing}):
+        node, domain, claims = known.get(id), world.config.domain_of.get(id), needing[id]
+        found.append(
+            UsedNode(
+                name=id,
+                type=node.type if node else None,
+                cluster=node.cluster if node else None,
+                domain=domain.name if domain else None,
+                drained=bool(node and node.drained),
+                capabilities=node.capabilities if node else (),
+                position=node.position if node else None,
+                releases=tuple(sorted(running[id])),
+                applications=tuple(sorted({*ids_of(claims, SubjectKind.APPLICATION)})),
+                connections=tuple(sorted({*ids_of(claims, SubjectKind.CONNECTION)})),
+                requesters=requesters_of(claims),
+            )
+        )
+    return found

@@ -1,0 +1,133 @@
+"""A plan that follows a sequence of ledgers, for the proof of commits.
+
+Planning is a function of ledger and configuration. The plan records which parts of the ledger were
+read for each release. If none of them changes, the release stays the same; only the others are
+planned again. The generator predicts which releases a claim affects
+(:func:`demandops.plan.release_keys.affected_keys`). A proof must not rely on that prediction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias, TypeVar, cast
+
+from demandops.config.config import Config
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.kept_replicas import Instance
+from demandops.ledger.ledger import Ledger, index_entries
+from demandops.ledger.world import World
+from demandops.plan.planner import plan
+from demandops.plan.release import Release
+from demandops.plan.release_keys import ReleaseKey, keys_of
+from demandops.subject import Subject
+
+T = TypeVar("T")
+Unit = TypeVar("Unit", bound="_Unit")
+
+_Unit: TypeAlias = "Subject | ReleaseKey"
+_Read: TypeAlias = "Subject | tuple[str, ...]"
+
+_ALL: _Read = ("all",)
+"""A read of the whole ledger."""
+
+
+class TracedPlan:
+    """The plan of one configuration for a sequence of ledgers with the same ended overrides."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._keys: dict[Subject, tuple[ReleaseKey, ...]] = {}
+        self._readers: dict[_Read, set[_Unit]] = {}
+        self._planned: set[ReleaseKey] = set()
+
+    def advance(
+        self, ledger: Ledger, changes: Iterable[ClaimChange], kept: Iterable[Instance] = ()
+    ) -> dict[ReleaseKey, Release | None]:
+        """Plan the releases again that the changes may affect; the first time, all of them.
+
+        Args:
+            ledger: the ledger after the changes.
+            changes: every claim that changed.
+            kept: every service instance whose kept replicas changed.
+
+        Returns:
+            The releases that were planned again; ``None`` for one that does not run.
+
+        Raises:
+            Refused: as :func:`demandops.plan.planner.plan`. Do not use this plan afterwards.
+        """
+        stale = {
+            unit for read in (*_changed(changes), *kept) for unit in self._readers.pop(read, ())
+        }
+        for subject in ledger.claims:
+            if subject in stale or subject not in self._keys:
+                self._keys[subject] = self._traced(
+                    ledger, subject, lambda seen, of: tuple(keys_of(seen, of, strict=True))
+                )
+        for subject in [unit for unit in stale if unit in self._keys]:
+            if subject not in ledger.claims:
+                del self._keys[subject]
+        needed = {key for keys in self._keys.values() for key in keys}
+        gone = self._planned - needed
+        found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
+        for key in sorted(needed - self._planned | (needed & stale), key=repr):
+            found[key] = self._traced(ledger, key, plan)
+        self._planned = needed
+        return found
+
+    def _traced(self, ledger: Ledger, unit: Unit, work: Callable[[World, Unit], T]) -> T:
+        reads: set[_Read] = set()
+        traced = Ledger(
+            cast(Any, _Recording(ledger.claims, reads)),
+            cast(Any, _Recording(ledger.index, reads)),
+            cast(Any, None),  # planning does not read the ends of leases
+            ledger.ended,
+            kept=cast(Any, _RecordingKept(_Recording(ledger.kept.steps, reads))),
+        )
+        result = work(World(self._config, traced), unit)
+        for read in reads:
+            self._readers.setdefault(read, set()).add(unit)
+        return result
+
+
+def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
+    """Return the reads whose result may differ after the changes."""
+    reads: set[_Read] = {_ALL}
+    for change in changes:
+        reads |= {change.key.subject, *index_entries(change.before), *index_entries(change.after)}
+    return reads
+
+
+@dataclass(frozen=True)
+class _RecordingKept:
+    """The kept replicas; planning reads only :attr:`steps`, whose reads are recorded."""
+
+    steps: _Recording
+
+
+class _Recording:
+    """A map of the ledger that records which keys are read."""
+
+    def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
+        self._map, self._reads = map, reads
+
+    def get(self, key: _Read, default: Any = None) -> Any:  # noqa: ANN401
+        self._reads.add(key)
+        return self._map.get(key, default)
+
+    def __getitem__(self, key: _Read) -> Any:  # noqa: ANN401
+        self._reads.add(key)
+        return self._map[key]
+
+    def __contains__(self, key: _Read) -> bool:
+        self._reads.add(key)
+        return key in self._map
+
+    def __iter__(self) -> Iterator[Any]:
+        self._reads.add(_ALL)
+        return iter(self._map)
+
+    def values(self) -> Any:  # noqa: ANN401
+        self._reads.add(_ALL)
+        return self._map.values()

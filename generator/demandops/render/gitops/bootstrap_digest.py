@@ -1,0 +1,39 @@
+"""The digest of a bootstrap file: an annotation by which a cluster tells which one it has. Pure.
+
+Nobody but a person applies the file, so the cluster may have an older one. The object that applies
+an access domain's folder carries the digest, and ``demandops status`` compares it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from demandops import strict_yaml
+from demandops.errors import InvalidInput
+
+ANNOTATION = "demandops/bootstrap"
+_LENGTH = 16
+
+
+def with_digest(render: Callable[[str], str]) -> str:
+    """Return the file that ``render`` returns for the digest of its objects; comments are none."""
+    objects = json.dumps(list(strict_yaml.load_all(render(""))), sort_keys=True)
+    return render(hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH])
+
+
+def digest_of(item: Mapping[str, Any]) -> str:
+    """Return the digest that an object carries, empty if it has none."""
+    annotations = (item.get("metadata") or {}).get("annotations") or {}
+    return str(annotations.get(ANNOTATION, ""))
+
+
+def digest_in(text: str) -> str:
+    """Return the digest in a bootstrap file, empty if it has none."""
+    try:
+        items = list(strict_yaml.load_all(text))
+    except InvalidInput:
+        return ""
+    return next(filter(None, (digest_of(item) for item in items if isinstance(item, dict))), "")

@@ -1,0 +1,296 @@
+"""A new application: its definition, values, chart, registry entries, README and example demand.
+
+Its services form a chain: the first reads the inputs, each further one reads the outputs of the one
+before. Launch files of one image start all of them. Pure.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from demandops.charts import chart_schema, values_table
+from demandops.config.config import Config
+from demandops.config.policy import matches
+from demandops.config.registry import Image
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.errors import InvalidInput
+from demandops.scaffold.written import document
+
+LIBRARY_FOLDER = f"appdefs/charts/{chart_schema.LIBRARY}"
+_RESULT = "result"
+_REQUESTER = "operator"
+_VERSION = "0.1.0"
+
+
+@dataclass(frozen=True, slots=True)
+class ServicePlan:
+    """A service: its name, and the launch file that it runs."""
+
+    name: str
+    package: str
+    launch_file: str
+
+
+@dataclass(frozen=True, slots=True)
+class ApplicationPlan:
+    """The application to write.
+
+    ``inputs`` maps roles to message types. ``node`` is that of the example demand.
+    """
+
+    name: str
+    description: str
+    inputs: Mapping[str, str]
+    services: tuple[ServicePlan, ...]
+    image: Image
+    node: str
+
+
+def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> dict[str, str]:
+    """Return path → text of a new application.
+
+    Args:
+        plan: the application to write.
+        config: the configuration that it is added to.
+        library: path → text of the library chart, which is added if the state repo has none.
+
+    Raises:
+        InvalidInput: the configuration has an application or a chart of this name.
+    """
+    if plan.name in config.appdefs or plan.name in config.charts or plan.name in config.images:
+        raise InvalidInput.at("NAME", f"'{plan.name}' exists already; choose another name")
+    known = config.files if f"{LIBRARY_FOLDER}/Chart.yaml" in config.files else library
+    root = f"appdefs/{plan.name}"
+    found = {f"{root}/appdef.yaml": _appdef(plan, _prefixes(plan, config))}
+    for service, inputs in _chain(plan):
+        found[f"{root}/values/{service.name}.yaml.j2"] = _values_template(plan, service, inputs)
+    found |= _chart(plan, f"{root}/charts/{plan.name}", known)
+    found[f"{root}/README.md"] = _readme(plan)
+    found[f"{root}/demand.yaml"] = _demand(plan, config)
+    for kind, content in (
+        ("charts", {"folder": f"{root}/charts/{plan.name}", "version": _VERSION}),
+        ("images", plan.image.model_dump(exclude_none=True)),
+    ):
+        path = f"registry/{kind}/{plan.name}.yaml"
+        found[path] = document(path, kind, kind.title(), {kind: {plan.name: content}})
+    return found | (dict(library) if known is library else {})
+
+
+def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
+    """Yield each service with its inputs: role → where it comes from."""
+    inputs = {role: role for role in plan.inputs}
+    for service in plan.services:
+        yield service, inputs
+        inputs = {_role(service.name): f"{service.name}.{_RESULT}"}
+
+
+def _role(name: str) -> str:
+    return name.replace("-", "_")
+
+
+def _prefixes(plan: ApplicationPlan, config: Config) -> dict[str, str]:
+    """Return a free prefix of release names for each service."""
+    taken = {kind.word for kind in CONNECTION_TYPES}
+    taken |= {one.prefix for found in config.services.values() for one in found.values()}
+    taken |= {one.prefix for one in config.definitions.values()}
+    found: dict[str, str] = {}
+    for service in plan.services:
+        found[service.name] = _free(re.sub("[^a-z0-9]", "", service.name)[:8], taken)
+        taken.add(found[service.name])
+    return found
+
+
+def _free(wanted: str, taken: Collection[str]) -> str:
+    names = [wanted, *(f"{wanted}{number}" for number in range(2, 100))]
+    return next(one for one in names if one not in taken)
+
+
+def _appdef(plan: ApplicationPlan, prefixes: Mapping[str, str]) -> str:
+    services: dict[str, Any] = {}
+    for service, inputs in _chain(plan):
+        services[service.name] = {
+            "prefix": prefixes[service.name],
+            "inputs": inputs,
+            "outputs": {_RESULT: f"/{{instance}}_{_role(service.name)}"},
+            "chart": plan.name,
+            "images": [plan.name],
+            "values": f"values/{service.name}.yaml.j2",
+        }
+    fields = {
+        "name": plan.name,
+        "description": plan.description,
+        "inputs": {role: {"type": type} for role, type in plan.inputs.items()},
+        "services": services,
+    }
+    note = (
+        "docs/appdef.md of DemandOps explains each field. To run a service once for each topic of\n"
+        "an input instead of once for each application, add `each: <input>` to it."
+    )
+    path = f"appdefs/{plan.name}/appdef.yaml"
+    return document(path, "application", "ApplicationDefinition", fields, note)
+
+
+def _values_template(plan: ApplicationPlan, service: ServicePlan, inputs: Iterable[str]) -> str:
+    topics = "".join(f'    {role}_topics: {{{{ topics.{role} | join(",") }}}}\n' for role in inputs)
+    return f"""\
+{{# Values of {service.name}. Each expression is written as a JSON value, so none needs quotes. The
+   arguments are those of its launch file. #}}
+replicas: {{{{ replicas }}}}
+image: {{{{ images["{plan.name}"] }}}}
+{{% if node.image_pull_secrets %}}
+imagePullSecrets:
+{{% for name in node.image_pull_secrets %}}
+  - name: {{{{ name }}}}
+{{% endfor %}}
+{{% endif %}}
+nodeSelector: {{{{ node.selector }}}}
+tolerations: {{{{ node.tolerations }}}}
+hostNetwork: {{{{ node.host_network }}}}
+ros:
+  domainId: {{{{ node.ros.domain_id }}}}
+  rmwImplementation: {{{{ node.ros.rmw }}}}
+launch:
+  package: {service.package}
+  file: {service.launch_file}
+  arguments:
+    node_name: {{{{ release | ros_name }}}}
+{topics}    {_RESULT}_topic: {{{{ outputs.{_RESULT} }}}}
+"""
+
+
+_LAUNCH: dict[str, Any] = {
+    "type": "object",
+    "additionalProperties": False,
+    "required": ["package", "file", "arguments"],
+    "properties": {
+        "package": {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$"},
+        "file": {"type": "string", "pattern": "^[A-Za-z0-9_][A-Za-z0-9_.-]*$"},
+        "arguments": {
+            "type": "object",
+            "propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"},
+            "additionalProperties": {"type": "string"},
+        },
+    },
+}
+
+
+def _chart(plan: ApplicationPlan, folder: str, library: Mapping[str, str]) -> dict[str, str]:
+    shared = library[f"{LIBRARY_FOLDER}/values.yaml"]
+    schema = json.loads(library[f"{LIBRARY_FOLDER}/values.schema.json"])
+    title = f"Values of the chart {plan.name}"
+    values = _chart_values(plan)
+    composed = chart_schema.composed(title, {"launch": _LAUNCH}, values, schema, shared)
+    version = re.search(r"(?m)^version: (\S+)$", library[f"{LIBRARY_FOLDER}/Chart.yaml"])
+    return {
+        f"{folder}/Chart.yaml": f"""\
+apiVersion: v2
+name: {plan.name}
+description: Runs the launch files of {plan.name}.
+type: application
+version: {_VERSION}
+dependencies:
+  - name: {chart_schema.LIBRARY}
+    version: {version[1] if version else _VERSION}
+    repository: file://../../../charts/{chart_schema.LIBRARY}
+    import-values: [{chart_schema.EXPORT}]
+""",
+        f"{folder}/values.yaml": values,
+        f"{folder}/values.schema.json": json.dumps(composed, indent=2, ensure_ascii=False) + "\n",
+        f"{folder}/README.md": f"# {plan.name}\n\nRuns the launch files of {plan.name}.\n\n"
+        f"## Values\n\nBesides those of the library "
+        f"[{chart_schema.LIBRARY}](../../../charts/{chart_schema.LIBRARY}/README.md#values):\n\n"
+        + values_table.table(values),
+        f"{folder}/templates/service.yaml": f"""\
+{{{{- $run := list "ros2" "launch" .Values.launch.package .Values.launch.file }}}}
+{{{{- range $name, $value := .Values.launch.arguments }}}}
+{{{{- $run = append $run (printf "%s:=%s" $name $value) }}}}
+{{{{- end }}}}
+{{{{- include "ros-service.service" (dict "root" . "name" "{plan.name}" "run" $run) }}}}
+""",
+    }
+
+
+def _chart_values(plan: ApplicationPlan) -> str:
+    first = plan.services[0]
+    return f"""\
+# Values of this chart, besides those of {LIBRARY_FOLDER}: probes, resources, rights and more.
+# The templates in ../../values/ write those of a release.
+
+image:
+  # -- Name of the image, with its registry, without tag or digest.
+  repository: {plan.image.repository}
+
+launch:
+  # -- Package of the launch file.
+  package: {first.package}
+  # -- Name of the launch file.
+  file: {first.launch_file}
+  # -- Arguments of the launch file: name → value.
+  arguments: {{}}
+
+# -- Labels of all objects, but not of the pods.
+commonLabels:
+  app.kubernetes.io/part-of: {plan.name}
+"""
+
+
+def _readme(plan: ApplicationPlan) -> str:
+    rows = "".join(
+        f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
+        f"| {', '.join(f'`{one}`' for one in inputs.values())} |\n"
+        for service, inputs in _chain(plan)
+    )
+    return f"""\
+# {plan.name}
+
+{plan.description}
+
+| service | runs | reads |
+| --- | --- | --- |
+{rows}
+A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas) and
+`{_RESULT}_topic`. The templates in `values/` name them: change both together.
+
+    demandops check .                                            # after each edit
+    demandops request --dry-run appdefs/{plan.name}/demand.yaml   # what the example would do
+"""
+
+
+def _requester(plan: ApplicationPlan, config: Config) -> str:
+    """Return who may demand the example, by the rules of its node's access domain."""
+    domain = config.domain_of.get(plan.node)
+    for rule in domain.rules if domain else ():
+        if matches(plan.name, rule.applications) and matches(plan.node, rule.nodes):
+            name = rule.requesters[0].replace("?", "1").replace("*", "")
+            return name or _REQUESTER
+    return _REQUESTER
+
+
+def _demand(plan: ApplicationPlan, config: Config) -> str:
+    node = config.nodes.get(plan.node)
+    topics = node.topics if node else {}
+    fields = {
+        "demand": f"{plan.name}-example",
+        "requesters": [_requester(plan, config)],
+        "applications": [
+            {
+                "id": f"{plan.node}/{plan.name}",
+                "type": plan.name,
+                "node": plan.node,
+                "inputs": {
+                    role: [{"topic": topics.get(role, f"/{role}"), "source": plan.node}]
+                    for role in plan.inputs
+                },
+            }
+        ],
+    }
+    path = f"appdefs/{plan.name}/demand.yaml"
+    note = (
+        f"An example: demandops request {path}\n"
+        "requesters are who asks, by any name that the rules of the access domain allow."
+    )
+    return document(path, "demand", "Demand", fields, note)

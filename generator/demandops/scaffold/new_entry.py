@@ -1,0 +1,71 @@
+"""A new node, access domain or override, each in a file of its own. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from demandops.config.config import DOMAINS_FILE, Config
+from demandops.errors import InvalidInput
+from demandops.naming import object_name
+from demandops.scaffold.written import document
+
+
+def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
+    """Return path → text of a new node, and of its cluster if that is new."""
+    if id in config.nodes:
+        raise InvalidInput.at("ID", f"'{id}' is a node already; choose another id")
+    path = f"inventory/nodes/{object_name('', id)}.yaml"
+    entry = {"id": id, "type": type, "cluster": cluster}
+    note = (
+        "docs/inventory.md of DemandOps explains each field, as do the comments of\n"
+        "inventory/nodes.yaml. `topics` names the usual topic for each input of applications."
+    )
+    found = {path: document(path, "nodes", "Nodes", {"nodes": [entry]}, note)}
+    if cluster not in config.clusters:
+        path = f"inventory/clusters/{cluster}.yaml"
+        found[path] = document(path, "clusters", "Clusters", {"clusters": [{"name": cluster}]})
+    return found
+
+
+def access_domain(
+    name: str, namespace: str, nodes: Iterable[str], requesters: Iterable[str], config: Config
+) -> dict[str, str]:
+    """Return path → text of a new access domain. Without requesters all may demand everything.
+
+    Raises:
+        InvalidInput: there is one of this name, or one that has every node.
+    """
+    if name in config.domains:
+        raise InvalidInput.at("NAME", f"'{name}' is an access domain already; choose another name")
+    for other in config.domains.values():
+        if "*" in other.nodes:
+            file = config.file_of(DOMAINS_FILE, other.name)
+            message = (
+                f"access domain '{other.name}' has every node by its pattern '*', so no other one "
+                "can have any; narrow its patterns first"
+            )
+            raise InvalidInput.at("nodes", message, file=file)
+    path = f"policy/access-domains/{name}.yaml"
+    rules = [{"name": "all", "requesters": [*requesters]}] if requesters else []
+    entry: dict[str, Any] = {"name": name, "namespace": namespace, "nodes": [*nodes]}
+    entry |= {"rules": rules} if rules else {}
+    note = "docs/policy.md of DemandOps explains rules, quotas, leases, kinds and podSecurity."
+    return {path: document(path, "access-domains", "AccessDomains", {"domains": [entry]}, note)}
+
+
+def override(
+    name: str,
+    reason: str,
+    owner: str,
+    select: Mapping[str, list[str]],
+    effect: Mapping[str, Any],
+    config: Config,
+) -> dict[str, str]:
+    """Return path → text of a new override with one effect."""
+    if name in config.overrides:
+        raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
+    path = f"overrides/{name}.yaml"
+    fields = {"reason": reason, "owner": owner, "select": [dict(select)], **effect}
+    note = "overrides/README.md lists what else an override can do, until when, and for what."
+    return {path: document(path, "override", "Override", fields, note)}

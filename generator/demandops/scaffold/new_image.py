@@ -1,0 +1,52 @@
+"""The container file and the pipelines of a ROS package of one's own, for its own repository.
+
+They test it, build its image, and propose the image to the state repo, pinned by its digest. Pure.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from demandops.config.repo_settings import as_git_url
+from demandops.errors import InvalidInput
+from demandops.quoting import quoted
+
+_PLACES = {
+    "Containerfile": "Containerfile",
+    "github-workflow.yml": ".github/workflows/image.yml",
+    "gitlab-ci.yml": ".gitlab-ci.yml",
+    "propose-image": "ci/propose-image",
+}
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_REPOSITORY = re.compile(r"(?P<host>[a-z0-9.-]+(:[0-9]+)?)(/[a-z0-9._-]+)+")
+_URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A-Za-z0-9._~/-]+")
+
+
+def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str]) -> dict[str, str]:
+    """Return path → text of the files.
+
+    Args:
+        name: the image's name in the registry of the state repo.
+        repository: the image's repository, with its host.
+        state_repo: the URL of the state repo; git asks for a password that it needs.
+        texts: the files of ``templates/scaffold/image``.
+
+    Raises:
+        InvalidInput: ``name``, ``repository`` or ``state_repo`` has characters that the files
+            cannot contain.
+    """
+    url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
+    if not _NAME.fullmatch(name):
+        raise InvalidInput.at("NAME", f"{quoted(name)} is no name; write letters, digits and -")
+    if image is None:
+        message = f"{quoted(repository)} is no repository; write HOST/PATH without a tag"
+        raise InvalidInput.at("--repository", message)
+    if not _URL.fullmatch(url):
+        message = f"{quoted(state_repo)} is no URL; write https://HOST/PATH or git@HOST:PATH"
+        raise InvalidInput.at("--state-repo", message)
+    given = {"NAME": name, "REPOSITORY": repository, "HOST": image["host"], "STATE_REPO": url}
+    return {
+        _PLACES[file]: re.sub("@([A-Z_]+)@", lambda found: given[found[1]], text)
+        for file, text in texts.items()
+    }

@@ -1,0 +1,66 @@
+"""Moves placed applications off drained nodes, and retries those that did not fit elsewhere."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from datetime import datetime, timedelta
+
+from demandops.config.config import Config
+from demandops.errors import InvalidInput
+from demandops.ledger.world import World
+from demandops.runtime import Runtime
+from demandops.staterepo.write.commit_batch import CommitBatch
+
+log = logging.getLogger("demandops")
+
+_RETRY = timedelta(seconds=60)
+"""The pause before moving the applications that stayed on a drained node is tried again."""
+
+
+class Draining:
+    """Moves placed applications off drained nodes, in one commit for each node."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._tried: dict[str, tuple[Config, datetime]] = {}
+        self._logged: dict[str, frozenset[str]] = {}
+
+    def move_due(self, commits: CommitBatch) -> None:
+        """Commit the moves of each drained node; retry later the applications that stay."""
+        now = self._runtime.now()
+        for node in self._due(commits.head.state, now):
+            tried = (commits.head.state.config, now)
+            try:
+                decision = commits.drain(node, self._runtime.fresh_id(), now)
+            except InvalidInput as error:
+                self._tried[node] = tried
+                self._warn(node, map(str, error.faults))
+                continue
+            # with files, the commit may still lose to another writer, so it is not done yet
+            if not decision.files:
+                self._tried[node] = tried
+            for moved in decision.placed:
+                log.info("'%s' is drained: %s", node, moved)
+            self._warn(node, decision.warnings)
+
+    def _warn(self, node: str, stays: Iterable[str]) -> None:
+        """Log, once, which applications stay on a drained node and why."""
+        texts = frozenset(stays)
+        for text in sorted(texts - self._logged.get(node, frozenset())):
+            log.warning("'%s' is drained: %s", node, text)
+        self._logged[node] = texts
+
+    def is_due(self, world: World) -> bool:
+        """Return whether to drain a node now."""
+        return bool(self._due(world, self._runtime.now()))
+
+    def _due(self, world: World, now: datetime) -> list[str]:
+        """Return the drained nodes with applications, except those that were just tried."""
+        found = []
+        for node in world.config.drained_nodes:
+            config, at = self._tried.get(node, (None, now))
+            is_new = config is not world.config or not at <= now < at + _RETRY
+            if is_new and world.ledger.applications_on.get(node):
+                found.append(node)
+        return found

@@ -1,0 +1,53 @@
+"""What the generator commits by itself when it is due, and nobody demands it."""
+
+from __future__ import annotations
+
+from demandops.decision import State
+from demandops.runtime import Runtime
+from demandops.service.timing.draining import Draining
+from demandops.service.timing.expiry import OverrideExpiry, ScaleDown
+from demandops.service.timing.waiting_turns import WaitingTurns
+from demandops.staterepo.write.commit_batch import CommitBatch
+
+
+class OwnWork:
+    """Ends overrides, scales down, empties drained nodes and books demands that waited."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._override_expiry = OverrideExpiry()
+        self._scale_down = ScaleDown()
+        self._draining = Draining(runtime)
+        self._waiting_turns = WaitingTurns(runtime)
+
+    def commit_due(self, commits: CommitBatch) -> None:
+        """Commit what is due; retry later what failed."""
+        self._override_expiry.end_due(commits, self._runtime.now())
+        self._scale_down.end_due(commits, self._runtime.now())
+        self._draining.move_due(commits)
+        self._waiting_turns.book_due(commits)
+
+    def follow(self, commits: CommitBatch, before: State) -> None:
+        """Book what waited for room, if the demand decided on ``before`` gave some back."""
+        self._waiting_turns.follow(commits, before)
+
+    def postpone(self) -> None:
+        """Commit nothing that ends for a while, because the commits could not be published."""
+        self._override_expiry.postpone(self._runtime.now())
+        self._scale_down.postpone(self._runtime.now())
+
+    def is_due(self, state: State) -> bool:
+        """Return whether to commit anything now."""
+        now = self._runtime.now()
+        return (
+            self._override_expiry.is_due(state, now)
+            or self._scale_down.is_due(state.ledger, now)
+            or self._draining.is_due(state)
+            or self._waiting_turns.is_due(state)
+        )
+
+    def seconds_until_due(self, state: State, longest: float) -> float:
+        """Return the seconds until the next end: at least one, at most ``longest``."""
+        now = self._runtime.now()
+        seconds = self._override_expiry.seconds_until_due(state, now, longest)
+        return self._scale_down.seconds_until_due(state.ledger, now, seconds)

@@ -1,0 +1,37 @@
+"""How long to stop following the state repo after an error; demands are still published."""
+
+from __future__ import annotations
+
+from demandops.runtime import Runtime
+
+FIRST_S, LONGEST_S = 1.0, 60.0
+
+
+class Rest:
+    """A pause, twice as long after each error that follows another."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._next, self._until = FIRST_S, runtime.monotonic()
+
+    def __bool__(self) -> bool:
+        """Return whether to rest now."""
+        return self._runtime.monotonic() < self._until
+
+    @property
+    def follows_success(self) -> bool:
+        """Whether the next rest is the first since something worked."""
+        return self._next == FIRST_S
+
+    def seconds_left(self) -> float:
+        """Return the seconds until the end of the rest."""
+        return self._until - self._runtime.monotonic()
+
+    def begin(self) -> None:
+        """Rest from now on."""
+        self._until = self._runtime.monotonic() + self._next
+        self._next = min(2 * self._next, LONGEST_S)
+
+    def succeeded(self) -> None:
+        """Make the next rest short again."""
+        self._next = FIRST_S

@@ -1,0 +1,57 @@
+"""When the demands that wait for room are tried again, and in which order.
+
+When a state may have room for them, they are tried before any other demand is decided. So no demand
+gets the room for which an earlier one, or one of a higher priority, was waiting.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from demandops.decision import State, decide
+from demandops.errors import InvalidInput
+from demandops.ledger.waiting import in_turn
+from demandops.quoting import quoted
+from demandops.runtime import Runtime
+from demandops.staterepo.write.commit_batch import CommitBatch
+
+log = logging.getLogger("demandops")
+
+
+class WaitingTurns:
+    """Books waiting demands once there is room for them, in one commit for each."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._tried: State | None = None
+
+    def book_due(self, commits: CommitBatch) -> None:
+        """Commit each waiting demand that fits, in turn, unless all were tried on this state."""
+        if not self.is_due(commits.head.state):
+            return
+        for waiting in in_turn(commits.head.state.ledger.waiting):
+            now = self._runtime.now()
+            try:
+                decision = decide(commits.head.state, dict(waiting.goal), now, commits.read)
+            except InvalidInput as error:
+                log.debug("demand %s waits on: %s", quoted(waiting.demand), error)
+                continue
+            if decision.outcome == "booked" and not decision.approval:
+                commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
+                log.info("demand %s no longer waits", quoted(waiting.demand))
+        self._tried = commits.head.state
+
+    def follow(self, commits: CommitBatch, before: State) -> None:
+        """Book waiting demands if the demand decided on ``before`` gave room back."""
+        if commits.frees:
+            commits.frees = False
+            self.book_due(commits)
+        elif self._tried is before:  # there is no more room than when they were tried
+            self._tried = commits.head.state
+
+    def is_due(self, state: State) -> bool:
+        """Return whether demands wait that were not tried on this state."""
+        tried = self._tried
+        return bool(state.ledger.waiting) and not (
+            tried is not None and tried.ledger is state.ledger and tried.config is state.config
+        )

@@ -1,0 +1,66 @@
+"""A checkout of a state repo, for reading: the commit that a person has checked out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pygit2
+from pygit2 import Oid, Repository
+
+from demandops.errors import StateRepoError
+from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git.local_repository import LocalRepository
+from demandops.staterepo.git.repository import PushDenied
+
+_ROOT_FILE = "demandops.yaml"
+
+
+def is_checkout(folder: Path) -> bool:
+    """Return whether a folder has the files of a state repo and belongs to Git."""
+    return (folder / ".git").exists() and (folder / _ROOT_FILE).is_file()
+
+
+def checkout_around(folder: Path) -> Path | None:
+    """Return the checkout of a state repo that a folder is in, or None."""
+    return next((one for one in (folder, *folder.parents) if is_checkout(one)), None)
+
+
+def origin_of(checkout: Path) -> str | None:
+    """Return the URL that a checkout was cloned from and is pushed to, or None."""
+    try:
+        remotes = {remote.name: remote.url for remote in Repository(str(checkout)).remotes}
+    except pygit2.GitError:
+        return None
+    return remotes.get("origin")
+
+
+class Checkout(LocalRepository):
+    """A checkout: its newest commit is the one that is checked out, whatever its branch."""
+
+    main_reference = "HEAD"
+    branches = "refs/remotes/origin/"
+
+    def tip(self) -> Oid:
+        """Return the commit that is checked out."""
+        target = self.objects.head.target
+        assert isinstance(target, Oid)  # noqa: S101 - HEAD is resolved
+        return target
+
+    def _require_usable(self, path: Path) -> None:
+        if self.objects.is_empty or self.objects.head_is_unborn:
+            raise StateRepoError(f"{path} has no commit yet; commit its files first")
+        _ = self.objects[self.tip()].peel(pygit2.Commit).tree
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Refuse: a generator writes to a bare repository or through a URL."""
+        raise PushDenied(f"{self.address} is a checkout, which is only read; name its remote")
+
+
+class LastFetch(LocalRepository):
+    """The clone of a URL as it was last fetched, for readers that must not wait for the network."""
+
+    main_reference = f"refs/remotes/origin/{MAIN_BRANCH}"
+    branches = "refs/remotes/origin/"
+
+    def _require_usable(self, path: Path) -> None:
+        _ = self.objects[self.tip()].peel(pygit2.Commit).tree

@@ -1,0 +1,103 @@
+"""A pack and its index, as Git reads them, written and synced.
+
+Objects are compressed and stored whole. A search for deltas would cost more than the rest of a
+demand's commit; git's housekeeping makes them later (:mod:`demandops.staterepo.git.new_objects`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from pygit2 import Oid
+from pygit2.enums import ObjectType
+
+_KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
+_LEVEL = 1
+"""Objects are new and short-lived in this form, so speed counts more than size."""
+_SHORT_OFFSETS = 1 << 31
+"""Offsets from here on are in a table of their own."""
+
+
+class Packed(NamedTuple):
+    """An object in a pack: its id, the checksum of its bytes there, and where they start."""
+
+    oid: bytes
+    crc: int
+    offset: int
+
+
+def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -> Path:
+    """Write a pack and its index into a folder, sync both, and return the pack's path.
+
+    Raises:
+        OSError: if either cannot be written or synced.
+    """
+    parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
+    packed, offset = list[Packed](), len(parts[0])
+    for oid, kind, data in objects:
+        part = _header(_KINDS[kind], len(data)) + zlib.compress(data, _LEVEL)
+        packed.append(Packed(oid.raw, zlib.crc32(part), offset))
+        parts.append(part)
+        offset += len(part)
+    checksum = _sha1(parts)
+    path = folder / f"pack-{checksum.hex()}.pack"
+    _write_synced(path, [*parts, checksum])
+    _write_synced(path.with_suffix(".idx"), index_of(packed, checksum))
+    return path
+
+
+def _header(kind: int, size: int) -> bytes:
+    """Return the type and size of an object, seven bits of the size in each byte but the first."""
+    first, size = kind << 4 | size & 0xF, size >> 4
+    header = bytearray()
+    while size:
+        header.append(first | 0x80)
+        first, size = size & 0x7F, size >> 7
+    header.append(first)
+    return bytes(header)
+
+
+def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
+    """Return an index of the second version in parts, for a pack with this checksum."""
+    found = sorted(packed)
+    firsts = [one.oid[0] for one in found]
+    far = [one.offset for one in found if one.offset >= _SHORT_OFFSETS]
+    places = {offset: _SHORT_OFFSETS | place for place, offset in enumerate(far)}
+    parts = [
+        b"\xfftOc" + struct.pack(">I", 2),
+        struct.pack(">256I", *(bisect_right(firsts, first) for first in range(256))),
+        b"".join(one.oid for one in found),
+        _numbers("I", (one.crc for one in found)),
+        _numbers("I", (places.get(one.offset, one.offset) for one in found)),
+        _numbers("Q", far),
+        checksum,
+    ]
+    return [*parts, _sha1(parts)]
+
+
+def _numbers(size: str, numbers: Iterable[int]) -> bytes:
+    each: Iterator[bytes] = (struct.pack(f">{size}", number) for number in numbers)
+    return b"".join(each)
+
+
+def _sha1(parts: Iterable[bytes]) -> bytes:
+    digest = hashlib.sha1()  # noqa: S324 - Git's checksums
+    for part in parts:
+        digest.update(part)
+    return digest.digest()
+
+
+def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
+    """Write a new file that nobody may change, like those of git."""
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)
+    with open(handle, "wb") as file:  # noqa: PTH123 - of the handle
+        file.writelines(parts)
+        file.flush()
+        os.fsync(handle)

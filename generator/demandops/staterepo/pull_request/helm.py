@@ -1,0 +1,123 @@
+"""The program ``helm``: its report on a chart, as kinds of objects or as faults.
+
+Helm keeps its files in a folder of its own. It has no access to a cluster or to chart repositories.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from demandops.errors import Fault, fault
+from demandops.quoting import quoted
+
+HELM_BIN = "HELM_BIN"
+"""The environment variable that names the program, instead of ``helm`` on ``PATH``."""
+
+_SECONDS = 120
+_MOST = 400
+_API = re.compile(r"(?m)^apiVersion: *[\"']?([^\s\"']+)")
+_KIND = re.compile(r"(?m)^kind: *[\"']?([^\s\"']+)")
+_LINT = re.compile(r"\[(?P<level>ERROR|WARNING)\] (?P<text>.*)")
+_PLACE = re.compile(
+    r"(?P<path>[A-Za-z0-9][\w.-]*/(?:charts/[\w.-]+/)*templates/[\w./-]+?)(?::(?P<line>\d+))?(?=[:)\s])"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Helm's report on a chart with some values: API group and kind of its objects, or faults."""
+
+    kinds: tuple[tuple[str, str], ...] = ()
+    faults: tuple[Fault, ...] = ()
+    warnings: tuple[Fault, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Helm:
+    """The installed program, and a folder for what it keeps."""
+
+    program: str
+    home: Path
+
+    @staticmethod
+    def find(home: Path) -> Helm | None:
+        """Return the program that ``HELM_BIN`` or ``PATH`` names, if there is one."""
+        program = shutil.which(os.environ.get(HELM_BIN) or "helm")
+        return Helm(program, home) if program else None
+
+    def lint(self, chart: Path, values: Path) -> Report:
+        """Return the faults and warnings of ``helm lint``."""
+        code, out, err = self._run("lint", str(chart), f"--values={values}")
+        found = parsed_lint(out, chart.name)
+        if code != 0 and not found.faults:
+            return Report(faults=(parsed_error(err or out, chart.name),))
+        return found
+
+    def template(self, chart: Path, values: Path, release: str, namespace: str) -> Report:
+        """Return the kinds of the objects of a release."""
+        code, out, err = self._run(
+            *("template", release, str(chart), "--include-crds", "--skip-tests"),
+            *(f"--namespace={namespace}", f"--values={values}"),
+        )
+        if code != 0:
+            return Report(faults=(parsed_error(err, chart.name),))
+        return Report(tuple(parsed_kinds(out)))
+
+    def _run(self, *arguments: str) -> tuple[int, str, str]:
+        environment = {
+            "PATH": os.environ.get("PATH", os.defpath),
+            "HOME": str(self.home),
+            "KUBECONFIG": os.devnull,
+            "HELM_PLUGINS": str(self.home / "plugins"),
+        }
+        try:
+            done = subprocess.run(
+                [self.program, *arguments],
+                env=environment,
+                capture_output=True,
+                check=False,
+                timeout=_SECONDS,
+            )
+        except subprocess.TimeoutExpired:
+            return 1, "", f"Error: helm did not end within {_SECONDS} s"
+        out, err = (text.decode("utf-8", "replace") for text in (done.stdout, done.stderr))
+        return done.returncode, out, err
+
+
+def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
+    """Yield API group and kind of each object that ``helm template`` printed."""
+    for document in re.split(r"(?m)^---$", out):
+        api, kind = _API.search(document), _KIND.search(document)
+        if kind:
+            yield api[1].rpartition("/")[0] if api else "", kind[1]
+
+
+def parsed_lint(out: str, chart: str) -> Report:
+    """Return what ``helm lint`` printed about a chart. Paths are below the chart's name."""
+    found: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
+    for entry in re.split(r"\n(?=\[|\n)", out):
+        match = _LINT.match(entry.strip())
+        if match:
+            found[match["level"]].append(_told(entry.strip()[match.start("text") :], chart))
+    return Report(faults=tuple(found["ERROR"]), warnings=tuple(found["WARNING"]))
+
+
+def parsed_error(err: str, chart: str) -> Fault:
+    """Return helm's error message as a fault, with the template and line that it names."""
+    text = err.partition("Error: ")[2] or err
+    return _told(text.partition("\n\nUse --debug")[0].strip(), chart)
+
+
+def _told(text: str, chart: str) -> Fault:
+    places = [*_PLACE.finditer(text)]
+    place = places[-1] if places else None
+    file = place["path"] if place else chart
+    line = f"line {place['line']}" if place and place["line"] else ""
+    said = quoted(" ".join(text.split()), _MOST)
+    return fault(line, f"helm says {said}; fix the chart or its values").within(file)

@@ -1,0 +1,160 @@
+"""A person's commit, made for them by a command: on main, or on a branch to be merged.
+
+It has the person's own name as author and committer, so a generator reads it like any other edit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from pygit2 import Commit, Oid, Tree
+
+from demandops.errors import Fault, InvalidInput, StateRepoError
+from demandops.render.changes.changeset import FileReader
+from demandops.runtime import REAL
+from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git import signing
+from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.repository import StateRepository
+from demandops.staterepo.history import commit_message
+from demandops.staterepo.history.authorship import Person
+from demandops.staterepo.history.message_format import compose
+from demandops.staterepo.load import last_valid_config
+from demandops.staterepo.write.proposal_branch import PendingProposal, ProposalBranches
+
+_ATTEMPTS = 5
+_PAUSE_S = 0.2
+
+Files = Mapping[str, str | None]
+"""Path → the new text; None removes the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Author:
+    """The person who commits, the time, and the words of the message."""
+
+    person: Person
+    now: datetime
+    summary: str
+    reason: str = ""
+
+    @property
+    def text(self) -> str:
+        """The message of the commit."""
+        return compose([[self.summary], [self.reason] if self.reason else []], [])
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A commit on main, or on a branch; ``link`` is the merge request that the server printed."""
+
+    commit: str
+    branch: str
+    link: str = ""
+
+
+def commit_to_main(
+    repository: StateRepository, make: Callable[[FileReader], Files], author: Author
+) -> Published:
+    """Commit files to main.
+
+    Args:
+        repository: the state repo.
+        make: returns the files, given a reader of main; called again if main has moved.
+        author: the person, the time and the message.
+
+    Raises:
+        InvalidInput: the files are not valid; nothing was changed.
+        StateRepoError: the commit could not be published.
+    """
+    return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), author)
+
+
+def commit_to_branch(
+    repository: StateRepository, files: Files, author: Author, branch: str, options: Sequence[str]
+) -> Published:
+    """Commit files to a new branch on top of main; ``options`` are push options for the server.
+
+    Raises:
+        InvalidInput: the files are not valid; nothing was changed.
+        StateRepoError: the branch exists, or could not be pushed.
+    """
+    tip = trees.commit_of(repository.objects, repository.refresh())
+    made = _commit(repository, tip, files, [tip.id], author)
+    branches = ProposalBranches(repository)
+    if branches.exists(branch):
+        raise StateRepoError(f"the branch {branch} exists already; merge or delete it first")
+    link = branches.put(branch, made, "", options)
+    return Published(str(made), branch, link)
+
+
+def merge(repository: StateRepository, proposal: PendingProposal, author: Author) -> Published:
+    """Merge a proposal into main by a merge commit.
+
+    Raises:
+        StateRepoError: main has other changes to the same files, or cannot be written.
+    """
+    objects = repository.objects
+    head = trees.commit_of(objects, proposal.commit)
+
+    def make(tip: Commit) -> tuple[Files, list[Oid]]:
+        base = objects.merge_base(tip.id, head.id)
+        if base is None:
+            raise StateRepoError(f"{proposal.branch} and {MAIN_BRANCH} have no commit in common")
+        start = trees.commit_of(objects, base).tree
+        proposed = [path for path, _ in trees.differences(start, head.tree)]
+        if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):
+            raise StateRepoError(
+                f"{MAIN_BRANCH} changed since {proposal.branch} was made; a running generator "
+                "makes it anew, so try again then"
+            )
+        read = _reader(head.tree)
+        return {path: read(path) for path in proposed}, [tip.id, head.id]
+
+    return _publish(repository, make, author)
+
+
+def _publish(
+    repository: StateRepository,
+    make: Callable[[Commit], tuple[Files, list[Oid]]],
+    author: Author,
+) -> Published:
+    for attempt in range(1, _ATTEMPTS + 1):
+        tip = trees.commit_of(repository.objects, repository.refresh())
+        files, parents = make(tip)
+        made = _commit(repository, tip, files, parents, author)
+        if repository.publish(tip.id, made):
+            return Published(str(made), MAIN_BRANCH)
+        repository.new.forget()
+        REAL.sleep(_PAUSE_S * attempt)
+    raise StateRepoError(
+        f"{repository.address} moved {_ATTEMPTS} times; nothing was changed, try again"
+    )
+
+
+def _commit(
+    repository: StateRepository, tip: Commit, files: Files, parents: list[Oid], author: Author
+) -> Oid:
+    tree = trees.write(repository.new, tip.tree, dict(files))
+    new_faults = _faults(repository.objects[tree].peel(Tree)) - _faults(tip.tree)
+    if new_faults:
+        raise InvalidInput(sorted(new_faults, key=str))
+    who = commit_message.signature(*author.person, author.now)
+    return signing.create_commit(
+        repository.new, repository.signer, (who, who), author.text, tree, parents
+    )
+
+
+def _faults(tree: Tree) -> set[Fault]:
+    """Return the faults of a configuration; a commit may not add to those that main has."""
+    try:
+        last_valid_config.config_at(tree)
+    except InvalidInput as error:
+        return {*error.faults}
+    return set()
+
+
+def _reader(tree: Tree) -> FileReader:
+    return lambda path: trees.read_text(tree, path)

@@ -1,0 +1,1 @@
+"""The web page, which shows the state repo live. It changes nothing."""

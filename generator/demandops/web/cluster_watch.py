@@ -1,0 +1,90 @@
+"""Watches the releases on their clusters, and notes when the state of one changes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+
+from demandops.cluster.access import ClusterAccess
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import ClusterDomain, Target
+from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.release_status import ReleaseStatus, statuses
+from demandops.runtime import Runtime
+from demandops.staterepo.git.repository import StateRepository
+from demandops.web.moment import HealthChange
+from demandops.web.views.health_word import word_of
+
+_KEPT = 2_000
+"""How many changes of health are kept; older ones are dropped."""
+
+
+class ClusterWatch:
+    """The watched clusters; all methods but :attr:`changes` belong to one thread."""
+
+    def __init__(
+        self,
+        clusters: Mapping[str, ClusterAccess],
+        on_change: Callable[[], None],
+        runtime: Runtime,
+    ) -> None:
+        self._runtime = runtime
+        self._caches = {
+            name: ObjectCache(name, access, on_change, runtime)
+            for name, access in clusters.items()
+            if access.kubeconfig
+        }
+        self._domains = set[ClusterDomain]()
+        self._states: dict[str, str] = {}
+        self._unhealthy_from: dict[str, float] = {}
+        self._changes = deque[HealthChange](maxlen=_KEPT)
+
+    @property
+    def clusters(self) -> frozenset[str]:
+        """The names of the clusters that are watched."""
+        return frozenset(self._caches)
+
+    @property
+    def changes(self) -> tuple[HealthChange, ...]:
+        """The changes of health since the start, oldest first; from any thread."""
+        return tuple(self._changes.copy())
+
+    def statuses(
+        self, targets: Iterable[Target], commit: str, repository: StateRepository
+    ) -> dict[str, ReleaseStatus]:
+        """Return the status of each release, by name; also watch releases that are new."""
+        wanted = list(targets)
+        for domain in dict.fromkeys(target.domain for target in wanted):
+            if domain.cluster in self._caches and domain not in self._domains:
+                self._domains.add(domain)
+                self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)
+        by_name = {target.name: one for target, one in zip(wanted, found, strict=True)}
+        self._note(by_name)
+        return by_name
+
+    def _note(self, statuses: Mapping[str, ReleaseStatus]) -> None:
+        at = self._runtime.monotonic()
+        for name, status in statuses.items():
+            before, after = self._states.get(name, ""), word_of(status)
+            if before == after:
+                continue
+            self._states[name] = after
+            lasted = None
+            if after == "healthy":
+                began = self._unhealthy_from.pop(name, None)
+                lasted = None if began is None else at - began
+            elif after != "unknown":
+                self._unhealthy_from.setdefault(name, at)
+            if before:
+                reason = status.health.reason
+                change = HealthChange(self._runtime.now(), name, before, after, reason, lasted)
+                self._changes.append(change)
+        for name in self._states.keys() - statuses.keys():
+            del self._states[name]
+            self._unhealthy_from.pop(name, None)
+
+    def close(self) -> None:
+        """Stop watching."""
+        for cache in self._caches.values():
+            cache.close()

@@ -1,0 +1,274 @@
+"""The state at one commit, and the situation: this state with what clusters and forge tell."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from functools import cached_property
+from typing import Any
+
+from demandops.cluster.health.release_health import Health, Target
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.config.config import Config
+from demandops.config.override import Override
+from demandops.decision import State
+from demandops.demand.claim import Claim
+from demandops.errors import Fault
+from demandops.ledger.claim_changes import changes_on
+from demandops.ledger.ledger import Ledger
+from demandops.ledger.world import World
+from demandops.plan.overrides.claim_overrides import without_suspended
+from demandops.plan.planner import denied_release, plan
+from demandops.plan.release import Release, ServiceKey, ServiceRelease
+from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of_claims
+from demandops.plan.views import release_causes
+from demandops.plan.views.override_report import Entry, override_report
+from demandops.service import rollout_targets
+from demandops.staterepo.history.commit_log import LogEntry
+from demandops.staterepo.load.problem_report import Problem
+from demandops.staterepo.load.snapshot import Snapshot
+from demandops.staterepo.write.proposal_branch import PendingProposal
+from demandops.subject import Subject, SubjectKind
+
+_UNKNOWN = ReleaseStatus(Health("waiting"))
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A release, its place in a cluster, and the claims that need it."""
+
+    release: Release
+    target: Target
+    behind: list[Claim]
+
+
+@dataclass(frozen=True, slots=True)
+class KnownRows:
+    """The rows of a list by their ids, each with what it was made of.
+
+    ``made_for`` are the statuses that they were made for, or None if the books were others.
+    """
+
+    made_for: object
+    rows: Mapping[str, tuple[tuple[Any, ...], Any]]
+
+
+class Moment:
+    """The books at one commit: what runs, and for whom. Derived once, when it is asked for.
+
+    What later books have in common with them, :meth:`take_over` keeps: then a commit costs what it
+    changes.
+    """
+
+    def __init__(
+        self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
+    ) -> None:
+        self.snapshot, self.entry, self.problems = snapshot, entry, problems
+        self.rows: dict[str, KnownRows] = {}
+        """The rows of lists, as far as they were made."""
+        self._entries: list[Entry] | None = None
+        self._planned: dict[ReleaseKey, Planned | None] | None = None
+        self.last_changes: dict[str, LogEntry | None] = {}
+        """File → the newest commit that changed it, for files that were asked for."""
+
+    @property
+    def commit(self) -> str:
+        """The commit's id."""
+        return str(self.snapshot.commit)
+
+    @property
+    def state(self) -> State:
+        """Configuration and ledger in effect."""
+        return self.snapshot.state
+
+    @property
+    def config(self) -> Config:
+        """The configuration in effect."""
+        return self.state.config
+
+    @cached_property
+    def active(self) -> World:
+        """Configuration and ledger without the claims that overrides suspend."""
+        return without_suspended(self.state)
+
+    def take_over(self, before: Moment) -> None:
+        """Keep what an earlier moment has derived, and derive only what may differ.
+
+        Does nothing if the configuration or the overrides differ, because then all may differ.
+        """
+        old, new = before.state, self.state
+        if (old.config, old.overrides) != (new.config, new.overrides):
+            return
+        subjects = _changed_subjects(old.ledger, new.ledger)
+        changes = changes_on(old.ledger, new.ledger, subjects)
+        keys = {*affected_keys(old, new, changes), *_kept_differently(old.ledger, new.ledger)}
+        for one, other in ((change.before, change.after) for change in changes):
+            # who requests a release is often in no file
+            if one and other and (one.requesters, one.partial) != (other.requesters, other.partial):
+                keys.update(keys_of_claims(self.active, [other]))
+        known = before.planned | dict(self._for_other_claims(before, subjects))
+        for key in keys:
+            known.pop(key, None)
+            planned = self._plan(key)
+            if planned or denied_release(new, key):
+                known[key] = planned
+        self._planned = known
+        self.rows = {name: replace(rows, made_for=None) for name, rows in before.rows.items()}
+
+    def _for_other_claims(
+        self, before: Moment, subjects: Iterable[Subject]
+    ) -> Iterator[tuple[ReleaseKey, Planned]]:
+        """Yield the releases for these subjects, with the claims that need them now."""
+        gone: set[int] = set()
+        fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
+        for subject in subjects:
+            was, now = (each.active.ledger.claims_on(subject) for each in (before, self))
+            gone |= {id(claim) for claim in was} - {id(claim) for claim in now}
+            known = {id(claim) for claim in was}
+            fresh[subject.kind][subject.id] = [one for one in now if id(one) not in known]
+        for key, one in before.planned.items():
+            if one is None:
+                continue
+            kind, ids = _held_by(one.release)
+            if fresh[kind].keys().isdisjoint(ids):
+                continue
+            kept = [claim for claim in one.behind if id(claim) not in gone]
+            added = [claim for id in ids for claim in fresh[kind].get(id, ())]
+            needing = [claim for claim in added if release_causes.needs(claim, one.release)]
+            if needing or len(kept) < len(one.behind):
+                yield key, replace(one, behind=release_causes.by_booking([*kept, *needing]))
+
+    def _plan(self, key: ReleaseKey) -> Planned | None:
+        release = plan(self.state, key)
+        if release is None:
+            return None
+        target = rollout_targets.target_of(release, self.config.repo_settings)
+        return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
+
+    @property
+    def planned(self) -> dict[ReleaseKey, Planned | None]:
+        """What is planned at each key; None if an override denies it."""
+        if self._planned is None:
+            self._planned = {key: self._plan(key) for key in all_keys(self.state)}
+        return self._planned
+
+    @cached_property
+    def _sorted(self) -> list[Planned]:
+        """What is planned, sorted by cluster and name."""
+        found = filter(None, self.planned.values())
+        return sorted(found, key=lambda one: (one.target.domain.cluster, one.target.name))
+
+    @cached_property
+    def targets(self) -> list[tuple[Release, Target]]:
+        """Every release with its place in a cluster, sorted by cluster and name."""
+        return [(one.release, one.target) for one in self._sorted]
+
+    @cached_property
+    def denied(self) -> list[tuple[Release, Override]]:
+        """The releases that claims need and an override denies, with the override."""
+        keys = (key for key, one in self.planned.items() if one is None)
+        return [found for key in keys if (found := denied_release(self.state, key))]
+
+    @cached_property
+    def releases(self) -> dict[str, Release]:
+        """Every release, by name."""
+        return {release.name: release for release, _ in self.targets}
+
+    def override_entries(self, now: datetime) -> list[Entry]:
+        """Return what each override does; the first call's time decides which have expired."""
+        if self._entries is None:
+            self._entries = override_report(self.state, now)
+        return self._entries
+
+    @cached_property
+    def behind(self) -> dict[str, list[Claim]]:
+        """The claims that need each release, by its name."""
+        return {one.target.name: one.behind for one in self._sorted}
+
+    @cached_property
+    def releases_of_demands(self) -> dict[str, list[str]]:
+        """The names of the releases that each demand needs, by its id."""
+        found: dict[str, list[str]] = {}
+        for name, claims in self.behind.items():
+            for demand in dict.fromkeys(claim.demand for claim in claims):
+                found.setdefault(demand, []).append(name)
+        return found
+
+    @cached_property
+    def claims_of_demands(self) -> dict[str, list[Claim]]:
+        """All claims, by demand; those of a demand are sorted."""
+        found: dict[str, list[Claim]] = {}
+        for claim in self.state.ledger:
+            found.setdefault(claim.demand, []).append(claim)
+        for claims in found.values():
+            if len(claims) > 1:
+                claims.sort(key=lambda one: str(one.subject))
+        return found
+
+
+def _held_by(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
+    """Return the applications or connections that a release is for."""
+    if isinstance(release, ServiceRelease):
+        return SubjectKind.APPLICATION, release.applications
+    return SubjectKind.CONNECTION, release.connections
+
+
+def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
+    """Return the subjects whose claims differ.
+
+    What did not change is the same object in both, and a look-up by subject takes longer.
+    """
+    before = {id(claims): subject for subject, claims in old.claims.items()}
+    after = {id(claims): subject for subject, claims in new.claims.items()}
+    differing = before.keys() ^ after.keys()
+    return [*dict.fromkeys(before.get(each) or after[each] for each in differing)]
+
+
+def _kept_differently(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
+    """Yield the services that keep other replicas than before."""
+    before, after = old.kept.steps, new.kept.steps
+    for instance in {*before, *after}:
+        if before.get(instance) != after.get(instance):
+            yield ServiceKey.of(instance)
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """The state at a moment, with the health of releases and the open proposals.
+
+    ``statuses`` are those of releases, by name; empty for an earlier moment. ``watched`` are the
+    clusters that are watched. ``unread`` is why a newer state cannot be read, or empty.
+    """
+
+    moment: Moment
+    now: datetime
+    is_newest: bool = True
+    statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)
+    watched: frozenset[str] = frozenset()
+    proposals: tuple[PendingProposal, ...] = ()
+    unread: str = ""
+
+    def status(self, release: str) -> ReleaseStatus:
+        """Return the status of a release."""
+        return self.statuses.get(release, _UNKNOWN)
+
+
+@dataclass(frozen=True, slots=True)
+class HealthChange:
+    """A change of a release's health; ``lasted_s`` is how long it had been unhealthy."""
+
+    time: datetime
+    release: str
+    before: str
+    after: str
+    reason: str = ""
+    lasted_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Commit:
+    """A commit of the history, and the top-level entries that it changed."""
+
+    entry: LogEntry
+    roots: tuple[str, ...]

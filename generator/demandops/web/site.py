@@ -1,0 +1,244 @@
+"""The site: how its views become pages, its events, and the headers that keep it closed.
+
+Every address is read only, and no page loads anything from another host. Templates escape every
+value that they print, and show what is not visible.
+"""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from collections.abc import AsyncIterator, Callable
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import anyio
+from anyio import to_thread
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from starlette.applications import Starlette
+from starlette.datastructures import MutableHeaders
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from demandops import __version__
+from demandops.errors import DemandOpsError
+from demandops.quoting import escaped, lines
+from demandops.web.follower import Follower
+from demandops.web.view_pages import NAVIGATION, VIEWS, Asked, Data, View
+from demandops.web.views import rows
+
+log = logging.getLogger("demandops")
+
+_HERE = Path(__file__).parent
+_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+        "connect-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+_DOCS_HEADERS = _HEADERS | {
+    "Content-Security-Policy": (
+        "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+    )
+}
+"""The documentation has scripts within its pages, and nothing of any state repo."""
+_LOOK_S = 0.1
+_HEARTBEAT_S = 15.0
+_RETRY_MS = 1_000
+_MOST_LISTENERS = 100
+_EARLIER_AT_ONCE = 4
+"""How many views of earlier moments are made at once. One may take seconds, and must not keep those
+of now waiting."""
+
+
+class Site:
+    """The ASGI application of the page."""
+
+    def __init__(
+        self,
+        follower: Follower,
+        hosts: tuple[str, ...] = ("*",),
+        documentation: Path | None = None,
+    ) -> None:
+        """Make the site.
+
+        Args:
+            follower: the state repo.
+            hosts: the names that a browser may call it by, so that no other site can have its
+                visitors' browsers read this page; ``*`` for any.
+            documentation: the folder of the documentation's site; None: it was not built.
+        """
+        self._follower, self._has_docs = follower, documentation is not None
+        self._earlier = anyio.CapacityLimiter(_EARLIER_AT_ONCE)
+        self._templates = Environment(
+            loader=FileSystemLoader(_HERE / "pages"),
+            autoescape=True,
+            undefined=StrictUndefined,
+            finalize=_visible,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        self._templates.filters |= {
+            "when": _when,
+            "clock": _clock,
+            "ago": _ago,
+            "iso": _iso,
+            "sh": shlex.quote,
+        }
+        self.application = Starlette(
+            routes=[
+                *(Route(path, self._shows(view), methods=["GET"]) for path, view in VIEWS.items()),
+                Route("/events", _Events(follower), methods=["GET"]),
+                Route("/health", self._health, methods=["GET"]),
+                Mount("/static", StaticFiles(directory=_HERE / "static")),
+                *([Mount("/docs", StaticFiles(directory=documentation))] if documentation else []),
+            ],
+            middleware=[
+                Middleware(_ClosedHeaders),
+                Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts), www_redirect=False),
+            ],
+            exception_handlers={404: self._nothing_here},
+        )
+        self.application.router.redirect_slashes = False
+
+    def _shows(self, view: View) -> Callable[[Request], Any]:
+        async def answer(request: Request) -> Response:
+            limiter = self._earlier if request.query_params.get("at") else None
+            return await to_thread.run_sync(self._render, view, request, limiter=limiter)
+
+        return answer
+
+    def _render(self, view: View, request: Request) -> Response:
+        try:
+            asked = Asked(self._follower, request)
+            template, data = view(asked)
+            return self._page(asked, template, data)
+        except DemandOpsError as error:
+            return self._message(request, "Nothing to show", str(error), 404)
+        except Exception:  # a fault of the page must not stop the node in its process
+            log.exception("view %s of the page does not work", request.url.path)
+            text = "a fault of the program; see its log"
+            return self._message(request, "This view does not work", text, 500)
+
+    def _page(self, asked: Asked, template: str, data: Data, status: int = 200) -> Response:
+        common = {
+            "navigation": NAVIGATION,
+            "here": asked,
+            "now": asked.situation.now,
+            "situation": asked.situation,
+            "moment": asked.situation.moment,
+            "exactly": rows.exactly,
+            "program": __version__,
+            "has_docs": self._has_docs,
+        }
+        text = self._templates.get_template(template).render(common | data)
+        return HTMLResponse(text, status)
+
+    def _message(self, request: Request, title: str, text: str, status: int) -> Response:
+        page = self._templates.get_template("message.html.j2")
+        shown = {"title": title, "text": text, "path": request.url.path}
+        return HTMLResponse(page.render(shown), status)
+
+    async def _nothing_here(self, request: Request, error: Exception) -> Response:
+        return self._message(request, "Nothing here", "there is no such view", 404)
+
+    async def _health(self, request: Request) -> Response:
+        unread = self._follower.newest.unread
+        return PlainTextResponse("behind\n" if unread else "ok\n", 503 if unread else 200)
+
+
+class _Events:
+    """Tells browsers when there is something new to show, as server-sent events."""
+
+    def __init__(self, follower: Follower) -> None:
+        self._follower, self._listeners = follower, 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if self._listeners >= _MOST_LISTENERS:
+            await PlainTextResponse("too many pages are open\n", 503)(scope, receive, send)
+            return
+        unbuffered = {"X-Accel-Buffering": "no"}  # a proxy may pass on each event at once
+        answer = StreamingResponse(self._changes(), 200, unbuffered, "text/event-stream")
+        self._listeners += 1
+        try:
+            await answer(scope, receive, send)
+        finally:
+            self._listeners -= 1
+
+    async def _changes(self) -> AsyncIterator[str]:
+        told, silent = -1, 0.0
+        yield f"retry: {_RETRY_MS}\n\n"
+        while not self._follower.closed.is_set():
+            version = self._follower.version
+            if version != told:
+                told, silent = version, 0.0
+                yield f"event: change\ndata: {version}\n\n"
+            elif silent > _HEARTBEAT_S:
+                silent = 0.0
+                yield ": still here\n\n"
+            await anyio.sleep(_LOOK_S)
+            silent += _LOOK_S
+
+
+class _ClosedHeaders:
+    """Adds the headers that keep a page closed to every answer."""
+
+    def __init__(self, application: ASGIApp) -> None:
+        self._application = application
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                is_of_docs = scope["path"].startswith("/docs/")
+                MutableHeaders(scope=message).update(_DOCS_HEADERS if is_of_docs else _HEADERS)
+            await send(message)
+
+        await self._application(scope, receive, sending)
+
+
+# ---- what templates print ----
+
+
+def _visible(value: object) -> object:
+    """Return what a template prints with escapes for what is not visible."""
+    return value if isinstance(value, Markup) else lines(str(value))
+
+
+def _iso(at: datetime) -> str:
+    return at.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _when(at: datetime) -> str:
+    return escaped(at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"))
+
+
+def _clock(at: datetime, now: datetime) -> str:
+    """Return a time of today as a time of the day, and any other with its date."""
+    at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
+    return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")
+
+
+def _ago(at: datetime, now: datetime) -> str:
+    """Return a time as people say it, before or after now."""
+    seconds = (now - at).total_seconds()
+    amount = abs(seconds)
+    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
+        if amount >= length:
+            text = f"{amount / length:.0f} {unit}"
+            break
+    else:
+        text = f"{amount:.0f} s"
+    return f"{text} ago" if seconds >= 0 else f"in {text}"

@@ -1,0 +1,109 @@
+// Keeps the page current, filters while a person types, and lets times age. Without it all links
+// and the filter still work.
+"use strict";
+
+const content = () => document.getElementById("page");
+const live = document.getElementById("live");
+const field = document.getElementById("q");
+let shown = "";
+let asked = 0;
+
+// Replaces what the page shows by what the server has now; keeps focus, scroll and open details.
+async function show(address, isQuiet) {
+  const turn = ++asked;
+  const answer = await fetch(address, { headers: { Accept: "text/html" } });
+  const text = await answer.text();
+  if (turn !== asked || text === shown) return;
+  const next = new DOMParser().parseFromString(text, "text/html");
+  const fresh = next.getElementById("page");
+  if (!fresh) throw new Error("this is not the page");
+  shown = text;
+  const kept = where(document.activeElement);
+  const open = new Set([...content().querySelectorAll("details[open]")].map(place));
+  const scrolled = [...content().querySelectorAll(".scroll")].map((one) => [one.scrollLeft, one.scrollTop]);
+  for (const one of fresh.querySelectorAll("details")) if (open.has(place(one))) one.open = true;
+  content().replaceWith(document.adoptNode(fresh));
+  document.title = next.title;
+  for (const link of document.querySelectorAll("header nav a, header .brand")) {
+    const same = [...next.querySelectorAll("header nav a, header .brand")].find((one) => one.textContent === link.textContent);
+    if (same) link.setAttribute("href", same.getAttribute("href"));
+  }
+  content().querySelectorAll(".scroll").forEach((one, n) => scrolled[n] && one.scrollTo(...scrolled[n]));
+  if (kept) find(kept)?.focus({ preventScroll: true });
+  if (!isQuiet) say("updated");
+}
+
+// Where the focus is, so that it can be found in the new content.
+function where(element) {
+  if (!element || !content().contains(element)) return null;
+  const same = element.id ? [] : [...content().querySelectorAll(element.tagName)].filter((one) => key(one) === key(element));
+  return { id: element.id, tag: element.tagName, key: key(element), number: same.indexOf(element) };
+}
+
+function find(kept) {
+  if (kept.id) return document.getElementById(kept.id);
+  return [...content().querySelectorAll(kept.tag)].filter((one) => key(one) === kept.key)[kept.number];
+}
+
+const key = (one) => one.getAttribute("href") || one.getAttribute("aria-label") || one.textContent.slice(0, 80);
+const place = (one) => (one.closest("section, aside, figure")?.querySelector("h2, strong")?.textContent || "") + one.querySelector("summary")?.textContent;
+
+function say(text) {
+  if (!live) return;
+  live.textContent = text;
+  live.classList.toggle("away", text.startsWith("not current"));
+  live.classList.toggle("current", /^(live|updated)$/.test(text));
+}
+
+function age() {
+  const now = Date.now();
+  for (const one of document.querySelectorAll("time[datetime]")) {
+    const seconds = (now - Date.parse(one.dateTime)) / 1000;
+    const amount = Math.abs(seconds);
+    const [length, unit] = amount >= 86400 ? [86400, "d"] : amount >= 3600 ? [3600, "h"] : amount >= 60 ? [60, "min"] : [1, "s"];
+    const text = `${Math.round(amount / length)} ${unit}`;
+    const wanted = seconds >= 0 ? `${text} ago` : `in ${text}`;
+    if (one.textContent !== wanted) one.textContent = wanted;
+  }
+}
+
+function follow(isAgain) {
+  const events = new EventSource("/events");
+  let first = !isAgain;
+  events.addEventListener("change", () => {
+    // the first one tells what the page has, or after a break what it may have missed
+    if (!first) show(location.href, false).catch(() => say("not current: the server does not answer"));
+    first = false;
+    if (!live.textContent.startsWith("updated")) say("live");
+  });
+  events.addEventListener("error", () => {
+    say("not current: waiting for the server");
+    // a browser asks again by itself, unless it got another answer, as a proxy's without its server
+    if (events.readyState === EventSource.CLOSED) setTimeout(follow, 2000, true);
+  });
+}
+
+if (field) {
+  let timer = 0;
+  field.addEventListener("input", () => {
+    clearTimeout(timer);
+    timer = setTimeout(() => {
+      if (["/demand", "/release"].includes(location.pathname)) return;
+      const address = new URL(location.href);
+      if (field.value) address.searchParams.set("q", field.value);
+      else address.searchParams.delete("q");
+      address.searchParams.delete("page");
+      history.replaceState(null, "", address);
+      show(address, true).catch(() => say("not current: the server does not answer"));
+    }, 150);
+  });
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "/" && !/^(INPUT|TEXTAREA|SELECT)$/.test(document.activeElement.tagName)) {
+      event.preventDefault();
+      field.focus();
+    }
+  });
+}
+if (live?.dataset.live === "yes") follow(false);
+else say("an earlier moment");
+setInterval(age, 5000);

@@ -1,0 +1,181 @@
+"""The views by their addresses: for each, the template and the data that it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.requests import Request
+
+from demandops.config.override import format_time
+from demandops.web.follower import MOST_COMMITS, Follower
+from demandops.web.moment import Situation
+from demandops.web.views import (
+    demand_view,
+    fleet_map,
+    not_ready,
+    rates,
+    release_view,
+    rows,
+    time_line,
+)
+from demandops.web.views.lists import LISTS, rows_of
+from demandops.web.views.rows import Filter, Link, Row
+
+_KEPT = ("at", "q")
+"""The parameters that links to other views keep."""
+
+NAVIGATION = (
+    ("", "Not ready"),
+    ("map", "Map"),
+    *((kind.name, kind.title) for kind in LISTS.values()),
+    ("timeline", "Time line"),
+    ("overrides", "Overrides"),
+    ("rates", "Rates"),
+)
+"""The views: path and title."""
+
+_MOST_CAUSES = 100
+
+Data = dict[str, Any]
+View = Callable[["Asked"], tuple[str, Data]]
+
+
+class Asked:
+    """A request for a view: its parameters, the situation and the filter that they choose."""
+
+    def __init__(self, follower: Follower, request: Request) -> None:
+        self.follower = follower
+        self.path = request.url.path.strip("/")
+        self.params = dict(request.query_params)
+        self.situation: Situation = follower.at(self.get("at"))
+        self.filter = Filter(self.get("q"))
+
+    def get(self, name: str) -> str:
+        """Return a parameter; empty if it is not given."""
+        return self.params.get(name, "").strip()[:500]
+
+    def page(self) -> int:
+        """Return the number of the requested page of a list; 1 without a valid number."""
+        text = self.get("page")
+        return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
+
+    def to(self, path: str | None = None, **changes: str | int) -> str:
+        """Return the address of a view that keeps the chosen moment and filter.
+
+        Without ``path`` it is the address of this view with all its parameters. ``changes`` replace
+        parameters; an empty value removes one.
+        """
+        kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
+        params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
+        query = f"?{urlencode(params)}" if params else ""
+        return f"/{self.path if path is None else path}{query}"
+
+    def link(self, link: Link) -> str:
+        """Return the address of a link, which keeps the moment."""
+        return self.to(link.path, **{"q": "", **link.params})
+
+
+def _not_ready(asked: Asked) -> tuple[str, Data]:
+    moment = asked.situation.moment
+    last_change = partial(asked.follower.last_change, moment)
+    causes = not_ready.causes(asked.situation, asked.filter, last_change)
+    applications = not_ready.applications(asked.situation, causes, asked.filter)
+    data = {"causes": causes[:_MOST_CAUSES], "total": len(causes), "applications": applications}
+    return "not_ready.html.j2", data
+
+
+def _map(asked: Asked) -> tuple[str, Data]:
+    shown = fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))
+    return "map.html.j2", {"map": shown}
+
+
+def _list(asked: Asked) -> tuple[str, Data]:
+    kind = LISTS[asked.path]
+    found = rows_of(asked.situation, kind.name)
+    shown = rows.table(kind.columns, found, asked.filter, asked.get("sort"), asked.page())
+    return "list.html.j2", {"kind": kind, "table": shown}
+
+
+def _demand(asked: Asked) -> tuple[str, Data]:
+    held = demand_view.explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))
+    return "demand.html.j2", {"demand": held}
+
+
+def _release(asked: Asked) -> tuple[str, Data]:
+    found = release_view.explained(asked.situation, asked.follower.reader(), asked.get("name"))
+    return "release.html.j2", {"release": found}
+
+
+_EVENTS = 50
+
+
+def _timeline(asked: Asked) -> tuple[str, Data]:
+    now, lane = asked.situation, asked.get("lane")
+    every = time_line.events(asked.follower.history, asked.follower.health_changes)
+    found = time_line.matching(every, asked.filter, lane if lane in time_line.LANES else "")
+    chosen = None if now.is_newest else (now.moment.entry.time, now.moment.commit)
+    changed: list[str] = []
+    if asked.get("at"):
+        reader, commit = asked.follower.reader(), now.moment.commit
+        changed = reader.files_changed_by(commit)
+    last = max(1, -(-len(found) // _EVENTS))
+    page = min(max(asked.page(), 1), last)
+    return "timeline.html.j2", {
+        "strip": time_line.strip(found, now.now, asked.get("span"), chosen),
+        "lanes": time_line.LANES,
+        "lane": lane,
+        "spans": time_line.SPANS,
+        "events": found[(page - 1) * _EVENTS : page * _EVENTS],
+        "total": len(found),
+        "page": page,
+        "pages": last,
+        "changed": changed,
+        "is_cut": len(asked.follower.history) >= MOST_COMMITS,
+    }
+
+
+def _overrides(asked: Asked) -> tuple[str, Data]:
+    now, entries = asked.situation, []
+    for entry in now.moment.override_entries(now.now):
+        texts = {
+            "owner": [entry.override.owner],
+            "reason": [entry.override.reason],
+            "release": [release.name for release in entry.releases],
+            "demand": [claim.demand for claim in entry.claims],
+            "requester": [who for claim in entry.claims for who in claim.requesters],
+        }
+        if asked.filter.matches(Row({"override": rows.cell(entry.override.name)}, texts)):
+            entries.append(entry)
+    return "overrides.html.j2", {
+        "entries": entries,
+        "format_time": format_time,
+    }
+
+
+def _rates(asked: Asked) -> tuple[str, Data]:
+    span = asked.get("span") if asked.get("span") in time_line.SPANS else "1d"
+    health = asked.follower.health_changes
+    commits = [
+        one
+        for one in asked.follower.history
+        if asked.filter.matches(time_line.of_commit(one).row())
+    ]
+    plots = rates.plots(commits, health, asked.situation.now, span)
+    data = {"plots": plots, "span": span, "spans": time_line.SPANS}
+    return "rates.html.j2", data | {"width": rates.WIDTH, "height": rates.HEIGHT}
+
+
+VIEWS: Mapping[str, View] = {
+    "/": _not_ready,
+    "/map": _map,
+    **{f"/{name}": _list for name in LISTS},
+    "/demand": _demand,
+    "/release": _release,
+    "/timeline": _timeline,
+    "/overrides": _overrides,
+    "/rates": _rates,
+}
+"""Address → the function that returns the template and the data of a view."""

@@ -1,0 +1,78 @@
+"""One demand: what it holds, and what its release would change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from demandops import strict_yaml
+from demandops.decision import decide
+from demandops.demand.claim import Claim, requesters_of
+from demandops.errors import InvalidInput, StateRepoError
+from demandops.plan.views.release_causes import how_to_release
+from demandops.quoting import quoted
+from demandops.render.changes.changeset import ReleaseChange
+from demandops.settings import API_VERSION
+from demandops.staterepo.reader import Reader
+from demandops.web.moment import Situation
+
+
+@dataclass(frozen=True, slots=True)
+class Consequence:
+    """What the release of a demand would change, and how to release it.
+
+    ``file`` is a demand for ``demandops request``, empty if it is released in another way, which
+    ``how`` says. ``approval`` are the rules that require a person's approval.
+    """
+
+    releases: tuple[ReleaseChange, ...]
+    how: str
+    file: str
+    approval: tuple[str, ...] = ()
+    refused: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ExplainedDemand:
+    """A demand and its claims; ``releases`` are the names of the releases that it needs."""
+
+    id: str
+    claims: Sequence[Claim]
+    requesters: tuple[str, ...]
+    releases: Sequence[str]
+    consequence: Consequence
+
+
+def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
+    """Return a demand.
+
+    Raises:
+        StateRepoError: if it holds nothing.
+    """
+    claims = now.moment.claims_of_demands.get(id)
+    if not claims:
+        raise StateRepoError(f"demand {quoted(id)} holds nothing")
+    releases = now.moment.releases_of_demands.get(id, [])
+    return ExplainedDemand(
+        id, claims, requesters_of(claims), releases, _consequence(now, reader, id)
+    )
+
+
+def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
+    claims = now.moment.claims_of_demands[id]
+    goal = {
+        "apiVersion": API_VERSION,
+        "kind": "Demand",
+        "operation": "release",
+        "demand": id,
+        "requesters": list(requesters_of(claims)),
+    }
+    how = how_to_release(claims[0])
+    is_by_id = how.startswith("send operation")
+    file = strict_yaml.dump(goal) if is_by_id else ""
+    try:
+        read = reader.file_reader(now.moment.commit)
+        decision = decide(now.moment.state, goal, now.now, read)
+    except InvalidInput as error:
+        return Consequence((), how, file, refused=str(error))
+    return Consequence(decision.releases, how, file, decision.approval)

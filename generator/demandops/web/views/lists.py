@@ -1,0 +1,280 @@
+"""The lists: demands, services, connections and leases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, TypeAlias
+
+from demandops.demand.claim import Claim, requesters_of
+from demandops.ledger.waiting import WaitingDemand
+from demandops.ledger.world import World
+from demandops.plan.planner import connection_topics
+from demandops.plan.release import ServiceRelease
+from demandops.plan.views import demand_list
+from demandops.subject import SubjectKind
+from demandops.web.moment import KnownRows, Moment, Situation
+from demandops.web.views.health_word import PLACES, WORDS, word_of, worst_word
+from demandops.web.views.rows import Cell, Column, Link, Part, Row, cell, exactly
+
+Parts: TypeAlias = "tuple[Any, ...]"
+
+
+@dataclass(frozen=True, slots=True)
+class ListKind:
+    """A kind of list: its name in addresses, its title, its columns and its entries.
+
+    ``entries`` yields each entry's id and the parts that ``row`` makes its row of. The row is made
+    anew only if a part differs.
+    """
+
+    name: str
+    title: str
+    about: str
+    columns: tuple[Column, ...]
+    entries: Callable[[Situation], Iterator[tuple[str, Parts]]]
+    row: Callable[..., Row]
+
+
+def release_part(name: str) -> Part:
+    """Return a release's name, which leads to its view."""
+    return Part(name, Link("release", {"name": name}))
+
+
+def demand_part(id: str) -> Part:
+    """Return a demand's id, which leads to its view."""
+    return Part(id, Link("demand", {"id": id}))
+
+
+def health_cell(word: str) -> Cell:
+    """Return the cell of a health; the worst sorts first."""
+    return cell(word, tone=WORDS[word], order=PLACES[word])
+
+
+def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
+    """Return values that lead to a view, filtered by them."""
+    return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
+
+
+def _requesters(of: Iterable[str]) -> Cell:
+    return cell(*_filtered("demands", "requester", of))
+
+
+def _services(now: Situation) -> Iterator[tuple[str, Parts]]:
+    for release, _ in now.moment.targets:
+        if isinstance(release, ServiceRelease):
+            name = release.name
+            yield name, (release, now.moment.behind[name], word_of(now.status(name)))
+
+
+def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
+    return Row(
+        {
+            "release": cell(release_part(release.name)),
+            "service": cell(release.key.service),
+            "node": cell(*_filtered("services", "node", [release.node.id])),
+            "cluster": cell(release.node.cluster),
+            "application": cell(*_filtered("services", "application", release.applications)),
+            "version": cell(release.version.name or release.chart.version),
+            "requester": _requesters(release.requesters),
+            "health": health_cell(word),
+        },
+        {
+            "demand": [*dict.fromkeys(claim.demand for claim in claims)],
+            "type": [release.node.type],
+        },
+    )
+
+
+def _connections(now: Situation) -> Iterator[tuple[str, Parts]]:
+    ledger, carrying = now.moment.active.ledger, clients_of(now.moment)
+    for id in ledger.subjects(SubjectKind.CONNECTION):
+        claims, clients = ledger.connection_claims(id), carrying.get(id, [])
+        if claims:  # not all are suspended
+            yield id, (claims, clients, worst_word(map(now.status, clients)))
+
+
+def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], word: str) -> Row:
+    held = claims[0].connection
+    return Row(
+        {
+            "connection": cell(held.id),
+            "by": cell(held.type.word if held.type else ""),
+            "from": cell(*_filtered("connections", "from", [held.source])),
+            "to": cell(*_filtered("connections", "to", [held.target])),
+            "topic": cell(*(route.source for route in connection_topics(claims))),
+            "requester": _requesters(requesters_of(claims)),
+            "release": cell(*map(release_part, clients)),
+            "health": health_cell(word),
+        },
+        {
+            "demand": [claim.demand for claim in claims],
+            "node": [held.source, held.target],
+        },
+    )
+
+
+def clients_of(moment: Moment) -> dict[str, list[str]]:
+    """Return the names of the releases that carry each connection, by its id."""
+    found: dict[str, list[str]] = {}
+    for name, release in moment.releases.items():
+        if not isinstance(release, ServiceRelease):
+            for id in release.connections:
+                found.setdefault(id, []).append(name)
+    return found
+
+
+def _demands(now: Situation) -> Iterator[tuple[str, Parts]]:
+    moment = now.moment
+    for id, claims in moment.claims_of_demands.items():
+        releases = moment.releases_of_demands.get(id, [])
+        yield id, (claims, releases, worst_word(map(now.status, releases)))
+    for one in moment.state.ledger.waiting.values():
+        yield f"waiting {one.demand}", (one, [], "waiting")
+
+
+def _demand(
+    world: World, holds: list[Claim] | WaitingDemand, releases: list[str], word: str
+) -> Row:
+    if isinstance(holds, WaitingDemand):
+        held = demand_list.waiting_demand(holds)
+    else:
+        held = demand_list.held_demand(holds, world)
+    health = health_cell(word)
+    if held.state == "suspended":
+        health = cell("suspended", tone="bad", order=0.0)
+    elif held.state == "waiting":
+        health = cell("waits for room", tone="busy", order=PLACES["waiting"])
+    return Row(
+        {
+            "demand": cell(demand_part(held.name)),
+            "request": cell(*held.requests),
+            "requester": _requesters(held.requesters),
+            "application": cell(*_filtered("services", "application", held.applications)),
+            "connection": cell(*_filtered("connections", "connection", held.connections)),
+            "since": _time(held.since),
+            "lease": _time(held.lease.until if held.lease else None),
+            "health": health,
+        },
+        {"release": releases, "node": held.nodes},
+    )
+
+
+def _leases(now: Situation) -> Iterator[tuple[str, Parts]]:
+    for claim in now.moment.state.ledger:
+        if claim.lease is not None:
+            yield f"{claim.subject} {claim.demand}", (claim,)
+
+
+def _lease(world: World, claim: Claim) -> Row:
+    lease = claim.lease
+    assert lease is not None  # noqa: S101 - only such claims are listed
+    return Row(
+        {
+            "ends": _time(lease.until),
+            "subject": cell(claim.subject.id),
+            "kind": cell(claim.subject.kind.value[:-1]),
+            "demand": cell(demand_part(claim.demand)),
+            "requester": _requesters(claim.requesters),
+            "term": cell(f"{lease.seconds} s", order=float(lease.seconds)),
+            "slack": cell(f"{lease.slack} s", order=float(lease.slack)),
+        },
+        {"node": demand_list.nodes_of(claim)},
+    )
+
+
+def _time(at: datetime | None) -> Cell:
+    return Cell(time=at)
+
+
+def _columns(*named: str) -> tuple[Column, ...]:
+    return tuple(Column(*each.split("|")) for each in named)
+
+
+def rows_of(now: Situation, name: str) -> list[Row]:
+    """Return the rows of a list; those of other books are taken where they are the same."""
+    moment, kind = now.moment, LISTS[name]
+    known = moment.rows.get(name, KnownRows(None, {}))
+    if known.made_for is not now.statuses:
+        made: dict[str, tuple[Parts, Row]] = {}
+        for id, parts in kind.entries(now):
+            before = known.rows.get(id)
+            is_same = before is not None and before[0] == parts
+            made[id] = before if before and is_same else (parts, kind.row(moment.state, *parts))
+        known = moment.rows[name] = KnownRows(now.statuses, made)
+    return [row for _, row in known.rows.values()]
+
+
+LISTS = {
+    kind.name: kind
+    for kind in (
+        ListKind(
+            "demands",
+            "Demands",
+            "What requesters hold, until they release it or its lease ends.",
+            _columns(
+                "demand|Demand",
+                "health|Health",
+                "requester|Requesters",
+                "application|Applications",
+                "connection|Connections",
+                "since|Since",
+                "lease|Lease until",
+                "request|Request",
+            ),
+            _demands,
+            _demand,
+        ),
+        ListKind(
+            "services",
+            "Services",
+            "One row for each Helm release: a service on a node, shared by all who need it.",
+            _columns(
+                "release|Release",
+                "health|Health",
+                "service|Service",
+                "node|Node",
+                "cluster|Cluster",
+                "application|For",
+                "version|Version",
+                "requester|Requesters",
+            ),
+            _services,
+            _service,
+        ),
+        ListKind(
+            "connections",
+            "Connections",
+            "Topics that are carried from one node to another.",
+            _columns(
+                "connection|Connection",
+                "health|Health",
+                "by|By",
+                "from|From",
+                "to|To",
+                "topic|Topics",
+                "requester|Requesters",
+                "release|Releases",
+            ),
+            _connections,
+            _connection,
+        ),
+        ListKind(
+            "leases",
+            "Leases",
+            "Claims that end unless their requester renews them, next end first.",
+            _columns(
+                "ends|Ends",
+                "subject|Holds",
+                "kind|Kind",
+                "demand|Demand",
+                "requester|Requesters",
+                "term|Term",
+                "slack|Slack",
+            ),
+            _leases,
+            _lease,
+        ),
+    )
+}

@@ -1,0 +1,306 @@
+"""The applications that are not ready, and the causes: since when, and who can mend them."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
+
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.config.override import Override
+from demandops.demand.claim import Claim, requesters_of
+from demandops.ledger.waiting import WaitingDemand, in_turn
+from demandops.plan.overrides.claim_overrides import suspended_claims
+from demandops.plan.release import ServiceRelease
+from demandops.plan.views import release_causes
+from demandops.staterepo.load.problem_report import Problem
+from demandops.staterepo.write.proposal_branch import PendingProposal
+from demandops.web.moment import Moment, Situation
+from demandops.web.views.health_word import WORDS, since_of, word_of, worst_word
+from demandops.web.views.remedy import KINDS, Kind, LastChange, Remedy, remedy_of
+from demandops.web.views.rows import Cell, Filter, Link, Part, Row, cell, exactly
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Something that keeps applications from being ready.
+
+    ``told`` are the exact words of the cluster, a file's check or a person. ``releases`` are those
+    that cannot run because of it.
+    """
+
+    kind: Kind
+    what: Part
+    why: str
+    remedy: Remedy
+    since: datetime | None = None
+    told: str = ""
+    releases: tuple[str, ...] = ()
+    applications: tuple[str, ...] = ()
+    requesters: tuple[str, ...] = ()
+    demands: tuple[str, ...] = ()
+
+    @property
+    def tone(self) -> str:
+        """The tone in which the page shows the cause."""
+        return KINDS[self.kind]
+
+    def row(self) -> Row:
+        """Return the cause as a row, by which filters find it."""
+        texts = {
+            "release": self.releases,
+            "application": self.applications,
+            "requester": self.requesters,
+            "demand": self.demands,
+        }
+        return Row({"what": Cell((self.what,)), "why": cell(self.why, self.told)}, texts)
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """An application, its state in a word, and the causes that keep it from being ready."""
+
+    application: str
+    word: str
+    causes: tuple[Cause, ...]
+
+    @property
+    def tone(self) -> str:
+        """The tone in which the page shows the word."""
+        return {**WORDS, **KINDS}[self.word]
+
+
+def causes(now: Situation, wanted: Filter, last_change: LastChange) -> list[Cause]:
+    """Return every cause that matches, the worst and oldest first."""
+    found = [
+        *_unread(now),
+        *_invalid(now, last_change),
+        *_suspended(now.moment, last_change),
+        *_denied(now.moment, last_change),
+        *_of_releases(now, last_change),
+        *map(_waits, in_turn(now.moment.state.ledger.waiting)),
+        *map(_proposed, now.proposals),
+    ]
+    places = {kind: place for place, kind in enumerate(KINDS)}
+    latest = now.now.timestamp()
+    found.sort(key=lambda one: (places[one.kind], one.since.timestamp() if one.since else latest))
+    return [cause for cause in found if wanted.matches(cause.row())]
+
+
+def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list[Ready]:
+    """Return the applications that match, those that are not ready first."""
+    by_application: dict[str, list[Cause]] = {}
+    for cause in found:
+        for application in cause.applications:
+            by_application.setdefault(application, []).append(cause)
+    statuses: dict[str, list[ReleaseStatus]] = {}
+    rows: dict[str, Row] = {}
+    for name, release in now.moment.releases.items():
+        for application in release.applications if isinstance(release, ServiceRelease) else ():
+            statuses.setdefault(application, []).append(now.status(name))
+    for claim in now.moment.state.ledger:
+        if claim.is_on_application:
+            known = rows.get(claim.subject.id)
+            who = {*claim.requesters, *(known.hidden["requester"] if known else ())}
+            demands = {claim.demand, *(known.hidden["demand"] if known else ())}
+            rows[claim.subject.id] = Row(
+                {"application": cell(claim.subject.id)},
+                {"requester": sorted(who), "demand": sorted(demands)},
+            )
+    made = []
+    for application, row in sorted(rows.items()):
+        if wanted.matches(row):
+            mine = tuple(by_application.get(application, ()))
+            word = worst_word(statuses.get(application, ()))
+            if mine and word in ("healthy", "unknown"):
+                word = mine[0].kind
+            made.append(Ready(application, word, mine))
+    return sorted(made, key=lambda one: (not one.causes, one.application))
+
+
+def _unread(now: Situation) -> Iterator[Cause]:
+    if now.unread:
+        yield Cause(
+            "unread",
+            Part("The state repo"),
+            "cannot be read, so this page may be out of date",
+            Remedy("the operator of the Git server", "make it reachable; the page tries again"),
+            told=now.unread,
+        )
+
+
+def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
+    for problem in now.moment.problems:
+        change = last_change(problem.file)
+        author = problem.author if isinstance(problem, Problem) else ""
+        author = author or (change.author if change else "")
+        field = f", {problem.field}" if problem.field else ""
+        since = problem.since if isinstance(problem, Problem) else ""
+        yield Cause(
+            "invalid",
+            Part(f"{problem.file or 'The configuration'}{field}"),
+            "is not valid, so its last valid version stays in effect",
+            Remedy(
+                f"{author}, who changed it last" if author else "the person who changed it last",
+                "correct the file by pull request",
+                shlex.join(["git", "show", since[:10]]) if since else "demandops check .",
+            ),
+            told=problem.message,
+            since=change.time if change else None,
+        )
+
+
+def _suspended(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
+    by_override: dict[str, tuple[Override, list[Claim]]] = {}
+    for claim, override in suspended_claims(moment.state):
+        by_override.setdefault(override.name, (override, []))[1].append(claim)
+    for override, claims in by_override.values():
+        names = [claim.subject.id for claim in claims]
+        change = last_change(override.path)
+        yield Cause(
+            "suspended",
+            Part(" and ".join(dict.fromkeys(names)), Link("overrides")),
+            f"is booked, but {override.path} denies it",
+            _by_owner(override),
+            told=override.reason,
+            applications=tuple(dict.fromkeys(_applications_with(moment, claims))),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
+            since=change.time if change else None,
+        )
+
+
+def _denied(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
+    """Yield a cause for each service that an override denies, unless it suspends whole claims."""
+    ledger = moment.active.ledger
+    for release, override in moment.denied:
+        claims = release_causes.claims_behind(ledger, release)
+        change = last_change(override.path)
+        yield Cause(
+            "suspended",
+            Part(release.description, Link("release", {"name": release.name})),
+            f"is needed, but {override.path} denies it",
+            _by_owner(override),
+            told=override.reason,
+            releases=(release.name,),
+            applications=tuple(release.applications) if isinstance(release, ServiceRelease) else (),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
+            since=change.time if change else None,
+        )
+
+
+def _by_owner(override: Override) -> Remedy:
+    ends = f", or wait: it ends at {override.expires}" if override.expires else ""
+    return Remedy(
+        f"{override.owner}, who owns the override",
+        f"remove the file by pull request{ends}",
+        shlex.join(["git", "rm", override.path]),
+    )
+
+
+def _proposed(proposal: PendingProposal) -> Cause:
+    return Cause(
+        "decision",
+        Part(proposal.summary, Link("overrides")),
+        "awaits a person's approval",
+        Remedy(
+            "a person who may merge to main",
+            "merge the branch to approve it, delete the branch to refuse it",
+            shlex.join(["git", "merge", f"origin/{proposal.branch}"]),
+        ),
+        since=proposal.since,
+        requesters=proposal.requesters,
+        demands=proposal.demands,
+    )
+
+
+def _waits(waiting: WaitingDemand) -> Cause:
+    return Cause(
+        "waiting",
+        Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
+        "waits for room on a node",
+        Remedy(
+            "the generator, as soon as there is room; sooner if the nodes' operator adds room or a "
+            "requester releases something"
+        ),
+        since=waiting.since,
+        requesters=waiting.requesters,
+        demands=(waiting.demand,),
+    )
+
+
+def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
+    """Yield a cause for each group of unhealthy releases that share a reason."""
+    together: dict[tuple[str, str, str, str], list[str]] = {}
+    for name, release in now.moment.releases.items():
+        status = now.status(name)
+        word = word_of(status)
+        if word not in ("healthy", "unknown"):
+            health = status.health
+            key = (word, health.object, health.reason, release.node.cluster)
+            together.setdefault(key, []).append(name)
+    for (word, object, reason, cluster), names in together.items():
+        first = now.moment.releases[names[0]]
+        several = len(names) > 1
+        kind: Kind = "failing" if word == "failing" else "starting"
+        if word == "waiting":
+            kind = "waiting"
+        yield Cause(
+            kind,
+            Part(
+                f"{len(names)} releases in {cluster}", Link("services", {"q": f"cluster={cluster}"})
+            )
+            if several
+            else Part(first.description, Link("release", {"name": names[0]})),
+            _why(kind, object, several),
+            remedy_of(kind, first, now.moment.config, object, reason, last_change),
+            since=_since(now.status(name) for name in names),
+            told=f"{object}: {reason}" if object else reason,
+            releases=tuple(names),
+            **_affected(now.moment, names),
+        )
+
+
+def _since(statuses: Iterable[ReleaseStatus]) -> datetime | None:
+    return min((at for status in statuses if (at := since_of(status))), default=None)
+
+
+def _why(kind: Kind, object: str, several: bool) -> str:
+    verbs = ("fail", "have", "start") if several else ("fails", "has", "starts")
+    if object.startswith("cluster "):
+        return "cannot be seen: the cluster does not answer"
+    if kind == "failing":
+        return verbs[0]
+    if kind == "waiting":
+        return f"{verbs[1]} not been applied by the cluster yet"
+    return f"{verbs[2]}, and did not become ready yet"
+
+
+def _affected(moment: Moment, names: list[str]) -> dict[str, tuple[str, ...]]:
+    """Return the applications, requesters and demands that releases affect.
+
+    A connection affects the applications of the demands that hold it.
+    """
+    applications: dict[str, None] = {}
+    claims = [claim for name in names for claim in moment.behind[name]]
+    demands = dict.fromkeys(claim.demand for claim in claims)
+    for name in names:
+        release = moment.releases[name]
+        if isinstance(release, ServiceRelease):
+            applications |= dict.fromkeys(release.applications)
+        else:
+            applications |= dict.fromkeys(_applications_with(moment, moment.behind[name]))
+    return {
+        "applications": tuple(applications),
+        "requesters": requesters_of(claims),
+        "demands": tuple(demands),
+    }
+
+
+def _applications_with(moment: Moment, claims: Iterable[Claim]) -> Iterator[str]:
+    """Yield the applications of the demands that have these claims."""
+    for demand in dict.fromkeys(claim.demand for claim in claims):
+        held = moment.claims_of_demands.get(demand, ())
+        yield from (one.subject.id for one in held if one.is_on_application)

@@ -1,0 +1,159 @@
+"""Rates and latencies: how many demands come, and how long it takes until releases run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from statistics import median
+
+from demandops.web.moment import Commit, HealthChange
+from demandops.web.views.time_line import SPANS
+
+WIDTH, HEIGHT = 560, 150
+_BINS = 48
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """One bar; its label names time and value."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A plot: bars, the highest value on its axis, and its figures as a table."""
+
+    title: str
+    unit: str
+    about: str
+    bars: tuple[Bar, ...]
+    top: str
+    first: datetime
+    last: datetime
+    summary: str
+    table: tuple[tuple[datetime, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """A value at a time."""
+
+    time: datetime
+    value: float
+
+
+_BOOKED = {"join", "put"}
+_RELEASED = {"shutdown", "release", "expire", "decommission"}
+
+
+def plots(
+    commits: Sequence[Commit], health: Sequence[HealthChange], now: datetime, span: str
+) -> list[Plot]:
+    """Return the plots of a span (a key of ``SPANS``)."""
+    seconds = SPANS.get(span, 0)
+    oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
+    start = now - timedelta(seconds=seconds) if seconds else oldest
+    span_s = max((now - start).total_seconds(), 1.0)
+    demands = [one.entry for one in commits if one.entry.first("Operation-Id")]
+    waits = [
+        Sample(one.time, (one.time - one.authored).total_seconds())
+        for one in demands
+        if one.authored and one.first("Operation") in _BOOKED | _RELEASED
+    ]
+    ready = [Sample(one.time, one.lasted_s) for one in health if one.lasted_s is not None]
+    make = _Maker(start, span_s)
+    return [
+        make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
+        make.counts(
+            "Demands released", _times(commits, _RELEASED), "commits that release or expire one"
+        ),
+        make.counts(
+            "People's commits",
+            [one.entry.time for one in commits if not one.entry.by_generator],
+            "commits that no generator made",
+        ),
+        make.medians("From received to committed", waits, "median of the demands, whole seconds"),
+        make.medians(
+            "Until healthy again",
+            ready,
+            "median time that releases were not healthy, as far as this page watched",
+        ),
+    ]
+
+
+def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
+    return [one.entry.time for one in commits if one.entry.first("Operation") in operations]
+
+
+class _Maker:
+    """Makes plots of one span of time."""
+
+    def __init__(self, start: datetime, span_s: float) -> None:
+        self._start, self._bin_s = start, span_s / _BINS
+        self._span = span_s
+
+    def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
+        """Return a plot of the number of events in each bin of time."""
+        bins = self._bins(Sample(at, 1.0) for at in times)
+        total = sum(map(len, bins))
+        per_hour = total * 3600 / self._span
+        summary = f"{total} in all, {per_hour:.3g} an hour"
+        values = [float(len(one)) for one in bins]
+        return self._plot(title, f"per {_duration(self._bin_s)}", about, values, summary, "")
+
+    def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
+        """Return a plot of the median of the samples in each bin of time."""
+        bins = self._bins(samples)
+        every = sorted(value for one in bins for value in one)
+        summary = "nothing was seen yet"
+        if every:
+            late = every[math.ceil(0.95 * len(every)) - 1]
+            summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, of {len(every)}"
+        values = [median(one) if one else 0.0 for one in bins]
+        return self._plot(title, "in seconds", about, values, summary, " s")
+
+    def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:
+        bins: list[list[float]] = [[] for _ in range(_BINS)]
+        for one in samples:
+            place = int((one.time - self._start).total_seconds() / self._bin_s)
+            if one.time >= self._start:
+                bins[min(place, _BINS - 1)].append(one.value)
+        return bins
+
+    def _plot(
+        self, title: str, unit: str, about: str, values: list[float], summary: str, suffix: str
+    ) -> Plot:
+        top = max(*values, 1.0)
+        width = WIDTH / _BINS
+        starts = [self._start + timedelta(seconds=self._bin_s * n) for n in range(_BINS)]
+        texts = [f"{value:.3g}{suffix}" for value in values]
+        bars = tuple(
+            Bar(
+                round(n * width + 1, 2),
+                round(HEIGHT * (1 - value / top), 2),
+                round(width - 2, 2),
+                round(HEIGHT * value / top, 2),
+                f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
+            )
+            for n, value in enumerate(values)
+            if value
+        )
+        table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
+        end = self._start + timedelta(seconds=self._span)
+        return Plot(
+            title, unit, about, bars, f"{top:.3g}{suffix}", self._start, end, summary, table
+        )
+
+
+def _duration(seconds: float) -> str:
+    for unit, length in (("days", 86400), ("hours", 3600), ("minutes", 60)):
+        if seconds >= length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds:.3g} seconds"

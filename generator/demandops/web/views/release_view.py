@@ -1,0 +1,139 @@
+"""One release: why it runs, its file, what changed in it, its history, and its status."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.config.override import Override
+from demandops.demand.claim import Claim
+from demandops.errors import DemandOpsError, StateRepoError
+from demandops.plan.release import Release, ServiceRelease
+from demandops.plan.views import release_causes
+from demandops.quoting import quoted
+from demandops.render.gitops.paths import path_of
+from demandops.staterepo.history.commit_log import LogEntry, PathHistory
+from demandops.staterepo.reader import Reader
+from demandops.web.moment import Moment, Situation
+from demandops.web.views.health_word import WORDS, since_of, word_of
+
+MOST_CHANGES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class DiffLine:
+    """A line of a difference; ``sign`` is ``+``, ``-``, ``@`` or empty."""
+
+    sign: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """A release that runs, was denied, or ran before; ``release`` is ``None`` if it does not run.
+
+    ``difference`` is what its newest change changed in its file. ``stop_with_it`` are the releases
+    that the override which the page shows would stop beside it.
+    """
+
+    name: str
+    path: str
+    release: Release | None
+    denied_by: Override | None
+    status: ReleaseStatus
+    claims: tuple[Claim, ...]
+    files: tuple[tuple[str, str, str], ...]
+    overrides: tuple[tuple[Override, tuple[str, ...]], ...]
+    text: str
+    history: PathHistory
+    last_change: LogEntry | None
+    difference: tuple[DiffLine, ...]
+    stop_with_it: tuple[str, ...]
+
+    @property
+    def word(self) -> str:
+        """The release's state in one word."""
+        return word_of(self.status) if self.release else "stopped"
+
+    @property
+    def tone(self) -> str:
+        """The tone in which the page shows the word."""
+        return WORDS.get(self.word, "none")
+
+    @property
+    def since(self) -> datetime | None:
+        """The time since which it has its state, if the cluster reports it."""
+        return since_of(self.status)
+
+    @property
+    def requesters(self) -> list[str]:
+        """Who needs it."""
+        return sorted({who for claim in self.claims for who in claim.requesters})
+
+
+def explained(now: Situation, reader: Reader, name: str) -> Explained:
+    """Explain the release with a name.
+
+    Raises:
+        StateRepoError: if there is none and never was.
+    """
+    moment = now.moment
+    release = moment.releases.get(name)
+    denied = None if release else release_causes.denied_release_named(moment.state, name)
+    planned = release or (denied[0] if denied else None)
+    path = path_of(planned) if planned else None
+    path = path or reader.release_path(name, moment.commit)
+    if path is None:
+        raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran")
+    history = reader.history(path, moment.commit, MOST_CHANGES)
+    last = next(iter(history.newest), None) or history.started
+    if history.stopped and not release:
+        last = history.stopped
+    return Explained(
+        name=name,
+        path=path,
+        release=release,
+        denied_by=denied[1] if denied else None,
+        status=now.status(name),
+        claims=tuple(moment.behind.get(name, ())),
+        files=tuple(release_causes.shaping_files(release, moment.config)) if release else (),
+        overrides=release.shaping.by if release else (),
+        text=reader.file_reader(moment.commit)(path) or "",
+        history=history,
+        last_change=last,
+        difference=tuple(_difference(reader, last, path)) if last else (),
+        stop_with_it=tuple(_others_stopped(moment, release)) if release else (),
+    )
+
+
+def _others_stopped(moment: Moment, release: Release) -> Iterable[str]:
+    """Yield what stops with a release if its service is denied on its node, or its connections."""
+    for name, other in moment.releases.items():
+        if name == release.name:
+            continue
+        if isinstance(release, ServiceRelease):
+            if isinstance(other, ServiceRelease) and _place(other) == _place(release):
+                yield name
+        elif not isinstance(other, ServiceRelease) and (
+            set(other.connections) <= set(release.connections)
+        ):
+            yield name
+
+
+def _place(release: ServiceRelease) -> tuple[str, str]:
+    return release.key.service, release.node.id
+
+
+def _difference(reader: Reader, change: LogEntry, path: str) -> Iterable[DiffLine]:
+    after = reader.file_reader(change.commit)(path) or ""
+    before = ""
+    with suppress(DemandOpsError):  # the first commit has no parent to compare with
+        before = reader.file_reader(f"{change.commit}~1")(path) or ""
+    lines = difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=2)
+    for line in list(lines)[2:]:
+        sign = line[:1].strip()
+        yield DiffLine(sign, line if sign == "@" else line[1:])

@@ -1,0 +1,115 @@
+"""Who can mend a release that is not ready, as far as its files and its cluster tell."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+from demandops.config.config import IMAGES_FILE, Config
+from demandops.config.registry import Image
+from demandops.plan.release import Release, ServiceRelease
+from demandops.staterepo.history.commit_log import GENERATOR_NAME, LogEntry
+
+Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
+
+KINDS: dict[str, str] = {
+    "unread": "bad",
+    "failing": "bad",
+    "invalid": "bad",
+    "suspended": "bad",
+    "decision": "busy",
+    "waiting": "busy",
+    "starting": "busy",
+}
+"""The kinds of causes, in the order of the view, and their tones."""
+
+LastChange = Callable[[str], "LogEntry | None"]
+"""Returns the newest commit that changed a file, if there is one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Remedy:
+    """Who can mend a cause, how, and by which command; all but ``who`` may be empty."""
+
+    who: str
+    how: str = ""
+    command: str = ""
+
+
+_IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
+_ROOM = re.compile(r"not scheduled|Insufficient|didn't match|untolerated taint|unschedulable", re.I)
+_CRASH = re.compile(r"CrashLoop|exit code|OOMKilled|RunContainerError", re.I)
+
+
+def remedy_of(
+    kind: Kind,
+    release: Release,
+    config: Config,
+    object: str,
+    reason: str,
+    last_change: LastChange,
+) -> Remedy:
+    """Return who can mend a release, as far as its configuration and the cluster's words tell."""
+    cluster, (word, _, name) = release.node.cluster, object.partition(" ")
+    namespace, _, short = name.partition("/")
+    describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]
+    command = shlex.join(describe) if short else ""
+    if word == "cluster":
+        return Remedy(f"the operator of cluster {cluster}", "make its API reachable from here")
+    if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
+        who = f"the operator of the GitOps controller of cluster {cluster}"
+        if kind != "failing":
+            who = f"the GitOps controller of cluster {cluster}, by itself; else its operator"
+        return Remedy(who, "", command)
+    if kind == "starting":
+        who = f"nobody yet; if it lasts, the operator of cluster {cluster}"
+        return Remedy(who, "", command)
+    if release.shaping.by:
+        override = release.shaping.by[-1][0]
+        return Remedy(
+            f"{override.owner}, who owns {override.path}, which changes this release",
+            f"correct or remove {override.path} by pull request",
+            command,
+        )
+    if _ROOM.search(reason):
+        return Remedy(
+            f"the operator of node {release.node.id} in cluster {cluster}",
+            "give it room, or have the demand run on another node",
+            command,
+        )
+    if _IMAGE.search(reason):
+        return _of_images(release, config, command, last_change)
+    how = "look at its log" if _CRASH.search(reason) else ""
+    if not isinstance(release, ServiceRelease):
+        return Remedy(f"the maintainer of the {release.type.word} client", how, command)
+    where = f"appdefs/{release.service.folder}"
+    by = _changed_by([where], last_change)
+    return Remedy(f"the maintainer of {where}{by}", how, command)
+
+
+def _of_images(release: Release, config: Config, command: str, last_change: LastChange) -> Remedy:
+    names = [name for name in release.images if name in config.images]
+    images = [_image(release, name, config).reference() for name in names]
+    files = dict.fromkeys(config.file_of(IMAGES_FILE, name) for name in names)
+    by = _changed_by(files, last_change)
+    return Remedy(
+        f"the publisher of image {', '.join(images)}",
+        f"push the image, or correct its entry in {' or '.join(files)} by pull request{by}",
+        command,
+    )
+
+
+def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
+    """Return which people changed files or folders last."""
+    changes = filter(None, map(last_change, paths))
+    people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
+    return f" ({', '.join(people)} changed it last)" if people else ""
+
+
+def _image(release: Release, name: str, config: Config) -> Image:
+    if isinstance(release, ServiceRelease):
+        return release.image(name, config)
+    return release.shaping.image(name, config.images[name])

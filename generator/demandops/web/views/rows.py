@@ -1,0 +1,174 @@
+"""Lists that can be filtered, sorted and paged, as plain values."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import cached_property
+from typing import TypeAlias
+
+PAGE = 100
+"""The most rows on a page of a list."""
+
+_MOST_PARTS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A view, and its parameters."""
+
+    path: str
+    params: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A text, and the view that it links to, if any."""
+
+    text: str
+    link: Link | None = None
+
+
+Text: TypeAlias = "str | int | Part"
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """The content of one field of a row: texts, or a time.
+
+    ``tone`` colours it. ``order`` is its sort key, by default its first text.
+    """
+
+    parts: tuple[Part, ...] = ()
+    time: datetime | None = None
+    tone: str = ""
+    order: float | str | None = None
+
+    @property
+    def shown(self) -> tuple[Part, ...]:
+        """The first texts, as many as a row shows."""
+        return self.parts[:_MOST_PARTS]
+
+    @property
+    def more(self) -> int:
+        """The number of texts that the row leaves out."""
+        return max(0, len(self.parts) - _MOST_PARTS)
+
+    @property
+    def rank(self) -> tuple[bool, float, str]:
+        """The key by which rows are sorted; empty cells come last."""
+        order = self.order
+        if order is None:
+            order = self.time.timestamp() if self.time else self.parts[0].text if self.parts else ""
+        if isinstance(order, str):
+            return order == "", 0.0, order.casefold()
+        return False, float(order), ""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A field of every row: its name in filters, and its title."""
+
+    key: str
+    title: str
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: its cells, and texts that filters look at too, by name."""
+
+    cells: Mapping[str, Cell]
+    hidden: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @cached_property
+    def texts(self) -> dict[str, tuple[str, ...]]:
+        """Its texts by name, in the case that filters look at."""
+        found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
+        for key, texts in self.hidden.items():
+            found[key] = (*found.get(key, ()), *texts)
+        return {key: tuple(text.casefold() for text in texts) for key, texts in found.items()}
+
+    @cached_property
+    def all_texts(self) -> str:
+        """All its texts, each in a line."""
+        return "\n".join(text for texts in self.texts.values() for text in texts)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """One page of a list, as it is filtered and sorted.
+
+    ``sort`` is the key of a column, with ``-`` in front for the reverse order.
+    """
+
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    total: int
+    matching: int
+    sort: str
+    page: int
+
+    @property
+    def pages(self) -> int:
+        """How many pages there are."""
+        return max(1, -(-self.matching // PAGE))
+
+
+def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
+    """Return a cell of these texts, without empty ones."""
+    parts = (one if isinstance(one, Part) else Part(str(one)) for one in texts)
+    return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
+
+
+class Filter:
+    """A search text for rows: all its words must occur.
+
+    ``node:edge`` looks at one field only; ``node=edge`` wants exactly this text. Quotes join words.
+    """
+
+    def __init__(self, text: str) -> None:
+        try:
+            words = shlex.split(text)
+        except ValueError:  # a quote that is not closed yet
+            words = text.split()
+        self._words = [word.casefold() for word in words]
+
+    def __bool__(self) -> bool:
+        """Return whether the filter has any words."""
+        return bool(self._words)
+
+    def matches(self, row: Row) -> bool:
+        """Return whether a row contains all words of the filter."""
+        return all(_has(row, word) for word in self._words)
+
+
+def _has(row: Row, word: str) -> bool:
+    for sign in ":=":
+        key, found, wanted = word.partition(sign)
+        if found and key in row.texts:
+            texts = row.texts[key]
+            return wanted in texts if sign == "=" else any(wanted in text for text in texts)
+    return word in row.all_texts
+
+
+def exactly(key: str, value: str) -> str:
+    """Return the filter for one exact value."""
+    return shlex.quote(f"{key}={value}")
+
+
+def table(
+    columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
+) -> Table:
+    """Return a page of the rows that match; an unknown ``sort`` or ``page`` is the first."""
+    every = list(rows)
+    found = [row for row in every if wanted.matches(row)]
+    key = sort.removeprefix("-")
+    if key not in {column.key for column in columns}:
+        sort = key = columns[0].key
+    found.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
+    last = max(1, -(-len(found) // PAGE))
+    page = min(max(page, 1), last)
+    shown = tuple(found[(page - 1) * PAGE : page * PAGE])
+    return Table(tuple(columns), shown, len(every), len(found), sort, page)

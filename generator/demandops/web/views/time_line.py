@@ -1,0 +1,199 @@
+"""One time line of demands, overrides, people's commits and health."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+
+from demandops.config.override import OVERRIDES_ROOT
+from demandops.staterepo.history.commit_log import PROPOSAL
+from demandops.web.moment import Commit, HealthChange
+from demandops.web.views.health_word import WORDS
+from demandops.web.views.rows import Filter, Row, cell
+
+LANES = {
+    "demands": "Demands",
+    "overrides": "Overrides",
+    "people": "People and generator",
+    "health": "Health",
+}
+"""The lanes of the time line, from top to bottom, and their titles."""
+
+SPANS = {
+    "15min": 900,
+    "1h": 3600,
+    "6h": 6 * 3600,
+    "1d": 86400,
+    "7d": 7 * 86400,
+    "30d": 30 * 86400,
+    "all": 0,
+}
+"""The spans of time that can be shown, in seconds; 0 for everything that is known."""
+
+WIDTH = 1000
+_BINS = 60
+_FEW = 20
+_STEPS_S = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 86400, 7 * 86400, 30 * 86400)
+_TICKS = 8
+
+_BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommission", "rollback"}
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened; ``commit`` is empty for a change of health."""
+
+    lane: str
+    time: datetime
+    word: str
+    summary: str
+    who: str
+    commit: str = ""
+    release: str = ""
+    tone: str = ""
+
+    def row(self) -> Row:
+        """Return the event as a row, by which filters find it."""
+        return Row(
+            {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
+            {"who": [self.who], "commit": [self.commit], "release": [self.release]},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """Events of one lane that are close together; ``commit`` is the newest one's."""
+
+    lane: str
+    x: float
+    radius: float
+    count: int
+    label: str
+    commit: str
+    tone: str
+    is_chosen: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """A time below the line."""
+
+    x: float
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """The time line as a picture; ``chosen`` is the place of the chosen moment, if it is in it."""
+
+    span: str
+    dots: tuple[Dot, ...]
+    ticks: tuple[Tick, ...]
+    chosen: float | None
+
+
+def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
+    """Return all events, newest first."""
+    found = [*map(of_commit, commits), *map(_of_health, health)]
+    return sorted(found, key=lambda one: one.time, reverse=True)
+
+
+def of_commit(commit: Commit) -> Event:
+    """Return the event of a commit."""
+    entry = commit.entry
+    word = entry.first("Operation") or "by hand"
+    lane = "people"
+    if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
+        lane = "demands"
+    elif word == "expire-override" or (word == "by hand" and OVERRIDES_ROOT in commit.roots):
+        lane = "overrides"
+    who = ", ".join(entry.trailers.get("Requester", ())) or entry.author
+    return Event(lane, entry.time, word, entry.summary, who, entry.commit)
+
+
+def _of_health(change: HealthChange) -> Event:
+    reason = f": {change.reason}" if change.reason else ""
+    summary = f"was {change.before}, is {change.after}{reason}"
+    tone = WORDS[change.after]
+    return Event("health", change.time, change.after, summary, "", "", change.release, tone)
+
+
+def matching(found: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
+    """Return the events of a lane, or of all, that match."""
+    return [
+        one for one in found if lane in ("", one.lane) and (not wanted or wanted.matches(one.row()))
+    ]
+
+
+def strip(
+    found: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
+) -> Strip:
+    """Return the picture of events, newest first.
+
+    Args:
+        found: the events.
+        now: the end of the line.
+        span: a key of ``SPANS``; any other: the shortest one with some events.
+        chosen: time and commit of the chosen moment.
+    """
+    if span not in SPANS:
+        span = _span_with_some(found, now)
+    oldest = found[-1].time if found else now - timedelta(hours=1)
+    start = now - timedelta(seconds=SPANS[span]) if SPANS[span] else oldest
+    length = max((now - start).total_seconds(), 1.0)
+
+    def place(at: datetime) -> float:
+        return WIDTH * (at - start).total_seconds() / length
+
+    bins: dict[tuple[str, int], list[Event]] = {}
+    for one in found:
+        if one.time >= start:
+            x = min(place(one.time), WIDTH - 1e-6)
+            bins.setdefault((one.lane, int(x * _BINS / WIDTH)), []).append(one)
+    dots = tuple(
+        _dot(lane, (place + 0.5) * WIDTH / _BINS, group, chosen[1] if chosen else "")
+        for (lane, place), group in sorted(bins.items())
+    )
+    mark = place(chosen[0]) if chosen else None
+    shown = mark if mark is not None and 0 <= mark <= WIDTH else None
+    return Strip(span, dots, tuple(_ticks(start, now, place)), shown)
+
+
+def _span_with_some(found: Sequence[Event], now: datetime) -> str:
+    few = found[min(_FEW, 3 * len(found) // 4) - 1].time if len(found) > 1 else now
+    for name, seconds in SPANS.items():
+        if seconds and few >= now - timedelta(seconds=seconds):
+            return name
+    return "all"
+
+
+def _dot(lane: str, x: float, group: Sequence[Event], chosen: str) -> Dot:
+    newest, count = group[0], len(group)
+    more = f", and {count - 1} more" if count > 1 else ""
+    what = " ".join(filter(None, (newest.release, newest.summary)))
+    label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
+    tone = next((one.tone for one in group if one.tone == "bad"), newest.tone)
+    radius = min(4.0 + math.log2(count), 8.0)
+    return Dot(
+        lane,
+        x,
+        radius,
+        count,
+        label,
+        newest.commit,
+        tone,
+        bool(chosen) and any(one.commit == chosen for one in group),
+    )
+
+
+def _ticks(start: datetime, end: datetime, place: Callable[[datetime], float]) -> Iterable[Tick]:
+    length = (end - start).total_seconds()
+    step = next((one for one in _STEPS_S if length / one <= _TICKS), length / _TICKS)
+    form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
+    at = math.ceil(start.timestamp() / step) * step
+    while at <= end.timestamp():
+        moment = datetime.fromtimestamp(at, tz=timezone.utc)
+        yield Tick(place(moment), moment.strftime(form))
+        at += step

@@ -1,0 +1,1 @@
+"""The event detector: a node that watches topics and demands by rules."""

@@ -1,0 +1,113 @@
+"""Sends the demands of events in threads of its own, and sends failed ones again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from math import inf
+from typing import Any
+
+from application_manager_interfaces.action import DeploymentRequest
+from demandops.detection.detector import Want
+from demandops.detection.events.detection_state import Key
+from demandops.detection.rules.rule_demand import Goal
+from demandops.detection.wanted_demands import Outcome, Sending, WantedDemands
+from demandops.quoting import one_line, quoted
+from demandops.runtime import REAL
+
+from demandops_ros.action_endpoints import DemandError, GoalSender
+from demandops_ros.client import DemandClient
+from demandops_ros.messages import fill_message
+
+_THREADS = 8
+"""How many goals are under way at once; the node publishes such goals together."""
+_LONGEST_WAIT_S = 60.0
+
+Log = Callable[[str, str], None]
+"""Takes a level (info, warning) and a text."""
+
+
+class DemandSender:
+    """Sends goals until the node has booked exactly what the events want."""
+
+    def __init__(
+        self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
+    ) -> None:
+        self._log = log
+        self._wanted = WantedDemands()
+        self._changed = REAL.condition()
+        self._is_closed = False
+        self._demands = DemandClient(
+            action_name=demand_action_name,
+            node_name="demandops_detector_client",
+            timeout_s=timeout_s,
+        )
+        self._requests = GoalSender(
+            DeploymentRequest, action_name, "demandops_detector_requests", timeout_s
+        )
+        self._threads = [
+            REAL.keep_running(f"sender-{number}", self._run) for number in range(_THREADS)
+        ]
+
+    def close(self) -> None:
+        """Stop sending; demands that are booked stay booked."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+        self._demands.close()
+        self._requests.close()
+
+    def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
+        """Send the goals for new wants; ``booked`` has the demands from before the start."""
+        with self._changed:
+            for key, goal in (booked or {}).items():
+                self._wanted.hold(key, goal)
+            for want in wants:
+                self._wanted.want(want)
+            self._changed.notify_all()
+
+    def summary(self) -> tuple[int, int, list[tuple[Key, str]]]:
+        """Return how many events have demands, how many wait for an answer, and the refusals."""
+        with self._changed:
+            return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
+
+    def _run(self) -> None:
+        while (sending := self._take()) is not None:
+            outcome = self._send(sending.goal)
+            with self._changed:
+                told = self._wanted.answered(sending, outcome, REAL.monotonic())
+                self._changed.notify_all()
+            rule, subjects = sending.key
+            what = f"{sending.purpose} of {quoted(sending.goal.id)} for {', '.join(subjects)}"
+            if told:
+                self._log("warning", f"rule {rule}: {what} failed, and is tried again: {told}")
+            elif not outcome.code and sending.purpose != "renew":
+                self._log("info", f"rule {rule}: {what}: {outcome.message}")
+
+    def _take(self) -> Sending | None:
+        """Wait for a goal to send; return ``None`` when closed."""
+        with self._changed:
+            while not self._is_closed:
+                now = REAL.monotonic()
+                if sending := self._wanted.next(now):
+                    return sending
+                pause = self._wanted.next_at() - now
+                self._changed.wait(None if pause == inf else max(0.0, min(pause, _LONGEST_WAIT_S)))
+        return None
+
+    def _send(self, goal: Goal) -> Outcome:
+        try:
+            if goal.action == "demand":
+                answer = self._demands.send(goal.data)
+                return Outcome("", f"{answer.outcome} in {answer.commit}", answer.lease_s)
+            return self._send_request(goal.data)
+        except DemandError as error:
+            return Outcome(error.code, one_line(str(error)))
+        except Exception as error:  # a value that the message cannot carry, or a closed client
+            return Outcome("fault", one_line(repr(error)))
+
+    def _send_request(self, data: Any) -> Outcome:  # noqa: ANN401 - plain data
+        succeeded, result, _ = self._requests.send(
+            fill_message(DeploymentRequest.Goal(), dict(data))
+        )
+        text = one_line(result.message.split("\n")[0])
+        return Outcome("" if succeeded else text.partition(":")[0] or "aborted", text)

@@ -1,0 +1,107 @@
+"""``demandops detect``: run the event detector, or try its rules on a recorded bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+from demandops.cli.json_output import output_option
+from demandops.cli.output import errors
+from demandops.detection.rules import rule_file
+from demandops.errors import InvalidInput
+from demandops.input_file import read_input
+
+
+@click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
+@click.argument("rules", required=False, metavar="[RULES]")
+@click.option(
+    "--replay",
+    "bag",
+    type=click.Path(path_type=Path),
+    metavar="BAG",
+    help="Send nothing: try the rules on a recorded bag, a folder or an MCAP file, and print what "
+    "would be demanded. Needs no ROS, but the extra replay.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Draw the replay as an SVG file: tracks, areas, and when each event lasted.",
+)
+@output_option
+@click.pass_context
+def detect(
+    ctx: click.Context, rules: str | None, bag: Path | None, plot: Path | None, output: str
+) -> None:
+    """Watch topics and demand by rules.
+
+    RULES is a file of rules (docs/detector.md); the ROS parameter rules can name it instead. It is
+    read again when it changes. Everything after --ros-args goes to ROS. Stop it with Ctrl-C or
+    SIGTERM: its demands stay booked, and the next start continues them.
+
+    \b
+    Examples:
+      demandops detect rules.yaml
+      demandops detect rules.yaml --ros-args -p settling_time:=20.0
+      demandops detect rules.yaml --replay bag --plot replay.svg
+    """
+    ros_args = list(ctx.args)
+    if rules == "--ros-args":
+        rules, ros_args = None, ["--ros-args", *ros_args]
+    if bag is not None:
+        if rules is None or ros_args:
+            raise click.UsageError("--replay takes a file of rules, and no ROS arguments")
+        _replay(rules, bag, plot, output)
+        return
+    for option, given in (("--plot", plot is not None), ("--output", output != "text")):
+        if given:
+            raise click.UsageError(f"{option} is for --replay")
+    _run(rules, ros_args)
+
+
+def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
+    """Print the demands that rules would make for a bag, and draw them."""
+    name, text = read_input(rules)
+    file = rule_file.read(text, name)
+    try:
+        from demandops_ros.detector import replay, replay_plot  # noqa: PLC0415 - needs rosbags
+        from demandops_ros.detector.recorded_bag import RecordedBag  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise click.ClickException(
+            f"--replay needs {error.name}, which is not installed; run pip install "
+            "'demandops[replay]'"
+        ) from None
+    recorded = RecordedBag(bag, file)
+    try:
+        found = replay.replayed(str(bag), recorded, file)
+    finally:
+        recorded.close()
+    for topic, type_name in recorded.unread.items():
+        errors.print(f"warning: {topic} has the type {type_name}, and is not read")
+    replay.show(found, output)
+    if plot is not None:
+        try:
+            plot.write_text(replay_plot.svg(found))
+        except OSError as error:
+            problem = f"cannot be written: {error.strerror or error}"
+            raise InvalidInput.at("", problem, file=str(plot)) from None
+
+
+def _run(rules: str | None, ros_args: list[str]) -> None:
+    """Run the node until a signal comes."""
+    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
+
+    from demandops_ros import ros_process  # noqa: PLC0415
+    from demandops_ros.detector.detector_node import DetectorNode  # noqa: PLC0415
+
+    with (
+        ros_process.stop_signals() as wait_for_signal,
+        ros_process.started(ros_args, SignalHandlerOptions.NO),
+    ):
+        node = DetectorNode(rules)
+        thread = ros_process.ExecutorThread(node)
+        wait_for_signal()
+        node.get_logger().info("stopping; what is demanded stays booked")
+        thread.close()
+        node.close()
+        node.destroy_node()

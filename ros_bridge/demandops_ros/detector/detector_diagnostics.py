@@ -1,0 +1,76 @@
+"""The detector's status on ``/diagnostics``: its rules, its data and its demands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from demandops.detection.detector import Detector
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
+
+from demandops_ros.detector.demand_sender import DemandSender
+from demandops_ros.detector.source_subscriptions import SourceSubscriptions
+from demandops_ros.diagnostics import status
+
+_MOST_REFUSALS = 20
+
+
+class DetectorDiagnostics:
+    """Publishes a status each for the rules, the data and the demands."""
+
+    def __init__(self, node: Node, rules: str) -> None:
+        self._node, self._rules = node, rules
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+    def publish(
+        self,
+        problems: Sequence[str],
+        detector: Detector,
+        topics: SourceSubscriptions,
+        sender: DemandSender,
+        is_started: bool,
+    ) -> None:
+        """Publish the current statuses."""
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.status = [
+            self._of_rules(problems, detector),
+            self._of_data(detector, topics, is_started),
+            self._of_demands(detector, sender),
+        ]
+        self._publisher.publish(message)
+
+    def _of_rules(self, problems: Sequence[str], detector: Detector) -> DiagnosticStatus:
+        level, text = DiagnosticStatus.OK, "valid"
+        if problems:
+            level = DiagnosticStatus.WARN
+            text = "the changed file is invalid; the last valid rules are in effect"
+        values = {"rules": str(len(detector.file.rules))}
+        values |= {f"problem {at}": one for at, one in enumerate(problems, start=1)}
+        return status("demandops_detector: rules", self._rules, level, text, values)
+
+    def _of_data(
+        self, detector: Detector, topics: SourceSubscriptions, is_started: bool
+    ) -> DiagnosticStatus:
+        level, text = DiagnosticStatus.OK, "detecting"
+        if not is_started:
+            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping"
+        values = {
+            "topics": str(topics.topics),
+            "entities": str(detector.entities),
+            "messages": str(topics.messages),
+            "messages left out": str(topics.unreadable),
+        }
+        return status("demandops_detector: data", self._rules, level, text, values)
+
+    def _of_demands(self, detector: Detector, sender: DemandSender) -> DiagnosticStatus:
+        _, unanswered, refusals = sender.summary()
+        level, text = DiagnosticStatus.OK, "all are answered"
+        if unanswered:
+            text = f"{unanswered} are under way"
+        if refusals:
+            level, text = DiagnosticStatus.WARN, f"{len(refusals)} failed and are tried again"
+        values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
+        for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
+            values[" ".join((rule, *subjects))] = why
+        return status("demandops_detector: demands", self._rules, level, text, values)

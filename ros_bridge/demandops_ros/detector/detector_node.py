@@ -1,0 +1,203 @@
+"""The node of the event detector: topics in, demands out.
+
+It decides on events alone and does not know what runs. Only at its start it reads in the latched
+bookkeeping which demands are its own, so that a restart does not end them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from demandops.detection.booked_events import booked_events
+from demandops.detection.detector import Detector
+from demandops.detection.events.detection_state import Observation
+from demandops.detection.rules.rule_file import RuleFile, read
+from demandops.errors import InvalidInput
+from demandops.input_file import read_input
+from demandops.quoting import one_line
+from demandops.runtime import REAL
+from demandops_interfaces.msg import Bookkeeping
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+
+from demandops_ros import ros_process
+from demandops_ros.detector import detector_parameters
+from demandops_ros.detector.demand_sender import DemandSender
+from demandops_ros.detector.detector_diagnostics import DetectorDiagnostics
+from demandops_ros.detector.source_subscriptions import SourceSubscriptions, faults_of_types
+
+_DISCOVERY_S = 0.5
+_RELOAD_S = 1.0
+_PATIENCE_S = 10.0
+_MOST_OBSERVATIONS = 100_000
+_SET_CLOCK_S = 1.0
+"""If a clock jumps by more, somebody has set it, or a simulation was restarted."""
+_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class DetectorNode(Node):  # type: ignore[misc]
+    """Watches the topics of its rules and keeps the demands that follow from them."""
+
+    def __init__(self, rules: str | None) -> None:
+        """Start to watch.
+
+        Args:
+            rules: the file of rules; if left out, the parameter ``rules`` names it.
+
+        Raises:
+            click.UsageError: if a parameter is not valid.
+            InvalidInput: if the rules are not valid.
+        """
+        super().__init__("demandops_detector")
+        settings = detector_parameters.declare(self, rules)
+        ros_process.log_to(self.get_logger(), settings["log_level"])
+        self._path, self._settle_s = Path(settings["rules"]), float(settings["settling_time"])
+        file, self._text = _read_rules(self._path)
+        self._last_now = self._now()
+        self._last_look = REAL.monotonic()
+        self._detector = Detector(file, self._last_now)
+        self._is_started = False
+        self._observations: deque[Observation] = deque(maxlen=_MOST_OBSERVATIONS)
+        self._sender = DemandSender(
+            settings["action_name"],
+            settings["demand_action_name"],
+            settings["answer_timeout"],
+            self._log,
+        )
+        self._topics = self._subscribe(file)
+        self._books: Any = None
+        if settings["bookkeeping_topic"]:
+            self._books = self.create_subscription(
+                Bookkeeping, settings["bookkeeping_topic"], self._hear_books, _LATCHED
+            )
+        else:
+            self._start({})
+        self.create_timer(settings["period"], self._step)
+        self.create_timer(_DISCOVERY_S, self._refresh)
+        self.create_timer(_RELOAD_S, self._reload_if_changed)
+        self._diagnostics = DetectorDiagnostics(self, settings["rules"])
+        self._problems: tuple[str, ...] = ()
+        self.create_timer(1.0, self._report)
+
+    def close(self) -> None:
+        """Stop the node. Its demands stay booked for the next start, or until their leases end."""
+        self._topics.close()
+        self._sender.close()
+
+    def _log(self, level: str, text: str) -> None:
+        logger = self.get_logger()  # rclpy allows only one level for each line that logs
+        if level == "warning":
+            logger.warning(one_line(text))
+        else:
+            logger.info(one_line(text))
+
+    def _now(self) -> float:
+        return float(self.get_clock().now().nanoseconds) / 1e9
+
+    def _subscribe(self, file: RuleFile) -> SourceSubscriptions:
+        topics = SourceSubscriptions(self, file, self._now, self._observations.append)
+        topics.refresh()
+        return topics
+
+    # ---- the start: which demands are ours ----
+
+    def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
+        if not self._is_started:
+            self._start(json.loads(message.bookkeeping_json))
+
+    def _start(self, bookkeeping: Mapping[str, Any]) -> None:
+        booked = booked_events(self._detector.file, bookkeeping)
+        self._sender.want(self._detector.resume(booked, self._now(), self._settle_s), booked)
+        self._is_started = True
+        self._last_now, self._last_look = self._now(), REAL.monotonic()
+        self._log(
+            "info",
+            f"detecting; rules: {len(self._detector.file.rules)}, demands booked before "
+            f"the start: {len(booked)}",
+        )
+
+    # ---- again and again ----
+
+    def _refresh(self) -> None:
+        self._topics.refresh()
+
+    def _step(self) -> None:
+        now = self._now()
+        if not self._is_started:
+            if REAL.monotonic() - self._last_look > _PATIENCE_S:
+                self.get_logger().warning(
+                    "no bookkeeping was heard yet, so nothing is demanded: is demandops serve "
+                    "running, and is bookkeeping_topic its topic?",
+                    once=True,
+                )
+            return
+        if self._books is not None:  # its own callback must not destroy it
+            self.destroy_subscription(self._books)
+            self._books = None
+        observations = [self._observations.popleft() for _ in range(len(self._observations))]
+        self._follow_clock(now)
+        for event, want in self._detector.step(observations, now):
+            self._log("info", f"rule {event.rule}: {event.why}")
+            self._sender.want([want])
+
+    def _follow_clock(self, now: float) -> None:
+        """Adjust the detector's times if the clock was set since the last call."""
+        look = REAL.monotonic()
+        passed = now - self._last_now
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        jumped = min(passed, 0.0) if simulated else passed - (look - self._last_look)
+        self._last_now, self._last_look = now, look
+        if abs(jumped) > _SET_CLOCK_S:
+            self._log("warning", f"the clock was set by {jumped:.1f} s")
+            self._detector.set_clock(jumped)
+
+    def _reload_if_changed(self) -> None:
+        """Use changed rules; if they are invalid, log that once and keep the last valid ones."""
+        try:
+            _, text = read_input(self._path)
+        except InvalidInput as error:
+            self._text = ""  # so that the next content counts as changed
+            self._keep_rules(error)
+            return
+        if text == self._text or not self._is_started:
+            return
+        self._text = text
+        try:
+            file, _ = _read_rules(self._path)
+        except InvalidInput as error:
+            self._keep_rules(error)
+            return
+        self._problems = ()
+        self._sender.want(self._detector.replace_rules(file, self._now(), self._settle_s))
+        self._topics.close()
+        self._topics = self._subscribe(file)
+        self._log("info", f"the file has changed; rules: {len(file.rules)}")
+
+    def _keep_rules(self, error: InvalidInput) -> None:
+        problems = tuple(str(each) for each in error.faults)
+        if problems != self._problems:
+            for problem in problems:
+                self._log("warning", f"{problem}; the last valid rules stay in effect")
+        self._problems = problems
+
+    def _report(self) -> None:
+        self._diagnostics.publish(
+            self._problems, self._detector, self._topics, self._sender, self._is_started
+        )
+
+
+def _read_rules(path: Path) -> tuple[RuleFile, str]:
+    """Return the rules in a file whose message types are installed, and its text.
+
+    Raises:
+        InvalidInput: with every fault.
+    """
+    name, text = read_input(path)
+    file = read(text, name)
+    if faults := faults_of_types(file):
+        raise InvalidInput(one.within(name) for one in faults)
+    return file, text

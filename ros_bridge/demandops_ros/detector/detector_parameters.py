@@ -1,0 +1,72 @@
+"""The detector's parameters: their defaults, descriptions and ranges."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+
+PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
+    "rules": ("", "File of rules.", None),
+    "action_name": (
+        DEFAULT_ACTION_NAME,
+        "Name of the action DeploymentRequest, for rules that send it.",
+        None,
+    ),
+    "demand_action_name": (
+        DEFAULT_DEMAND_ACTION_NAME,
+        "Name of the action Demand, for rules that send it.",
+        None,
+    ),
+    "bookkeeping_topic": (
+        "/demandops/bookkeeping",
+        "Topic that lists the booked demands, read at the start; empty: do not read it.",
+        None,
+    ),
+    "settling_time": (
+        10.0,
+        "Seconds after the start in which entities of booked demands must be seen.",
+        (0.1, 3_600.0),
+    ),
+    "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),
+    "answer_timeout": (60.0, "Most seconds that a goal waits for an answer.", (1.0, 86_400.0)),
+    "log_level": ("info", "Lowest level of messages in the log: debug, info, warn, error.", None),
+}
+"""Each parameter: its default, its description, and the range of a number."""
+
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+
+
+def declare(node: Node, rules: str | None) -> dict[str, Any]:
+    """Declare all parameters of a node and return their values.
+
+    Args:
+        node: the node.
+        rules: the file of rules on the command line.
+
+    Raises:
+        click.UsageError: if a value is not valid.
+    """
+    values = {}
+    for name, (default, description, span) in PARAMETERS.items():
+        described = ParameterDescriptor(description=description, read_only=True)
+        if span is not None:
+            described.floating_point_range = [
+                FloatingPointRange(from_value=span[0], to_value=span[1])
+            ]
+        given = rules if name == "rules" and rules else default
+        try:
+            values[name] = node.declare_parameter(name, given, described).value
+        except ParameterException as error:
+            raise click.UsageError(str(error)) from None
+    if not values["rules"]:
+        raise click.UsageError("no rules given; name a file, or set the ROS parameter rules")
+    if values["log_level"] not in LOG_LEVELS:
+        raise click.UsageError(
+            f"parameter log_level is '{values['log_level']}'; it takes {', '.join(LOG_LEVELS)}"
+        )
+    return values

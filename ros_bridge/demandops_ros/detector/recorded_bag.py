@@ -1,0 +1,90 @@
+"""A recorded bag, MCAP or sqlite3, read without ROS; the only module that knows rosbags."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from demandops.detection.events.detection_state import Observation
+from demandops.detection.message_reader import MessageReader, Unreadable
+from demandops.detection.rules.rule_file import RuleFile
+from demandops.detection.rules.topic_pattern import entity_in
+from demandops.errors import InvalidInput
+from demandops.quoting import one_line
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import ReaderError
+from rosbags.typesys import Stores, get_typestore
+
+
+class RecordedBag:
+    """The messages of a bag that rules read.
+
+    ``topics`` are the topics that a source reads; ``unread`` are topics that match a source, but
+    have another type. ``left_out`` counts unreadable messages by topic and reason.
+    """
+
+    def __init__(self, path: Path, file: RuleFile) -> None:
+        """Open a bag: its folder, or an MCAP file.
+
+        Raises:
+            InvalidInput: if it is not a bag that can be read, or none of its topics is.
+        """
+        try:
+            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            self._reader.open()
+        except (AnyReaderError, ReaderError, OSError) as error:
+            message = f"is not a bag that can be read: {one_line(str(error))}"
+            raise InvalidInput.at("", message, file=str(path)) from None
+        self._readers = {name: MessageReader(file, name) for name in file.sources}
+        self._sources: dict[int, list[tuple[str, str]]] = {}
+        self.topics: set[str] = set()
+        self.unread: dict[str, str] = {}
+        self.left_out: dict[tuple[str, str], int] = {}
+        for connection in self._reader.connections:
+            for name, source in file.sources.items():
+                entity = entity_in(source.topic, connection.topic)
+                if entity is None:
+                    continue
+                if connection.msgtype == source.type:
+                    self._sources.setdefault(connection.id, []).append((name, entity))
+                    self.topics.add(connection.topic)
+                else:
+                    self.unread[connection.topic] = connection.msgtype
+        if not self.topics:
+            wanted = ", ".join(f"{one.topic} ({one.type})" for one in file.sources.values())
+            recorded = sorted({f"{one.topic} ({one.msgtype})" for one in self._reader.connections})
+            self.close()
+            message = f"has no topic that the rules read: {wanted}; it has {', '.join(recorded)}"
+            raise InvalidInput.at("", message, file=str(path))
+
+    def close(self) -> None:
+        """Close the bag."""
+        self._reader.close()
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The times of the first and the last message of all topics, in seconds since 1970."""
+        return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
+
+    def observations(self) -> Iterator[Observation]:
+        """Yield an observation for each readable message, in the order of their recording."""
+        chosen = [one for one in self._reader.connections if one.id in self._sources]
+        for connection, nanoseconds, data in self._reader.messages(connections=chosen):
+            yield from self._read(connection, nanoseconds / 1e9, data)
+
+    def _read(self, connection: Connection, at: float, data: bytes) -> Iterator[Observation]:
+        for source, entity in self._sources[connection.id]:
+            try:
+                message = self._reader.deserialize(data, connection.msgtype)
+            except Exception as error:  # rosbags passes on errors of its parsers
+                self._leave_out(connection.topic, f"cannot be decoded: {error!r}")
+                continue
+            try:
+                yield self._readers[source].observation(message, entity, at)
+            except Unreadable as error:
+                self._leave_out(connection.topic, str(error))
+
+    def _leave_out(self, topic: str, why: str) -> None:
+        key = topic, one_line(why)
+        self.left_out[key] = self.left_out.get(key, 0) + 1

@@ -1,0 +1,136 @@
+"""Rules tried on a recorded bag: which demands they would make, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from math import dist
+from typing import Any
+
+from demandops.cli import json_output
+from demandops.cli.output import errors
+from demandops.cli.table import Column, Table
+from demandops.detection.detector import Detector
+from demandops.detection.events.detection_state import Event, Key, Observation
+from demandops.detection.rules.rule_demand import Goal
+from demandops.detection.rules.rule_file import RuleFile
+
+from demandops_ros.detector.recorded_bag import RecordedBag
+
+_TOGETHER = 1_000
+"""How many messages the engine takes at once; the events are the same for any number."""
+_TRACK_M = 0.5
+"""The distance in metres between two points of an entity's track in the plot."""
+
+
+@dataclass
+class Replay:
+    """The events and demands of rules for a bag. ``tracks`` has each entity's path, for a plot."""
+
+    bag: str
+    file: RuleFile
+    span: tuple[float, float]
+    topics: list[str]
+    messages: int = 0
+    events: list[tuple[Event, Goal | None]] = field(default_factory=list)
+    lasting: list[Key] = field(default_factory=list)
+    left_out: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    tracks: dict[tuple[str, str], list[tuple[float, float]]] = field(default_factory=dict)
+
+    def keep_track(self, one: Observation) -> None:
+        """Add an entity's position to its track."""
+        if one.position is not None:
+            track = self.tracks.setdefault(one.who, [])
+            if not track or dist(track[-1], one.position) >= _TRACK_M:
+                track.append(one.position)
+
+
+def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
+    """Return the replay of a bag; the detector's clock is the time of recording."""
+    start, end = bag.span
+    detector = Detector(file, start)
+    replay = Replay(name, file, (start, end), sorted(bag.topics))
+    waiting: list[Observation] = []
+
+    def step(now: float) -> None:
+        for event, want in detector.step(waiting, now):
+            replay.events.append((event, want.goal))
+        waiting.clear()
+
+    for one in bag.observations():
+        waiting.append(one)
+        replay.messages += 1
+        replay.keep_track(one)
+        if len(waiting) >= _TOGETHER:
+            step(one.at)
+    step(end)
+    replay.lasting, replay.left_out = sorted(detector.lasting), dict(bag.left_out)
+    return replay
+
+
+def show(replay: Replay, output: str) -> None:
+    """Print the events, as a table or as JSON."""
+    columns = [
+        Column("Second"),
+        Column("Change"),
+        Column("Rule"),
+        Column("Entities"),
+        Column("Why", rank=2, wraps=True),
+        Column("Demand", rank=1),
+    ]
+    rows = [
+        (
+            f"{event.at - replay.span[0]:.1f}",
+            "start" if event.starts else "stop",
+            event.rule,
+            ", ".join(event.subjects),
+            event.why,
+            "" if goal is None else goal.id,
+        )
+        for event, goal in replay.events
+    ]
+    summary = (
+        f"{replay.messages} messages on {len(replay.topics)} topics in "
+        f"{replay.span[1] - replay.span[0]:.1f} s; events that last at the end: "
+        f"{len(replay.lasting)}"
+    )
+    json_output.show(output, as_data(replay), [Table(columns, rows), summary])
+    for (topic, why), count in replay.left_out.items():
+        errors.print(f"warning: {topic}: {count} messages are left out: {why}")
+
+
+def as_data(replay: Replay) -> dict[str, Any]:
+    """Return a replay as plain data, the contract of ``--output json``."""
+    return {
+        "bag": replay.bag,
+        "from": _time(replay.span[0]),
+        "to": _time(replay.span[1]),
+        "topics": replay.topics,
+        "messages": replay.messages,
+        "left_out": [
+            {"topic": topic, "reason": why, "messages": count}
+            for (topic, why), count in replay.left_out.items()
+        ],
+        "events": [
+            {
+                "time": _time(event.at),
+                "second": round(event.at - replay.span[0], 3),
+                "rule": event.rule,
+                "entities": list(event.subjects),
+                "change": "start" if event.starts else "stop",
+                "reason": event.why,
+                "action": None if goal is None else goal.action_name,
+                "goal": None if goal is None else goal.document,
+            }
+            for event, goal in replay.events
+        ],
+        "lasting": [
+            {"rule": rule, "entities": list(subjects)} for rule, subjects in replay.lasting
+        ],
+    }
+
+
+def _time(seconds: float) -> str:
+    moment = datetime.fromtimestamp(seconds, timezone.utc)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,0 +1,131 @@
+"""A process with ROS: its ROS arguments, its log in ROS's log, its executor's thread, its end."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import signal
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import click
+import rclpy
+from demandops.quoting import OneLineFormatter
+from demandops.runtime import REAL
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.logging import LoggingSeverity, set_logger_level
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+_POLL_S = 0.2
+_LAST_CALLBACK_S = 20.0
+
+
+class ExecutorThread:
+    """Runs a node's callbacks in a thread, which ends before its node, and before Python.
+
+    The thread ends itself, because rclpy's ``shutdown`` waits for no callback and destroys what the
+    thread may need. A thread that still waits for ROS when Python ends aborts the process.
+    """
+
+    def __init__(self, node: Node, name: str = "executor") -> None:
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(node)
+        self._over = REAL.event()
+        self._thread = REAL.keep_running(name, self._spin)
+        atexit.register(self.close)  # it may be that nobody else does
+
+    def call(self, callback: Callable[[], object]) -> None:
+        """Call something in the thread."""
+        self._executor.create_task(callback)
+
+    def close(self) -> None:
+        """End the thread; the node may be destroyed then. May be called again."""
+        atexit.unregister(self.close)
+        if not self._over.is_set():
+            self._over.set()
+            self.call(lambda: None)  # wakes it
+            self._thread.join(_LAST_CALLBACK_S)
+            self._executor.shutdown(timeout_sec=0)
+
+    def _spin(self) -> None:
+        while not self._over.is_set() and self._executor.context.ok():
+            with suppress(ExternalShutdownException):
+                self._executor.spin_once()
+
+
+@contextmanager
+def stop_signals() -> Iterator[Callable[[], None]]:
+    """Yield a function that waits for Ctrl-C or SIGTERM; a second signal stops the process."""
+    over = REAL.event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
+
+    def wait() -> None:
+        while not over.wait(_POLL_S):  # a signal may come to another thread
+            pass
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
+
+    try:
+        yield wait
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class RosLogHandler(logging.Handler):
+    """Passes the generator's log records to ROS's log."""
+
+    def __init__(self, logger: RcutilsLogger) -> None:
+        super().__init__()
+        self._log = logger
+        self.setFormatter(OneLineFormatter())
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record at the matching ROS level."""
+        text = self.format(record)  # rclpy allows only one level for each line that logs
+        if record.levelno >= logging.ERROR:
+            self._log.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._log.warning(text)
+        elif record.levelno >= logging.INFO:
+            self._log.info(text)
+        else:
+            self._log.debug(text)
+
+
+@contextmanager
+def started(
+    arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
+) -> Iterator[list[str]]:
+    """Run the block with ROS initialized by `--ros-args`; yield the arguments for ROS.
+
+    Raises:
+        click.UsageError: if there are other arguments.
+    """
+    ros_args = list(arguments)
+    if ros_args and ros_args[0] != "--ros-args":
+        raise click.UsageError(
+            f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
+        )
+    if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
+        # ROS's log library does not start in a container without a home
+        os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
+    rclpy.init(args=["demandops", *ros_args], signal_handler_options=signals)
+    try:
+        yield ros_args
+    finally:
+        rclpy.try_shutdown()
+
+
+def log_to(logger: RcutilsLogger, level: str) -> None:
+    """Pass the generator's log on to a logger of ROS, from this level on."""
+    set_logger_level(logger.name, LoggingSeverity[level.upper()])
+    library_log = logging.getLogger("demandops")
+    library_log.handlers, library_log.propagate = [RosLogHandler(logger)], False
+    library_log.setLevel(logging.DEBUG)

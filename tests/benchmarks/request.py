@@ -1,0 +1,92 @@
+"""How many demands a second `demandops request` books: 300 vehicles at 30 intersections.
+
+One command reads all joins from a file, and each becomes a commit. A command that books a single
+demand tells what the start takes. Both run by turns on fresh repos. Prints a table, writes
+``build/request.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import yaml
+from rich.console import Console
+from rich.progress import Progress
+
+from tests.benchmarks import fleet
+from tests.kit.repo import NO_GIT_CONFIG, commits
+
+INTERSECTIONS, VEHICLES = 30, 10
+ROUNDS = 5
+
+
+def _seconds(folder: Path, demands: int) -> tuple[float, float]:
+    """Book demands in a fresh repo by one command; return its seconds, and the processor's."""
+    laid = fleet.lay_down_idle(folder / "state-repo.git", INTERSECTIONS, VEHICLES)
+    goals = [
+        fleet.goal(fleet.edge_id(edge), fleet.vehicle_id(edge, vehicle))
+        for vehicle in range(VEHICLES)
+        for edge in range(INTERSECTIONS)
+    ]
+    file = folder / "joins.yaml"
+    file.write_text(yaml.safe_dump_all(goals[:demands]))
+    command = [str(Path(sys.executable).with_name("demandops")), "request", str(file)]
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    subprocess.run(
+        [*command, "--state-repo", str(laid.path)],
+        env=os.environ | NO_GIT_CONFIG | {"DEMANDOPS_DATA_HOME": str(folder / "data")},
+        stdout=subprocess.DEVNULL,
+        check=True,
+    )
+    seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    worked = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    booked = len(commits(laid.path))
+    if booked != demands:
+        raise SystemExit(f"{demands} demands became {booked} commits")
+    return seconds, worked
+
+
+def main() -> int:
+    """Measure by turns and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--rounds", type=int, default=ROUNDS)
+    parser.add_argument("--output", type=Path, default=Path("build/request.json"))
+    args = parser.parse_args()
+    args.output.parent.mkdir(parents=True, exist_ok=True)
+    out = Console(highlight=False)
+    sizes = (1, INTERSECTIONS * VEHICLES)
+    times: dict[int, list[tuple[float, float]]] = {size: [] for size in sizes}
+    with Progress(console=out, transient=True) as progress:
+        for _ in progress.track(range(args.rounds), description="booking 300 demands"):
+            for size in sizes:
+                with TemporaryDirectory(prefix="request-", dir=args.output.parent) as folder:
+                    times[size].append(_seconds(Path(folder), size))
+    (one, one_cpu), (many, many_cpu) = (
+        map(statistics.median, zip(*times[size], strict=True)) for size in sizes
+    )
+    row = {
+        "demands": sizes[1],
+        "start_s": one,
+        "all_s": many,
+        "demands_per_s": sizes[1] / many,
+        "without_start_per_s": (sizes[1] - 1) / (many - one),
+        "start_cpu_s": one_cpu,
+        "all_cpu_s": many_cpu,
+    }
+    out.print(fleet.table("Demands through `demandops request`", [row]))
+    args.output.write_text(json.dumps({"rows": [row], "seconds": times}, indent=2) + "\n")
+    out.print(f"written to {args.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

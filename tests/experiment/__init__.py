@@ -1,0 +1,1 @@
+"""The paper's experiment without scripted demands: `make experiment` (docs/experiment.md)."""

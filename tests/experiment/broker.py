@@ -1,0 +1,61 @@
+"""A real MQTT broker on loopback, and what it carries."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as mqtt
+
+from tests.e2e.rig import launch
+from tests.e2e.rig.net import free_port
+
+_START_S = 10.0
+
+
+class Broker:
+    """mosquitto, and a client of it that counts all messages."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
+        self.bytes: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
+        program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+        assert program, "mosquitto is missing; run `setup/system e2e` as root to install it"
+        configuration = folder / "mosquitto.conf"
+        configuration.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n")
+        with (folder / "mosquitto.log").open("w") as log:
+            self._process = subprocess.Popen(
+                launch.command(program, "-c", str(configuration)), stdout=log, stderr=log
+            )
+        self._counter = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        self._counter.on_connect = lambda client, *_: client.subscribe("#")
+        self._counter.on_message = self._count
+        self._connect()
+        self._counter.loop_start()
+
+    def _connect(self) -> None:
+        deadline = time.monotonic() + _START_S
+        while True:
+            try:
+                self._counter.connect("127.0.0.1", self.port)
+                return
+            except OSError:
+                if self._process.poll() is not None or time.monotonic() > deadline:
+                    raise
+                time.sleep(0.05)
+
+    def _count(self, _: object, __: object, message: Any) -> None:
+        self.bytes[message.topic] += len(message.payload)
+        self.messages[message.topic] += 1
+
+    def close(self) -> None:
+        """End both."""
+        self._counter.disconnect()
+        self._counter.loop_stop()
+        self._process.terminate()
+        self._process.wait(10)

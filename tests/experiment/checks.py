@@ -1,0 +1,133 @@
+"""What must hold of a run. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from examples.experiment import paper
+from tests.e2e.common.expected import FUSION
+
+from . import fleet
+from .experiment import Outcome
+from .measures import steps
+from .participants import EGO_DATA
+from .routes import VEHICLES
+
+_SLACK_S = 3.0
+"""How long a message may be under way, or a client may take to end."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """Something that must hold, and the difference if it does not."""
+
+    name: str
+    fault: str = ""
+
+    @property
+    def holds(self) -> bool:
+        """Return whether it does."""
+        return not self.fault
+
+
+def checks(outcome: Outcome) -> list[Check]:
+    """Return all checks of a run."""
+    return [
+        Check("the detector formed the demands that a plain script over the poses gives",
+              differ([str(one) for one in outcome.events], [str(one) for one in outcome.formed])),
+        Check("after each demand the requesters of every service and connection are right",
+              "; ".join(_requesters(outcome))),
+        *_as_in_the_paper(outcome),
+        Check("the fusion subscribed to exactly these topics after each demand, without a restart",
+              "; ".join(_inputs(outcome))),
+        Check("every vehicle's data arrived on the edge while it was near, and only then",
+              "; ".join(_arrivals(outcome))),
+        Check("nothing arrived on the edge before the first demand",
+              f"{outcome.early} messages" if outcome.early else ""),
+        Check("every pod ran on the node that it was for", "; ".join(check_nodes(outcome))),
+        Check("the fusion published lists with every vehicle that was near",
+              "; ".join(_fused(outcome))),
+        Check("at the end only the initial deployment is left",
+              differ(sorted(outcome.before), sorted(outcome.left))),
+    ]  # fmt: skip
+
+
+def differ(expected: object, found: object) -> str:
+    """Return the difference, or an empty text."""
+    return "" if expected == found else f"expected {expected}, found {found}"
+
+
+def _requesters(outcome: Outcome) -> Iterator[str]:
+    inside: set[str] = set()
+    for formed in outcome.formed:
+        inside ^= {formed.vehicle}
+        if fault := differ(fleet.requesters(inside), formed.books):
+            yield f"{formed}: {fault}"
+
+
+def _as_in_the_paper(outcome: Outcome) -> Iterator[Check]:
+    settings = outcome.settings
+    if settings.seed == 0 and not settings.short and not settings.vanish:
+        found = [formed.books for formed in outcome.formed]
+        table = [paper.expected(step) for step in range(1, len(paper.STEPS) + 1)]
+        yield Check("the requesters are those of the paper's table", differ(table, found))
+
+
+def _inputs(outcome: Outcome) -> Iterator[str]:
+    """Look for each set of inputs, in order; the fusion may pass through others in between."""
+    seen = [topics for at, topics in outcome.inputs if at >= outcome.set_off]
+    inside: set[str] = set()
+    for formed in outcome.formed:
+        inside ^= {formed.vehicle}
+        wanted = fleet.fusion_inputs(inside)
+        if wanted in seen:
+            seen = seen[seen.index(wanted) + 1 :]
+        else:
+            yield f"after '{formed}' it never read {sorted(wanted)}"
+    fusions = [pod for pod in outcome.pods if pod.service == FUSION]
+    starts = [len(container.starts) for pod in fusions for container in pod.containers]
+    stays = _stays([formed.joins for formed in outcome.formed])
+    if len(fusions) != stays or set(starts) != {1}:
+        yield f"{len(fusions)} pods in place of {stays}, with {starts} starts of containers"
+
+
+def _stays(joins: Iterable[bool]) -> int:
+    """Return how often somebody came when nobody was near."""
+    count = inside = 0
+    for joined in joins:
+        count += joined and inside == 0
+        inside += 1 if joined else -1
+    return count
+
+
+def _arrivals(outcome: Outcome) -> Iterator[str]:
+    for vehicle in sorted({event.vehicle for event in outcome.events}):
+        times = outcome.arrivals.get(EGO_DATA.format(vehicle), [])
+        spans = [
+            (step.event.at, step.gone + _SLACK_S if step.gone else outcome.over)
+            for step in steps(outcome)
+            if step.event.vehicle == vehicle and step.event.joins
+        ]
+        if not times:
+            yield f"nothing of {vehicle} arrived"
+        stray = [at for at in times if not any(begin <= at <= end for begin, end in spans)]
+        if stray:
+            yield f"{len(stray)} messages of {vehicle} arrived when nobody demanded them"
+
+
+def check_nodes(outcome: Outcome) -> Iterator[str]:
+    """Yield the pods that ran elsewhere than they should."""
+    for pod in outcome.pods:
+        kind, *rest = pod.service.split("-")
+        is_first = kind in ("od", "of", "zenoh") or rest[2] == "source"
+        wanted = rest[0] if is_first else rest[1]
+        node = outcome.node_ids.get(pod.node, pod.node)
+        if node != wanted:
+            yield f"{pod.service} ran on {node}, not on {wanted}"
+
+
+def _fused(outcome: Outcome) -> Iterator[str]:
+    for step in steps(outcome):
+        if step.event.joins and step.event.vehicle in VEHICLES and step.first is None:
+            yield f"no list had {step.event.vehicle}"

@@ -1,0 +1,125 @@
+"""The larger experiment's world: many vehicles, three intersections with an edge each. Pure."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import yaml
+
+from tests.e2e.common.running import CLUSTER
+
+from .checks import Check, check_nodes, differ
+from .experiment import Formed, Outcome
+from .routes import MIDDLES
+from .rules import RULES, Event, Near, Pose, events_of
+
+FLEET = "vehicles"
+"""The cluster of the vehicles; the others are in that of the skeleton."""
+EDGES = tuple(f"edge{number:02}" for number in range(len(MIDDLES)))
+STATIONS = tuple(f"station{number:02}" for number in range(len(MIDDLES)))
+NODES = (*EDGES, *STATIONS, "cloud")
+
+
+def crossings(near: Near) -> tuple[Near, ...]:
+    """Return the intersections; the first is the paper's."""
+    (x, y) = near.point
+    return tuple(replace(near, point=(x + dx, y + dy)) for dx, dy in MIDDLES)
+
+
+def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
+    """Return the inventory; `clusters` is `inventory/clusters.yaml` of the skeleton."""
+    places: dict[str, Any] = yaml.safe_load(clusters)
+    places["clusters"].append({"name": FLEET})
+    kinds = dict.fromkeys(vehicles, "vehicle") | {node: node.rstrip("0123456789") for node in NODES}
+    nodes = [
+        {"id": node, "type": kind, "cluster": FLEET if kind == "vehicle" else CLUSTER}
+        for node, kind in kinds.items()
+    ]
+    brokers = [{"node": edge, "host": edge, "port": 1883} for edge in EDGES]
+    head = {"apiVersion": "demandops/v1"}
+    return {
+        "inventory/clusters.yaml": yaml.safe_dump(places),
+        "inventory/nodes.yaml": yaml.safe_dump({**head, "kind": "Nodes", "nodes": nodes}),
+        "inventory/brokers.yaml": yaml.safe_dump({**head, "kind": "Brokers", "brokers": brokers}),
+    }
+
+
+def rules(near: Near) -> str:
+    """Return a rule for each intersection: that of the example for vehicles without a lidar."""
+    found: dict[str, Any] = yaml.safe_load(RULES.read_text())
+    text = yaml.safe_dump(found["rules"][-1])
+    found["rules"] = []
+    for number, crossing in enumerate(crossings(near)):
+        rule = yaml.safe_load(text.replace("station00", STATIONS[number]))
+        rule = yaml.safe_load(
+            yaml.safe_dump(rule)
+            .replace("/edge", f"/{EDGES[number]}")
+            .replace(": edge\n", f": {EDGES[number]}\n")
+            .replace("edge/", f"{EDGES[number]}/")
+        )
+        x, y = crossing.point
+        rule |= {"name": f"at-{STATIONS[number]}", "entities": ["vehicle*"]}
+        rule["near"]["point"] = {"x": x, "y": y}
+        found["rules"].append(rule)
+    return yaml.safe_dump(found)
+
+
+def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> list[Event]:
+    """Return who joins and leaves until a time, each at the intersection that it passes."""
+    own: defaultdict[Near, list[Pose]] = defaultdict(list)
+    for pose in poses:
+        own[passing[pose.vehicle]].append(pose)
+    found = [event for near, some in own.items() for event in events_of(some, near, until)]
+    return sorted(found, key=lambda event: event.at)
+
+
+def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
+    """Return who requests what while these vehicles are near, each at an intersection."""
+    rows: dict[str, list[str]] = {}
+    for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
+        here = sorted(vehicle for vehicle, at in inside.items() if at == number)
+        if not here:
+            continue
+        everybody = sorted({station, *here})
+        rows |= {
+            f"connection {station} to {edge}": everybody,
+            f"object-detection {station}": everybody,
+            f"object-fusion {edge}/object_detection_fusion": everybody,
+        }
+        rows |= {f"connection {one} to {edge}": sorted({station, one}) for one in here}
+    return dict(sorted(rows.items()))
+
+
+def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
+    """Return the checks of a run without data."""
+    return [
+        Check("the detector formed the demands that a plain script over the poses gives",
+              differ(_by_vehicle(outcome.events), _by_vehicle(outcome.formed))),
+        Check("the requesters of every service and connection are right after the demands that "
+              "were looked at", "; ".join(_requesters(outcome.formed, passing))),
+        Check("every pod ran on the node that it was for", "; ".join(check_nodes(outcome))),
+        Check("at the end both clusters are as before",
+              differ(sorted(outcome.before), sorted(outcome.left))),
+    ]  # fmt: skip
+
+
+def _by_vehicle(found: Iterable[Event] | Iterable[Formed]) -> dict[str, list[bool]]:
+    """Return who joins and leaves how often; those of different vehicles may overtake."""
+    by_vehicle: defaultdict[str, list[bool]] = defaultdict(list)
+    for one in found:
+        by_vehicle[one.vehicle].append(one.joins)
+    return dict(sorted(by_vehicle.items()))
+
+
+def _requesters(formed: Iterable[Formed], passing: Mapping[str, int]) -> Iterator[str]:
+    inside: dict[str, int] = {}
+    for one in formed:
+        if one.joins:
+            inside[one.vehicle] = passing[one.vehicle]
+        else:
+            inside.pop(one.vehicle, None)
+        if one.books is not None and (fault := differ(requesters(inside), one.books)):
+            yield f"{one}: {fault}"

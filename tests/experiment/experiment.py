@@ -1,0 +1,408 @@
+"""One run: a cluster, brokers, vehicles, the generator and the detector, and what was seen."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from examples.experiment import paper
+from tests.e2e.common.answers import limited_world
+from tests.e2e.common.ros import Client
+from tests.e2e.common.running import CLUSTER
+from tests.e2e.common.staterepo import StateRepo, demandops, environment
+from tests.e2e.rig import launch
+from tests.e2e.rig.cluster import Gitops, Rig
+from tests.kit.ros import reserved
+
+from . import fleet, routes
+from .broker import Broker
+from .fleet import Carrier
+from .observers import CloudObserver, EdgeObserver
+from .participants import POSE, Plan
+from .process_runner import ProcessRunner, RunningPod
+from .routes import Way
+from .rules import Event, Near, Pose, causes, events_of, poses_in, predicted
+from .standins.image import image
+
+ROOT = Path(__file__).resolve().parents[2]
+_PATIENCE_S = 120.0
+_STAND_S = 0.5
+"""How long before something happens the vehicles stand, if they have to."""
+_CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to play: routes by a seed, or the tracks of a bag."""
+
+    gitops: Gitops = "flux"
+    connections: Carrier = "mqtt"
+    seed: int = 0
+    gap: float = 10.0
+    short: bool = False
+    vanish: str = ""
+    bag: str = ""
+    large: int = 0
+    tracks: tuple[Way, ...] = ()
+
+    def routes(self) -> tuple[Way, ...]:
+        """Return who drives where."""
+        if self.tracks:
+            return self.tracks
+        if self.large:
+            return routes.many(self.seed, self.large)
+        found = routes.one(self.seed, self.gap) if self.short else routes.four(self.seed, self.gap)
+        return routes.vanishing(found, self.vanish) if self.vanish else found
+
+
+@dataclass(frozen=True)
+class Formed:
+    """A demand that the detector formed: its commit, its stages, and what was booked after it."""
+
+    commit: str
+    vehicle: str
+    joins: bool
+    stages: dict[str, float]
+    books: dict[str, list[str]] | None  # None: nobody looked
+
+    def __str__(self) -> str:
+        return f"{self.vehicle} {'joins' if self.joins else 'leaves'}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was seen. Times are seconds since 1970."""
+
+    settings: Settings
+    routes: tuple[Way, ...]
+    near: Near
+    set_off: float
+    over: float
+    held: float
+    poses: list[Pose]
+    events: list[Event]
+    formed: list[Formed]
+    pods: list[RunningPod]
+    node_ids: dict[str, str]
+    inputs: list[tuple[float, frozenset[str]]]
+    fused: list[tuple[float, float, int]]
+    tracks: list[tuple[float, list[tuple[float, float]]]]
+    arrivals: dict[str, list[float]]
+    early: int
+    published: dict[str, dict[str, int]]
+    carried: dict[str, int]
+    left: frozenset[str]
+    before: frozenset[str]
+    crossings: tuple[Near, ...] = ()
+    """All intersections, if there are more."""
+
+
+Say = Callable[[str], object]
+
+
+class Experiment:
+    """The parts of a run, started one after the other."""
+
+    def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
+        self._settings, self._folder, self._say = settings, folder, say
+        self._near, self._routes = Near.read(), settings.routes()
+        self._stack = ExitStack()
+
+    def run(self) -> Outcome:
+        """Play, and return what was seen."""
+        with self._stack:
+            self._start_cluster()
+            self._start_fleet()
+            self._deploy_initially()
+            return self._drive()
+
+    def _start_cluster(self) -> None:
+        settings = self._settings
+        rig = Rig(CLUSTER, gitops=settings.gitops, nodes=fleet.NODES, report=self._say)
+        rig.start()
+        self._stack.push(lambda kind, *_: rig.stop(failed=kind is not None))
+        self._say(f"the cluster is up: {rig.timings}")
+        self._domains = {node: self._stack.enter_context(reserved()) for node in fleet.NODES}
+        self._brokers = {node: Broker(self._made(f"broker-{node}")) for node in ("cloud", "edge")}
+        for broker in self._brokers.values():
+            self._stack.callback(broker.close)
+        self._rig, self._rigs = rig, {CLUSTER: rig}
+
+    def _start_fleet(self) -> None:
+        rig, folder = self._rig, self._made("generator")
+        client = Client(self._domains["cloud"])
+        self._stack.callback(client.close)
+        self._world = world = _world(rig, folder, self._domains["cloud"], client)
+        self._stack.callback(world.generator.stop)
+        ports = {node: broker.port for node, broker in self._brokers.items()}
+        given = (world.file(name) for name in ("inventory/nodes.yaml", "registry/images.yaml"))
+        world.push(fleet.files(*given, self._domains, ports))
+        limited_world(world, rig, _CONTROLLER[self._settings.gitops])
+        self._runner = ProcessRunner(
+            rig.kube,
+            world.domain.namespace,
+            image(self._made("image")),
+            self._made("pods"),
+            environment(self._made("containers")) | {"PYTHONPATH": _python_path()},
+        )
+        self._stack.callback(self._runner.close)
+        self._edge = EdgeObserver(self._domains["edge"])
+        self._cloud = CloudObserver(self._domains["cloud"])
+        for observer in (self._edge, self._cloud):
+            observer.start()
+            self._stack.callback(observer.close)
+
+    def _deploy_initially(self) -> None:
+        """Bring the vehicles' poses to the cloud, and start the detector there."""
+        record = self._folder / "poses.jsonl"
+        plan = Plan(
+            self._routes,
+            self._near.point,
+            self._domains,
+            self._settings.seed,
+            str(record),
+            fleet.station_cloud(self._settings.connections),
+        )
+        plan.write(self._folder / "plan.json")
+        self._participants = self._start(
+            "participants", "tests.experiment.participants", str(self._folder / "plan.json")
+        )
+        assert self._read()["ready"]
+        vehicles = [route.vehicle for route in self._routes]
+        self._world.demand(fleet.initial_deployment(vehicles))
+        for vehicle in vehicles:
+            self._wait(
+                f"poses of {vehicle} in the cloud",
+                lambda v=vehicle: len(self._cloud.arrivals[POSE.format(v)]) > 0,
+            )
+        self._wait("the pods of the initial deployment", self._is_ready)
+        self._before = self._world.domain.lines()
+        self._say("the initial deployment carries the vehicles' poses to the cloud")
+        rules = self._folder / "rules.yaml"
+        rules.write_text(fleet.rules(self._settings.connections))
+        self._detect(rules)
+
+    def _detect(self, rules: Path) -> None:
+        """Start the detector in the cloud, and wait until it knows what is booked."""
+        options = ["detect", str(rules)]
+        self._detector = self._start("detector", "demandops.cli.main", *options, domain="cloud")
+        self._wait("the detector's start", lambda: "detecting; rules: " in self._log("detector"))
+
+    def _drive(self) -> Outcome:
+        first_commit, early = self._world.tip(), self._arrived()
+        last = max(route.ends for route in self._routes) + 2 * self._near.timeout
+        happens = causes(predicted(self._routes, self._near, last), self._near, last)
+        assert happens, "no vehicle comes near"
+        self._drive_until(_stand(happens, 1))
+        set_off = self._read()["set_off"]
+        self._say(f"the vehicles have set off; the last one leaves after {happens[-1]:.0f} s")
+        for number in range(1, len(happens) + 1):
+            self._drive_until(_stand(happens, number))
+            patience = happens[-1] + _PATIENCE_S
+            self._wait(f"event {number}", lambda n=number: len(self._events()) >= n, patience)
+            event = self._events()[number - 1]
+            if not self._reaches(lambda n=number: self._is_settled(n, first_commit), _PATIENCE_S):
+                self._say(f"'{event}' did not have all its consequences; the drive goes on")
+        self._wait("the last demands", lambda: self._released(first_commit, len(happens)))
+        self._wait("the last pods", self._is_as_before)
+        time.sleep(2.0)  # messages that should not come had time to come
+        over, left = time.time(), self._world.domain.lines()
+        self._end(self._detector)
+        self._participants.send_signal(signal.SIGTERM)
+        said = self._read()
+        poses = poses_in(self._folder / "poses.jsonl")
+        return Outcome(
+            settings=self._settings,
+            routes=self._routes,
+            near=self._near,
+            set_off=set_off,
+            over=over,
+            poses=poses,
+            events=events_of(poses, self._near, over),
+            formed=list(self._formed(first_commit)),
+            pods=[
+                pod for pod in self._runner.pods.values() if not pod.service.startswith(_INITIAL)
+            ],
+            node_ids=self._node_ids(),
+            inputs=self._edge.inputs,
+            fused=self._edge.fused,
+            tracks=self._edge.tracks,
+            arrivals=dict(self._edge.arrivals),
+            early=early,
+            held=said["held"],
+            published=said["sent"],
+            carried=self._carried(),
+            left=left,
+            before=self._before,
+        )
+
+    # --- looking ----------------------------------------------------------------------------
+
+    def _events(self) -> list[Event]:
+        return events_of(poses_in(self._folder / "poses.jsonl"), self._near, time.time())
+
+    def _arrived(self) -> int:
+        return sum(len(times) for times in self._edge.arrivals.values()) + len(self._edge.fused)
+
+    def _commits(self, since: str) -> list[str]:
+        repository = self._rig.repository(self._world.name)
+        command = ["git", "-C", str(repository), "rev-list", "--reverse", f"{since}..main"]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+
+    def _released(self, since: str, expected: int) -> bool:
+        """Return whether all demands are there, and nobody requests the fusion any longer."""
+        return len(self._commits(since)) >= expected and not self._books(self._world.tip())
+
+    def _is_settled(self, number: int, since: str) -> bool:
+        """Return whether what the first events demand has been deployed, and works."""
+        events = self._events()[:number]
+        inside: set[str] = set()
+        for event in events:
+            inside ^= {event.vehicle}
+        if len(self._commits(since)) < number:
+            return False
+        if self._edge.inputs[-1][1] != fleet.fusion_inputs(inside):
+            return False
+        return self._is_fused(events[-1]) if events[-1].joins else not self._runs(events[-1])
+
+    def _is_fused(self, event: Event) -> bool:
+        poses = poses_in(self._folder / "poses.jsonl")
+        own = {(p.x, p.y) for p in poses if p.vehicle == event.vehicle and p.at >= event.at}
+        return any(at >= event.at and own & set(seen) for at, seen in list(self._edge.tracks))
+
+    def _runs(self, event: Event) -> bool:
+        """Return whether a client of the vehicle's connection runs."""
+        carrier = self._settings.connections
+        running = [pod for pod in list(self._runner.pods.values()) if pod.ended is None]
+        return any(fleet.is_client(pod.service, event.vehicle, carrier) for pod in running)
+
+    def _carried(self) -> dict[str, int]:
+        if self._settings.connections == "mqtt":
+            return dict(self._brokers["edge"].bytes)
+        return {f"zenoh{topic}": size for topic, size in self._edge.bytes.items()}
+
+    def _is_ready(self) -> bool:
+        pods = [line for line in self._world.domain.lines() if line.startswith("pod of ")]
+        return all(line.endswith(", ready") for line in pods)
+
+    def _is_as_before(self) -> bool:
+        return self._world.domain.lines() == self._before
+
+    def _books(self, commit: str) -> dict[str, list[str]]:
+        """Return who requests what after a commit, without the initial deployment."""
+        repository = str(self._rig.repository(self._world.name))
+        options = ("--state-repo", repository, "--at", commit, "--output", "json")
+        books = json.loads(demandops(self._made("reader"), "bookkeeping", *options))
+        rows = paper.observed(books)
+        return {row: who for row, who in rows.items() if not row.endswith(" to cloud")}
+
+    def _formed(self, since: str) -> Iterator[Formed]:
+        """Yield the demands, from what changed in the bookkeeping from commit to commit."""
+        stages, inside = self._cloud.commits(), set()
+        for commit in self._commits(since):
+            books = self._books(commit)
+            now = {who for whos in books.values() for who in whos if who in routes.VEHICLES}
+            for vehicle in sorted(now ^ inside):
+                yield Formed(commit, vehicle, vehicle in now, stages.get(commit, {}), books)
+            inside = now
+
+    def _node_ids(self) -> dict[str, str]:
+        rigs = self._rigs.values()
+        nodes = [node["metadata"] for rig in rigs for node in rig.kube.find("Node")]
+        return {node["name"]: node["labels"].get("node_id", "") for node in nodes}
+
+    # --- processes --------------------------------------------------------------------------
+
+    def _start(self, name: str, module: str, *arguments: str, domain: str = "") -> Any:
+        given = environment(self._made(name)) | {"PYTHONPATH": _python_path()}
+        if domain:
+            given["ROS_DOMAIN_ID"] = str(self._domains[domain])
+        with (self._folder / f"{name}.log").open("w") as log:
+            process = subprocess.Popen(
+                launch.command(sys.executable, "-m", module, *arguments),
+                env=given,
+                cwd=ROOT,
+                stdin=subprocess.PIPE,
+                stdout=log if domain else subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        self._stack.callback(lambda: (process.kill(), process.wait(10)))
+        return process
+
+    def _drive_until(self, moment: float) -> None:
+        """Let the vehicles drive until a moment of their ways."""
+        self._participants.stdin.write(f"{moment}\n")
+        self._participants.stdin.flush()
+
+    def _end(self, process: Any) -> None:
+        process.send_signal(signal.SIGTERM)
+        process.wait(30)
+
+    def _read(self) -> dict[str, Any]:
+        line = self._participants.stdout.readline()
+        assert line, f"the participants ended: {self._log('participants')}"
+        return dict(json.loads(line))
+
+    def _log(self, name: str) -> str:
+        return (self._folder / f"{name}.log").read_text()
+
+    def _wait(self, what: str, holds: Callable[[], bool], seconds: float = _PATIENCE_S) -> None:
+        assert self._reaches(holds, seconds), f"{what} did not come in {seconds:.0f} s"
+
+    def _reaches(self, holds: Callable[[], bool], seconds: float) -> bool:
+        deadline = time.monotonic() + seconds
+        while not holds():
+            self._rig.check()
+            for name, process in self._parts():
+                assert process.poll() is None, f"the {name} ended: {self._log(name)}"
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.1)
+        return True
+
+    def _parts(self) -> Iterator[tuple[str, Any]]:
+        for name in ("participants", "detector"):
+            process = getattr(self, f"_{name}", None)
+            if process is not None:
+                yield name, process
+
+    def _made(self, name: str) -> Path:
+        folder = self._folder / name
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+_INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
+
+
+def _stand(happens: list[float], number: int) -> float:
+    """Return when the vehicles stand at the latest, after so many things have happened."""
+    if number == len(happens):
+        return math.inf
+    before, after = happens[number - 1 : number + 1]
+    return after - min(_STAND_S, (after - before) / 2)
+
+
+def _world(rig: Rig, folder: Path, domain: int, client: Client) -> StateRepo[Any]:
+    if rig.gitops == "argocd":
+        from tests.e2e.argocd.world import World as ArgoWorld
+
+        return ArgoWorld(rig, folder, domain, client)
+    from tests.e2e.flux.world import World as FluxWorld
+
+    return FluxWorld(rig, folder, domain, client)
+
+
+def _python_path() -> str:
+    return os.pathsep.join(str(ROOT / part) for part in ("", "generator", "ros_bridge"))

@@ -1,0 +1,137 @@
+"""The state repo of the experiment: the skeleton's, with what differs on one machine.
+
+Connections to the edge are of MQTT, as in the paper, or of Zenoh. Those to the cloud are of MQTT.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any, Literal
+
+import yaml
+
+from examples.experiment.paper import S
+from tests.e2e.rig.net import free_port
+
+from .participants import POSE, STATION_CLOUD
+from .routes import VEHICLES
+from .rules import RULES
+
+Carrier = Literal["mqtt", "zenoh"]
+NODES = (*VEHICLES, S, "edge", "cloud")
+_SYNC = {
+    "apiVersion": "demandops/v1",
+    "kind": "Override",
+    "reason": "The fusion follows its ConfigMap by a watch",
+    "owner": "experiment",
+    "select": [{"services": ["object-fusion"]}],
+    "values": {"watcher": {"package": "demandops_ros", "launchFile": "parameter_sync.launch.xml"}},
+}
+
+
+_BRIDGE = {"repository": "docker.io/eclipse/zenoh-bridge-ros2dds", "tag": "1.10.0"}
+_ZENOH = 2
+STATION_CLOUD_TARGET = f"/stations/{S}/pointcloud"
+
+
+def files(
+    nodes: str, images: str, domains: dict[str, int], ports: dict[str, int]
+) -> dict[str, str]:
+    """Return the files that a person changes.
+
+    Args:
+        nodes, images: `inventory/nodes.yaml` and `registry/images.yaml` of the skeleton.
+        domains: the ROS domain of each node.
+        ports: the port of each node's MQTT broker on this machine.
+    """
+    inventory: dict[str, Any] = yaml.safe_load(nodes)
+    registry: dict[str, Any] = yaml.safe_load(images)
+    registry["images"]["zenoh-bridge"] = _BRIDGE
+    for node in inventory["nodes"]:
+        node["ros"]["domainId"] = domains[node["id"]]
+        edge = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
+        node["zenoh"] = edge if node["id"] == "edge" else {}
+    brokers = [{"node": node, "host": "127.0.0.1", "port": port} for node, port in ports.items()]
+    return {
+        "inventory/nodes.yaml": yaml.safe_dump(inventory),
+        "registry/images.yaml": yaml.safe_dump(registry),
+        "inventory/brokers.yaml": yaml.safe_dump(
+            {"apiVersion": "demandops/v1", "kind": "Brokers", "brokers": brokers}
+        ),
+        "overrides/parameter-sync.yaml": yaml.safe_dump(_SYNC),
+    }
+
+
+def rules(carrier: Carrier) -> str:
+    """Return the rules of the example; with Zenoh, which renames no topic and needs no broker."""
+    text = RULES.read_text()
+    if carrier == "mqtt":
+        return text
+    found: dict[str, Any] = yaml.safe_load(text)
+    for rule in found["rules"]:
+        for connection in rule["deploymentRequest"]["connections"]:
+            del connection["broker_node_id"]
+            connection |= {"type": _ZENOH, "source_topics": [*connection["target_topics"]]}
+    return yaml.safe_dump(found)
+
+
+def station_cloud(carrier: Carrier) -> str:
+    """Return the topic on which the station publishes."""
+    return STATION_CLOUD if carrier == "mqtt" else STATION_CLOUD_TARGET
+
+
+CLIENTS: dict[Carrier, int] = {"mqtt": 2, "zenoh": 1}
+"""How many clients only one vehicle's connection to an edge has."""
+
+
+def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
+    """Return whether a service is one of these clients."""
+    if carrier == "zenoh":
+        return service == f"zenoh-{vehicle}"
+    return service.startswith(f"mqtt-{vehicle}-edge")
+
+
+def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
+    """Return the goal that brings every vehicle's poses to the cloud, for the detector."""
+    return {
+        "id": "initial-deployment",
+        "shutdown": False,
+        "connections": [
+            {
+                "id": f"{vehicle}/cloud",
+                "broker_node_id": "cloud",
+                "requester_ids": ["operator"],
+                "source_node_id": vehicle,
+                "target_node_id": "cloud",
+                "source_topics": [POSE.format(vehicle)],
+                "target_topics": [POSE.format(vehicle)],
+                "type": 1,
+            }
+            for vehicle in vehicles
+        ],
+    }
+
+
+def requesters(inside: Collection[str]) -> dict[str, list[str]]:
+    """Return who requests what while these vehicles are near; the paper's table in general."""
+    if not inside:
+        return {}
+    everybody = sorted({S, *inside})
+    rows = {
+        f"connection {S} to edge": everybody,
+        f"object-detection {S}": everybody,
+        "object-fusion edge/object_detection_fusion": everybody,
+    }
+    rows |= {f"connection {vehicle} to edge": sorted({S, vehicle}) for vehicle in inside}
+    if VEHICLES[0] in inside:
+        rows[f"object-detection {VEHICLES[0]}"] = sorted({S, VEHICLES[0]})
+    return dict(sorted(rows.items()))
+
+
+def fusion_inputs(inside: Collection[str]) -> frozenset[str]:
+    """Return the topics that the fusion must read while these vehicles are near."""
+    if not inside:
+        return frozenset()
+    sources = {S} | ({VEHICLES[0]} & set(inside))
+    lists = {f"/{source}_local_objectlist" for source in sources}
+    return frozenset(lists | {f"/vehicles/{vehicle}/ego_data" for vehicle in inside})

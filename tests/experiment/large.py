@@ -1,0 +1,179 @@
+"""The larger experiment: many vehicles by their poses alone, three intersections, two clusters.
+
+One process sends the poses in the cloud's ROS domain. The detector, the node, Git, the controllers
+and the clusters are those of the experiment; no container runs, so no data flow.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import yaml
+
+from tests.e2e.common.access import documented_roles, limited
+from tests.e2e.common.ros import Client
+from tests.e2e.common.running import CLUSTER
+from tests.e2e.flux.world import World
+from tests.e2e.rig.cluster import Rig
+from tests.kit.ros import reserved
+
+from . import crowd
+from .experiment import Experiment, Formed, Outcome, Say, Settings
+from .observers import CloudObserver
+from .participants import Plan
+from .process_runner import ProcessRunner
+from .rules import poses_in
+
+_LOOKS = 12
+"""At how many commits the whole bookkeeping is compared."""
+
+
+class PodWatch(ProcessRunner):
+    """Notes when pods get their nodes and end; it starts nothing."""
+
+    def _prepare(self) -> None:
+        self.pods |= self._waiting
+        self._waiting.clear()
+
+    def _refresh(self, config_map: str) -> None:
+        pass
+
+
+class LargeExperiment(Experiment):
+    """The parts of a run, started one after the other."""
+
+    def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
+        super().__init__(settings, folder, say)
+        self._crossings = crowd.crossings(self._near)
+        places = [crossing.point for crossing in self._crossings]
+        origin = self._near.point
+        self.passing = {
+            route.vehicle: places.index((origin[0] + route.middle[0], origin[1] + route.middle[1]))
+            for route in self._routes
+        }
+
+    def _start_cluster(self) -> None:
+        vehicles = [route.vehicle for route in self._routes]
+        self._rig = rig = Rig(CLUSTER, nodes=crowd.NODES, report=self._say)
+        self._rigs = {CLUSTER: rig}
+        rig.start()
+        self._stack.push(lambda kind, *_: rig.stop(failed=kind is not None))
+        self._rigs[crowd.FLEET] = fleet = Rig(crowd.FLEET, nodes=vehicles, git_of=rig)
+        fleet.start()
+        self._stack.push(lambda kind, *_: fleet.stop(failed=kind is not None))
+        self._domains = {"cloud": self._stack.enter_context(reserved())}
+        self._say(f"two clusters are up, with {len(vehicles) + len(crowd.NODES)} nodes")
+
+    def _start_fleet(self) -> None:
+        folder = self._made("generator")
+        client = Client(self._domains["cloud"])
+        self._stack.callback(client.close)
+        self._world = world = World(self._rig, folder, self._domains["cloud"], client)
+        self._stack.callback(world.generator.stop)
+        world.push(crowd.files(self.passing.keys(), world.file("inventory/clusters.yaml")))
+        world.generator.start()
+        bootstrap = f"bootstrap/{crowd.FLEET}.yaml"
+        self._wait("the second cluster's bootstrap file", lambda: self._exists(bootstrap))
+        access, self._watches = {}, []
+        for name, rig in self._rigs.items():
+            namespace = world.bootstrap(name, rig).namespace
+            rights = limited(
+                rig.kube, rig.kubeconfig, self._made(f"access-{name}"), documented_roles("flux")
+            )
+            access[name] = {"kubeconfig": str(rights)}
+            watch = PodWatch(rig.kube, namespace, folder, self._made("pods"), {})
+            self._stack.callback(watch.close)
+            self._watches.append(watch)
+        head = {"apiVersion": "demandops/v1", "kind": "ClusterAccess"}
+        file = folder / "clusters.yaml"
+        file.write_text(yaml.safe_dump({**head, "clusters": access}))
+        world.generator.stop()
+        world.generator.start("--clusters", str(file))
+        self._cloud = CloudObserver(self._domains["cloud"])
+        self._cloud.start()
+        self._stack.callback(self._cloud.close)
+
+    def _deploy_initially(self) -> None:
+        record, seed = str(self._folder / "poses.jsonl"), self._settings.seed
+        plan = Plan(self._routes, self._near.point, self._domains, seed, record, "", True)
+        plan.write(self._folder / "plan.json")
+        self._participants = self._start(
+            "participants", "tests.experiment.participants", str(self._folder / "plan.json")
+        )
+        assert self._read()["ready"]
+        self._before = self._lines()
+        rules = self._folder / "rules.yaml"
+        rules.write_text(crowd.rules(self._near))
+        self._detect(rules)
+
+    def _drive(self) -> Outcome:
+        first = self._world.tip()
+        self._drive_until(math.inf)
+        set_off = self._read()["set_off"]
+        last = max(route.ends for route in self._routes)
+        self._say(
+            f"{len(self._routes)} vehicles have set off; the last one leaves after {last:.0f} s"
+        )
+        deadline = time.monotonic() + last + 2 * self._near.timeout
+        self._reaches(lambda: time.monotonic() > deadline, math.inf)
+        passing = {vehicle: self._crossings[at] for vehicle, at in self.passing.items()}
+        poses = poses_in(self._folder / "poses.jsonl")
+        events = crowd.events(poses, passing, time.time())
+        self._wait("the last demands", lambda: len(self._commits(first)) >= len(events), 300)
+        self._wait("the last pods", lambda: self._lines() == self._before, 300)
+        over = time.time()
+        self._end(self._detector)
+        self._participants.send_signal(signal.SIGTERM)
+        said = self._read()
+        return Outcome(
+            settings=self._settings,
+            routes=self._routes,
+            near=self._near,
+            set_off=set_off,
+            over=over,
+            held=0.0,
+            poses=poses,
+            events=events,
+            formed=list(self._formed(first)),
+            pods=[pod for watch in self._watches for pod in watch.pods.values()],
+            node_ids=self._node_ids(),
+            inputs=[],
+            fused=[],
+            tracks=[],
+            arrivals={},
+            early=0,
+            published=said["sent"],
+            carried={},
+            left=self._lines(),
+            before=self._before,
+            crossings=self._crossings,
+        )
+
+    def _exists(self, path: str) -> bool:
+        self._world.tip()  # pulls
+        return (self._world.person.folder / path).exists()
+
+    def _lines(self) -> frozenset[str]:
+        domains = self._world.domains.items()
+        return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
+
+    def _formed(self, since: str) -> Iterator[Formed]:
+        """Yield the demands, as the commits name them; look at some commits' bookkeeping."""
+        stages, commits = self._cloud.commits(), self._commits(since)
+        looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
+        for commit in commits:
+            operation, *requesters = self._trailers(commit)
+            (vehicle,) = self.passing.keys() & set(requesters)
+            books = self._books(commit) if commit in looks else None
+            yield Formed(commit, vehicle, operation == "join", stages.get(commit, {}), books)
+
+    def _trailers(self, commit: str) -> list[str]:
+        keys = "".join(f"%(trailers:key={key},valueonly)%n" for key in ("Operation", "Requester"))
+        repository = str(self._rig.repository(self._world.name))
+        command = ["git", "-C", repository, "log", "-1", f"--format={keys}", commit]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()

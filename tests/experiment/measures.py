@@ -1,0 +1,160 @@
+"""What was measured in a run: the times of each event, and what running on demand saves. Pure."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+from . import fleet
+from .experiment import Formed, Outcome
+from .process_runner import RunningPod
+from .rules import Event
+
+STAGES = ("demand", "commit", "pods", "fused")
+
+
+@dataclass(frozen=True)
+class Step:
+    """An event, and when it had which consequence.
+
+    For a vehicle that joins: `demand` was accepted, `commit` was published, the last of the `pods`
+    of its connection had its node, and the `first` fused message had its ego data; `gone` is when
+    these pods ended. For one that leaves, `pods` is when the pods ended.
+    """
+
+    event: Event
+    demand: float | None = None
+    commit: float | None = None
+    pods: float | None = None
+    first: float | None = None
+    gone: float | None = None
+
+    def delays(self) -> dict[str, float]:
+        """Return the seconds from the event to each consequence."""
+        found = zip(STAGES, (self.demand, self.commit, self.pods, self.first), strict=True)
+        return {name: at - self.event.at for name, at in found if at is not None}
+
+
+def steps(outcome: Outcome) -> list[Step]:
+    """Return each event with its consequences, as far as the detector formed the same demands."""
+    formed: defaultdict[str, list[Formed]] = defaultdict(list)
+    for one in outcome.formed:
+        formed[str(one)].append(one)
+    return [
+        _step(outcome, event, formed[str(event)].pop(0))
+        for event in outcome.events
+        if formed[str(event)]
+    ]
+
+
+def _step(outcome: Outcome, event: Event, formed: Formed) -> Step:
+    commit = formed.stages.get("pushed", formed.stages.get("committed"))
+    pods = _pods_of(outcome, event)
+    ends = [pod.ended for pod in pods if pod.ended is not None]
+    gone = max(ends) if len(ends) == len(pods) and ends else None
+    if not event.joins:
+        return Step(event, formed.stages.get("admitted"), commit, gone)
+    bound = max((pod.bound for pod in pods), default=None)
+    first = _first_fused(outcome, event, gone)
+    return Step(event, formed.stages.get("admitted"), commit, bound, first, gone)
+
+
+def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
+    """Return the pods of the vehicle's connection in the stay that the event begins or ends."""
+    carrier = outcome.settings.connections
+    pods = [pod for pod in outcome.pods if fleet.is_client(pod.service, event.vehicle, carrier)]
+    if event.joins:
+        return [pod for pod in pods if pod.bound >= event.at][: fleet.CLIENTS[carrier]]
+    return [pod for pod in pods if pod.bound <= event.at][-fleet.CLIENTS[carrier] :]
+
+
+def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | None:
+    """Return when the first message of the fusion had a place that only this vehicle sent."""
+    places = {
+        (pose.x, pose.y)
+        for pose in outcome.poses
+        if pose.vehicle == event.vehicle and event.at <= pose.at <= (gone or outcome.over)
+    }
+    arrived = (at for at, seen in outcome.tracks if at >= event.at and places & set(seen))
+    return next(arrived, None)
+
+
+@dataclass(frozen=True)
+class Saving:
+    """A quantity on demand and with the same services always on, as means over the drive."""
+
+    name: str
+    unit: str
+    on_demand: float
+    always: float
+
+    @property
+    def saved(self) -> float:
+        """Return the part that is saved."""
+        return 1 - self.on_demand / self.always if self.always else 0.0
+
+
+def savings(outcome: Outcome) -> list[Saving]:
+    """Return what the drive took on demand, beside the same services always on.
+
+    Always on means: each service that ran at all, from the first to the last moment, and each of
+    their topics carried whole, as it was published.
+    """
+    seconds = outcome.over - outcome.set_off
+    services: dict[str, RunningPod] = {pod.service: pod for pod in outcome.pods}
+
+    def mean(amount: Callable[[RunningPod], float]) -> float:
+        lifetimes = ((pod.ended or outcome.over) - pod.bound for pod in outcome.pods)
+        used = zip(outcome.pods, lifetimes, strict=True)
+        return sum(amount(pod) * lifetime for pod, lifetime in used) / seconds
+
+    def always(amount: Callable[[RunningPod], float]) -> float:
+        return sum(amount(pod) for pod in services.values())
+
+    amounts: list[tuple[str, str, Callable[[RunningPod], float]]] = [
+        ("pods", "", lambda _: 1.0),
+        ("requested processor", "cores", lambda pod: pod.requests()[0]),
+        ("requested memory", "MiB", lambda pod: pod.requests()[1] / 2**20),
+    ]
+    found = [Saving(name, unit, mean(use), always(use)) for name, unit, use in amounts]
+    if not outcome.carried:
+        return found
+    carried = sum(_payload(outcome).values())
+    published = sum(
+        outcome.published[topic]["bytes"]
+        for topic in _payload(outcome)
+        if topic in outcome.published
+    )
+    rate = [size / seconds / 1024 for size in (carried, published)]
+    return [*found, Saving("carried to the edge", "KiB/s", *rate)]
+
+
+def _payload(outcome: Outcome) -> dict[str, int]:
+    """Return the bytes that were carried to the edge, by the ROS topic at their source."""
+    found: defaultdict[str, int] = defaultdict(int)
+    for topic, size in outcome.carried.items():
+        if not topic.startswith(("mqtt_client/", "$SYS/")):
+            _, _, ros_topic = topic.partition("/")
+            found[f"/{ros_topic}"] += size
+    return dict(found)
+
+
+def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
+    """Yield how many pods ran, at each time when the number changed."""
+    changes = [(pod.bound, 1) for pod in outcome.pods]
+    changes += [(pod.ended, -1) for pod in outcome.pods if pod.ended is not None]
+    count = 0
+    for at, change in sorted(changes):
+        count += change
+        yield at, count
+
+
+@lru_cache
+def quantiles(values: tuple[float, ...]) -> tuple[float, float, float]:
+    """Return the least, the median and the greatest."""
+    ordered = sorted(values)
+    middle = len(ordered) // 2
+    median = ordered[middle] if len(ordered) % 2 else sum(ordered[middle - 1 : middle + 1]) / 2
+    return ordered[0], median, ordered[-1]

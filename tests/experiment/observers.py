@@ -1,0 +1,127 @@
+"""Who looks at the ROS graphs of the edge and the cloud from outside, and keeps what happens."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, defaultdict
+from contextlib import suppress
+from typing import Any
+
+import rclpy
+from application_manager_interfaces.action import DeploymentRequest
+from demandops.settings import DEFAULT_ACTION_NAME
+from demandops_ros.action_endpoints import DEEP_QOS
+from demandops_ros.ros_process import ExecutorThread
+from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+
+from tests.e2e.common.expected import FUSION
+
+from .fleet import STATION_CLOUD_TARGET
+from .participants import EGO_DATA, POSE, VEHICLE_CLOUD
+from .routes import VEHICLES
+
+FUSION_NODE = FUSION.replace("-", "_")
+FUSED = "/edge_object_detection_fusion_global_objectlist"
+TRACKS = "/edge_object_detection_fusion_global_trajectories"
+_NO_INPUTS = ("/edge_object_detection_fusion_raw_objects", "/clock", "/parameter_events")
+_LOOK_S = 0.1
+
+
+class Observer:
+    """A node in the ROS domain of one of the fleet's nodes, spinning in a thread."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = Node(f"observer_{domain}", context=self._context)
+        self.arrivals: dict[str, list[float]] = defaultdict(list)
+
+    def watch(self, kind: Any, topic: str) -> None:
+        """Keep when messages of a topic arrive."""
+        arrived = self.arrivals[topic]
+        self.node.create_subscription(kind, topic, lambda _: arrived.append(time.time()), 10)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread = ExecutorThread(self.node)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._thread.close()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+class EdgeObserver(Observer):
+    """Sees what arrives on the edge, what the fusion reads, and what it gives."""
+
+    def __init__(self, domain: int) -> None:
+        super().__init__(domain)
+        self.inputs: list[tuple[float, frozenset[str]]] = [(time.time(), frozenset())]
+        self.fused: list[tuple[float, float, int]] = []  # arrival, stamp, number of objects
+        self.tracks: list[tuple[float, list[tuple[float, float]]]] = []
+        self.bytes: Counter[str] = Counter()
+        for vehicle in VEHICLES:
+            self.watch(PoseStamped, EGO_DATA.format(vehicle))
+            self._weigh(PoseStamped, EGO_DATA.format(vehicle))
+            self._weigh(PointCloud2, VEHICLE_CLOUD.format(vehicle))
+        self._weigh(PointCloud2, STATION_CLOUD_TARGET)
+        self.node.create_subscription(PoseArray, FUSED, self._take_fused, 10)
+        self.node.create_subscription(PoseArray, TRACKS, self._take_tracks, 10)
+        self.node.create_timer(_LOOK_S, self._look)
+
+    def _weigh(self, kind: Any, topic: str) -> None:
+        """Count the bytes of a topic."""
+
+        def count(data: bytes) -> None:
+            self.bytes[topic] += len(data)
+
+        self.node.create_subscription(kind, topic, count, 10, raw=True)
+
+    def _take_fused(self, message: PoseArray) -> None:
+        stamp = message.header.stamp
+        self.fused.append((time.time(), stamp.sec + stamp.nanosec / 1e9, len(message.poses)))
+
+    def _take_tracks(self, message: PoseArray) -> None:
+        places = [(pose.position.x, pose.position.y) for pose in message.poses]
+        self.tracks.append((time.time(), places))
+
+    def _look(self) -> None:
+        """Ask the ROS graph what the fusion subscribes to."""
+        found: list[Any] = []
+        if FUSION_NODE in self.node.get_node_names():
+            with suppress(Exception):  # it may leave meanwhile
+                found = self.node.get_subscriber_names_and_types_by_node(FUSION_NODE, "/")
+        topics = frozenset(name for name, _ in found if name not in _NO_INPUTS)
+        if topics != self.inputs[-1][1]:
+            self.inputs.append((time.time(), topics))
+
+
+class CloudObserver(Observer):
+    """Sees the poses that arrive in the cloud, and the stages of each demand."""
+
+    def __init__(self, domain: int) -> None:
+        super().__init__(domain)
+        self.stages: dict[bytes, dict[str, tuple[float, str]]] = defaultdict(dict)
+        for vehicle in VEHICLES:
+            self.watch(PoseStamped, POSE.format(vehicle))
+        self.node.create_subscription(
+            DeploymentRequest.Impl.FeedbackMessage,
+            f"{DEFAULT_ACTION_NAME}/_action/feedback",
+            self._take_feedback,
+            DEEP_QOS,
+        )
+
+    def _take_feedback(self, message: Any) -> None:
+        stage, _, rest = message.feedback.message.partition(" ")
+        self.stages[bytes(message.goal_id.uuid)].setdefault(stage, (time.time(), rest.strip()))
+
+    def commits(self) -> dict[str, dict[str, float]]:
+        """Return when each stage of a demand came, by its commit."""
+        return {
+            stages["committed"][1]: {stage: at for stage, (at, _) in stages.items()}
+            for stages in list(self.stages.values())
+            if "committed" in stages
+        }

@@ -1,0 +1,222 @@
+"""The vehicles and the station as one ROS program; each talks in the ROS domain of its node.
+
+    python -m tests.experiment.participants PLAN
+
+PLAN is a JSON file with the fields of `Plan`. The program publishes from its start, with all
+vehicles at rest. A line on standard input says until which moment of their ways they drive; there
+they stand, and go on publishing, until the next line. The first one sends them off. The program's
+last words are the messages and bytes that each topic had since then, and for how long the vehicles
+stood, as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import select
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
+
+from . import clouds
+from .routes import STATION, VEHICLES, Route, Track
+
+POSE = "/vehicles/{}/pose"
+EGO_DATA = "/vehicles/{}/ego_data"
+VEHICLE_CLOUD = "/vehicles/{}/drivers/lidar/pointcloud"
+STATION_CLOUD = f"/stations/{STATION}/drivers/lidar/pointcloud"
+
+POSE_HZ = 10
+POSES_PER_CLOUD = 2
+TICKS_PER_POSE_OF_MANY = 2
+RANGE_M = 120.0
+"""How far a lidar sees."""
+WITH_LIDAR = (VEHICLES[0],)
+"""The vehicles that share a point cloud, as in the paper."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to play: the ways, the ROS domain of each node, and the file of what was sent.
+
+    `origin` is where the intersection is on the map, `station_cloud` the topic of the station. With
+    `poses_only` one ROS node sends all poses, and nothing else, in the cloud's domain.
+    """
+
+    routes: tuple[Route | Track, ...]
+    origin: tuple[float, float]
+    domains: dict[str, int]
+    seed: int
+    record: str
+    station_cloud: str
+    poses_only: bool = False
+
+    def write(self, file: Path) -> None:
+        """Write it for the program."""
+        routes = [vars(route) for route in self.routes]
+        file.write_text(json.dumps(vars(self) | {"routes": routes}))
+
+    @classmethod
+    def read(cls, file: Path) -> Plan:
+        """Read what :meth:`write` wrote."""
+        data = json.loads(file.read_text())
+        routes = tuple(
+            Track(**route) if "points" in route else Route(**route) for route in data.pop("routes")
+        )
+        return cls(routes, **data)
+
+
+class Participant:
+    """A vehicle or the station: a ROS node in a context of its own."""
+
+    def __init__(self, name: str, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(
+            context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO
+        )
+        self.node = Node(f"{name}_participant", context=self._context, enable_rosout=False)
+        self._publishers: dict[str, Any] = {}
+        self.sent: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
+
+    def send(self, topic: str, message: Any, now: float) -> None:
+        """Publish a message with this stamp, and count it."""
+        message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(type(message), topic, 10)
+        data = serialize_message(message)
+        self._publishers[topic].publish(data)
+        self.sent[topic] += len(data)
+        self.messages[topic] += 1
+
+    def close(self) -> None:
+        """Leave the ROS graph."""
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+class Participants:
+    """All of them, and the time since the vehicles set off."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan, self._chance = plan, random.Random(plan.seed)
+        names = (*(route.vehicle for route in plan.routes), STATION)
+        if plan.poses_only:
+            self._by_name = dict.fromkeys(names, Participant("crowd", plan.domains["cloud"]))
+        else:
+            self._by_name = {name: Participant(name, plan.domains[name]) for name in names}
+        self._sent = Path(plan.record).open("w", buffering=1)  # noqa: SIM115 - as long as this
+        self.set_off: float | None = None
+        self.until, self.held = 0.0, 0.0
+        self._elapsed, self._last = -1.0, 0.0
+        self._ticks = 0
+
+    def tick(self) -> None:
+        """Publish what everybody has to say now."""
+        now, elapsed = time.time(), self._pass_time()
+        self._ticks += 1
+        if self._plan.poses_only and self._ticks % TICKS_PER_POSE_OF_MANY:
+            return
+        x, y = self._plan.origin
+        where = {
+            route.vehicle: (x + route.position(elapsed)[0], y + route.position(elapsed)[1])
+            for route in self._plan.routes
+        }
+        for route in self._plan.routes:
+            if route.sends(elapsed):
+                self._send_pose(route.vehicle, *where[route.vehicle], now)
+        if self._ticks % POSES_PER_CLOUD == 0 and not self._plan.poses_only:
+            self._send_clouds(where, elapsed, now)
+
+    def _pass_time(self) -> float:
+        """Return the moment of the ways that it is now."""
+        passed, self._last = time.monotonic() - self._last, time.monotonic()
+        if self.set_off is not None:
+            driven = min(passed, max(0.0, self.until - self._elapsed))
+            self._elapsed += driven
+            self.held += passed - driven
+        return self._elapsed
+
+    def _send_pose(self, vehicle: str, x: float, y: float, now: float) -> None:
+        message = PoseStamped()
+        message.header.frame_id = "map"
+        message.pose.position.x, message.pose.position.y = x, y
+        message.pose.orientation.w = 1.0
+        for topic in (POSE,) if self._plan.poses_only else (POSE, EGO_DATA):
+            self._by_name[vehicle].send(topic.format(vehicle), message, now)
+        print(json.dumps({"at": now, "vehicle": vehicle, "x": x, "y": y}), file=self._sent)
+
+    def _send_clouds(
+        self, where: dict[str, tuple[float, float]], elapsed: float, now: float
+    ) -> None:
+        self._by_name[STATION].send(
+            self._plan.station_cloud, self._cloud(self._plan.origin, where.values()), now
+        )
+        for route in self._plan.routes:
+            if route.vehicle in WITH_LIDAR and route.sends(elapsed):
+                others = [place for name, place in where.items() if name != route.vehicle]
+                cloud = self._cloud(where[route.vehicle], others)
+                self._by_name[route.vehicle].send(VEHICLE_CLOUD.format(route.vehicle), cloud, now)
+
+    def _cloud(self, at: tuple[float, float], objects: Iterable[tuple[float, float]]) -> Any:
+        near = [(x, y) for x, y in objects if (x - at[0]) ** 2 + (y - at[1]) ** 2 <= RANGE_M**2]
+        return clouds.to_message(clouds.points_of(near, self._chance))
+
+    def go(self) -> None:
+        """Let the vehicles set off, and count from now on."""
+        self.set_off, self._elapsed, self._last = time.time(), 0.0, time.monotonic()
+        for participant in set(self._by_name.values()):
+            participant.sent.clear()
+            participant.messages.clear()
+
+    def close(self) -> dict[str, Any]:
+        """Stop, and return how many messages and bytes each topic had since they set off."""
+        everybody = set(self._by_name.values())
+        for participant in everybody:
+            participant.close()
+        self._sent.close()
+        return {
+            topic: {"messages": participant.messages[topic], "bytes": size}
+            for participant in everybody
+            for topic, size in participant.sent.items()
+        }
+
+
+def main(plan: Path) -> None:
+    """Play until SIGTERM."""
+    over: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: over.append(number))
+    participants = Participants(Plan.read(plan))
+    print(json.dumps({"ready": True}), flush=True)
+    due = time.monotonic()
+    while not over:
+        participants.tick()
+        due = max(due + 1 / POSE_HZ, time.monotonic())
+        readable, _, _ = select.select([0], [], [], max(0.0, due - time.monotonic()))
+        if readable:
+            lines = os.read(0, 4096).split()
+            if not lines:
+                break
+            participants.until = float(lines[-1])
+            if participants.set_off is None:
+                participants.go()
+                print(json.dumps({"set_off": participants.set_off}), flush=True)
+                due = time.monotonic()
+    sent, held = participants.close(), participants.held
+    print(json.dumps({"sent": sent, "held": held}), flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,314 @@
+"""Runs the containers of a namespace's pods as processes of this machine, as a kubelet would.
+
+It watches the API server: a pod that got a node starts, one that is deleted ends. Each container
+runs its own command, arguments and environment; a container that ends is started again, later and
+later. ConfigMaps are files, and change when they change. A path below a mount becomes the path of
+the volume's folder, because the processes share this machine's file system. A pod's account is a
+kubeconfig, in KUBECONFIG, for the containers that mount its token.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import re
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from kubernetes.client.api.core_v1_api import CoreV1Api
+from kubernetes.client.exceptions import ApiException
+from kubernetes.watch import Watch
+from urllib3.exceptions import HTTPError
+
+from tests.e2e.common.volumes import files
+from tests.e2e.rig import launch
+from tests.e2e.rig.kube import Kube, Manifest
+
+_TICK_S = 0.1
+_NOT_YET = (LookupError, ApiException, HTTPError, OSError)
+"""What is missing, or an API server that is away."""
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
+_TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105 - a folder
+
+
+@dataclass
+class Container:
+    """A container, the starts of its process, and when it may start again."""
+
+    name: str
+    command: list[str]
+    environment: dict[str, str]
+    process: subprocess.Popen[bytes] | None = None
+    starts: list[float] = field(default_factory=list)
+    due: float = 0.0
+
+
+@dataclass
+class RunningPod:
+    """A pod on a node, and what became of it."""
+
+    manifest: Manifest
+    folder: Path
+    bound: float
+    containers: list[Container] = field(default_factory=list)
+    ended: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The pod's name."""
+        return str(self.manifest["metadata"]["name"])
+
+    @property
+    def service(self) -> str:
+        """The name of its release or connection client."""
+        return str(self.manifest["metadata"]["labels"]["app.kubernetes.io/instance"])
+
+    @property
+    def node(self) -> str:
+        """The name of its cluster node."""
+        return str(self.manifest["spec"]["nodeName"])
+
+    def requests(self) -> tuple[float, float]:
+        """Return the processor cores and the bytes of memory that it requests."""
+        found = [c["resources"].get("requests", {}) for c in self.manifest["spec"]["containers"]]
+        cores = sum(quantity(each.get("cpu", "0")) for each in found)
+        return cores, sum(quantity(each.get("memory", "0")) for each in found)
+
+
+class ProcessRunner:
+    """The kubelet of all nodes, for one namespace."""
+
+    def __init__(
+        self, kube: Kube, namespace: str, image: Path, folder: Path, environment: dict[str, str]
+    ) -> None:
+        """Start to watch.
+
+        Args:
+            kube: the cluster.
+            namespace: whose pods run.
+            image: the working directory of all containers, first on their PATH.
+            folder: where volumes and logs go.
+            environment: what every container finds in its image.
+        """
+        self._kube, self._namespace, self._image, self._folder = kube, namespace, image, folder
+        path = os.pathsep.join([str(image), os.environ.get("PATH", os.defpath)])
+        self._environment = environment | {"PATH": path}
+        self.pods: dict[str, RunningPod] = {}  # by uid; those that ended stay
+        self._waiting: dict[str, RunningPod] = {}
+        self._ending: list[tuple[subprocess.Popen[bytes], float]] = []
+        self._events: queue.Queue[tuple[str, Manifest]] = queue.Queue()
+        self._closed = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._watch, args=("Pod", "list_namespaced_pod"), daemon=True),
+            threading.Thread(
+                target=self._watch, args=("ConfigMap", "list_namespaced_config_map"), daemon=True
+            ),
+        ]
+        self._runner = threading.Thread(target=self._run, name="process-runner", daemon=True)
+        for thread in (*self._threads, self._runner):
+            thread.start()
+
+    def close(self) -> None:
+        """End all processes."""
+        self._closed.set()
+        self._runner.join(30)
+
+    def log(self, service: str) -> str:
+        """Return what the containers of a service have printed."""
+        found = sorted(self._folder.glob(f"{service}-*/*.log"))
+        return "\n".join(f"--- {path}\n{path.read_text(errors='replace')}" for path in found)
+
+    # --- watching ---------------------------------------------------------------------------
+
+    def _watch(self, kind: str, method: str) -> None:
+        """Pass on what happens to the objects of a kind, for ever."""
+        read: Any = getattr(CoreV1Api(self._kube.api), method)
+        while not self._closed.is_set():
+            with suppress(Exception):  # the server may be away; the next round reads all again
+                for event in Watch().stream(read, self._namespace, timeout_seconds=60):
+                    item = self._kube.api.sanitize_for_serialization(event["object"])
+                    self._events.put((f"{kind} {event['type']}", item))
+            self._closed.wait(_TICK_S)
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            with suppress(queue.Empty):
+                while True:
+                    self._take(*self._events.get(timeout=_TICK_S))
+            self._prepare()
+            self._start_due()
+            self._kill_late()
+        for pod in self.pods.values():
+            self._end(pod)
+        while self._ending:
+            self._kill_late()
+            time.sleep(_TICK_S)
+
+    def _take(self, event: str, item: Manifest) -> None:
+        kind, change = event.split()
+        uid = item["metadata"]["uid"]
+        if kind == "ConfigMap":
+            if change == "MODIFIED":
+                self._refresh(item["metadata"]["name"])
+        elif change == "DELETED" or item["metadata"].get("deletionTimestamp"):
+            self._waiting.pop(uid, None)
+            if uid in self.pods:
+                self._end(self.pods[uid])
+        elif item["spec"].get("nodeName") and uid not in self.pods:
+            folder = self._folder / item["metadata"]["name"]
+            self._waiting.setdefault(uid, RunningPod(item, folder, time.time()))
+
+    def _prepare(self) -> None:
+        """Let the pods start whose volumes can be filled; the others are tried again."""
+        for uid, pod in list(self._waiting.items()):
+            with suppress(*_NOT_YET):
+                pod.containers = list(self._containers(pod))
+                self.pods[uid] = self._waiting.pop(uid)
+
+    # --- volumes ----------------------------------------------------------------------------
+
+    def _containers(self, pod: RunningPod) -> Iterator[Container]:
+        spec = pod.manifest["spec"]
+        places = {volume["name"]: self._fill(pod, volume) for volume in spec["volumes"]}
+        for container in spec["containers"]:
+            mounts = {
+                mount["mountPath"]: places[mount["name"]] for mount in container["volumeMounts"]
+            }
+            program = container.get("command", self._entry_point(container["image"]))
+            wanted = [*program, *container.get("args", ())]
+            given = {
+                each["name"]: path_in_pod(each["value"], mounts)
+                for each in container.get("env", ())
+            }
+            if _TOKEN in mounts:
+                given["KUBECONFIG"] = str(self._kubeconfig(mounts[_TOKEN]))
+            yield Container(
+                container["name"], [path_in_pod(part, mounts) for part in wanted], given
+            )
+
+    def _entry_point(self, image: str) -> list[str]:
+        """Return an image's own program, if one stands in for it; else its arguments are one."""
+        program = program_of(image)
+        return [program] if (self._image / program).exists() else []
+
+    def _fill(self, pod: RunningPod, volume: dict[str, Any]) -> Path:
+        """Write a volume's files, each at once."""
+        folder = pod.folder / volume["name"]
+        folder.mkdir(parents=True, exist_ok=True)
+        account = pod.manifest["spec"].get("serviceAccountName", "default")
+        for name, content in files(self._kube, self._namespace, account, volume).items():
+            new = folder / f".{name}"
+            new.write_bytes(content)
+            new.replace(folder / name)
+        return folder
+
+    def _refresh(self, config_map: str) -> None:
+        for pod in self.pods.values():
+            for volume in pod.manifest["spec"]["volumes"] if pod.ended is None else ():
+                if volume.get("configMap", {}).get("name") == config_map:
+                    with suppress(*_NOT_YET):  # it may be gone by now
+                        self._fill(pod, volume)
+
+    def _kubeconfig(self, account: Path) -> Path:
+        """Write the pod's account as a kubeconfig; the token stays in its file."""
+        server = self._kube.api.configuration.host
+        cluster = {"server": server, "certificate-authority": str(account / "ca.crt")}
+        names = {"cluster": "c", "user": "u", "namespace": self._namespace}
+        config = {
+            "apiVersion": "v1",
+            "kind": "Config",
+            "current-context": "c",
+            "clusters": [{"name": "c", "cluster": cluster}],
+            "users": [{"name": "u", "user": {"token": (account / "token").read_text()}}],
+            "contexts": [{"name": "c", "context": names}],
+        }
+        file = account.with_suffix(".kubeconfig")
+        file.touch(mode=0o600)
+        file.write_text(yaml.safe_dump(config))
+        return file
+
+    # --- processes --------------------------------------------------------------------------
+
+    def _start_due(self) -> None:
+        for pod in self.pods.values():
+            for container in pod.containers if pod.ended is None else ():
+                process = container.process
+                if process is not None and process.poll() is not None:
+                    container.process = None
+                    pause = min(_FIRST_PAUSE_S * 2 ** len(container.starts), _LONGEST_PAUSE_S)
+                    container.due = time.monotonic() + pause
+                if container.process is None and time.monotonic() >= container.due:
+                    self._start(pod, container)
+
+    def _start(self, pod: RunningPod, container: Container) -> None:
+        environment = self._environment | container.environment
+        # `env` looks for the program on the container's PATH, as a container's runtime does
+        command = launch.command("/usr/bin/env", *container.command)
+        with (pod.folder / f"{container.name}.log").open("ab") as log:
+            container.process = subprocess.Popen(
+                command,
+                cwd=self._image,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        container.starts.append(time.time())
+
+    def _end(self, pod: RunningPod) -> None:
+        if pod.ended is not None:
+            return
+        pod.ended = time.time()
+        grace = pod.manifest["spec"].get("terminationGracePeriodSeconds", 30)
+        for container in pod.containers:
+            if container.process is not None and container.process.poll() is None:
+                _signal(container.process, signal.SIGTERM)
+                self._ending.append((container.process, time.monotonic() + grace))
+
+    def _kill_late(self) -> None:
+        for process, deadline in list(self._ending):
+            if process.poll() is None and time.monotonic() < deadline:
+                continue
+            _signal(process, signal.SIGKILL)  # also what is left of its group
+            process.wait(10)
+            self._ending.remove((process, deadline))
+
+
+def _signal(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, number)
+
+
+def program_of(image: str) -> str:
+    """Return what stands for an image's own program: its name without registry and tag."""
+    return image.rpartition("/")[2].partition("@")[0].partition(":")[0]
+
+
+def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
+    """Return the text with paths below mounts made paths of this machine."""
+    if not mounts:
+        return text
+    longest_first = sorted(mounts, key=len, reverse=True)
+    below = "|".join(map(re.escape, longest_first))
+    # in one pass: a path of this machine may lie below a mount's name, such as /tmp
+    return re.sub(rf"(?<![\w./-])({below})(?=/|$)", lambda hit: str(mounts[hit[1]]), text)
+
+
+_UNITS = {"m": 1e-3, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
+
+
+def quantity(text: str) -> float:
+    """Return a quantity of Kubernetes as a number."""
+    for unit, factor in _UNITS.items():
+        if text.endswith(unit):
+            return float(text.removesuffix(unit)) * factor
+    return float(text)

@@ -1,0 +1,211 @@
+"""The vehicles' routes through the intersection, by a seed or as recorded: where each is at a time.
+
+Pure. The intersection, with the station, is the origin of the map; distances are metres and times
+seconds since the vehicles set off.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+RADIUS_M = 84.0
+"""The paper's distance at which a vehicle is near the intersection."""
+FAR_M = 105.0
+"""Where a vehicle waits until its route begins, and where it ends."""
+VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
+STATION = "station00"
+
+LEAD_S = 2.0
+"""When a recording begins after the vehicles have set off."""
+MIDDLES = ((0.0, 0.0), (1000.0, 0.0), (0.0, 1000.0))
+SPACING_S = 1.2
+_SILENCE_S = 0.6
+"""Where a recording has no pose for longer, its vehicle is silent."""
+
+_PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
+"""The paper's order: 0 is the vehicle that joins, -0 the same vehicle when it leaves."""
+_SHORTEST_STAY = 3  # slots
+_JITTER = 0.2  # of a slot
+_ARMS = tuple(math.radians(degrees) for degrees in (0, 90, 180, 270))
+
+
+class Way(Protocol):
+    """Where a vehicle is at a time: a route, or a recorded track."""
+
+    @property
+    def vehicle(self) -> str:
+        """Who drives."""
+
+    @property
+    def ends(self) -> float:
+        """From when on nothing of interest happens."""
+
+    @property
+    def label(self) -> str:
+        """What the report says of it."""
+
+    def position(self, time: float) -> tuple[float, float]:
+        """Return where the vehicle is."""
+
+    def sends(self, time: float) -> bool:
+        """Return whether the vehicle sends anything."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """A vehicle's way along one arm of the intersection to its middle, and out along another.
+
+    It is within ``RADIUS_M`` from ``enters`` to ``leaves``, and sends nothing from ``vanishes`` on.
+    ``middle`` is where the intersection is.
+    """
+
+    vehicle: str
+    enters: float
+    leaves: float
+    arm_in: float
+    arm_out: float
+    vanishes: float = math.inf
+    middle: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def speed(self) -> float:
+        """Metres per second."""
+        return 2 * RADIUS_M / (self.leaves - self.enters)
+
+    @property
+    def ends(self) -> float:
+        """When it has left."""
+        return min(self.leaves, self.vanishes)
+
+    @property
+    def label(self) -> str:
+        """How fast it is, and whether it vanishes."""
+        silent = ", falls silent" if math.isfinite(self.vanishes) else ""
+        return f"{self.speed * 3.6:.0f} km/h{silent}"
+
+    def position(self, time: float) -> tuple[float, float]:
+        """Return where the vehicle is."""
+        along = (time - self.enters) * self.speed - RADIUS_M  # negative before the middle
+        along = min(max(along, -FAR_M), FAR_M)
+        arm = self.arm_in if along < 0 else self.arm_out
+        x, y = self.middle
+        return x + abs(along) * math.cos(arm), y + abs(along) * math.sin(arm)
+
+    def distance(self, time: float) -> float:
+        """Return how far the vehicle is from the intersection."""
+        return math.dist(self.position(time), self.middle)
+
+    def sends(self, time: float) -> bool:
+        """Return whether the vehicle sends anything."""
+        return time < self.vanishes
+
+
+@dataclass(frozen=True)
+class Track:
+    """A recorded way: times, and the place at each; between them the vehicle goes straight.
+
+    It waits at the first place, and is silent where the recording is.
+    """
+
+    vehicle: str
+    points: tuple[tuple[float, float, float], ...]
+    label: str = "recorded"
+
+    @property
+    def ends(self) -> float:
+        """When the recording ends."""
+        return self.points[-1][0]
+
+    def position(self, time: float) -> tuple[float, float]:
+        """Return where the vehicle is."""
+        (begin, x0, y0), (end, x1, y1) = self._around(time)
+        part = min(max((time - begin) / (end - begin), 0.0), 1.0) if end > begin else 0.0
+        return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+
+    def sends(self, time: float) -> bool:
+        """Return whether the vehicle sends anything."""
+        before, after = self._around(time)
+        nearest = min(abs(before[0] - time), abs(after[0] - time))
+        return time < self.points[0][0] or nearest <= _SILENCE_S
+
+    def _around(self, time: float) -> tuple[tuple[float, float, float], ...]:
+        index = bisect_right(self.points, time, key=lambda point: point[0])
+        last = len(self.points) - 1
+        return self.points[max(index - 1, 0)], self.points[min(index, last)]
+
+
+def tracks(
+    poses: Iterable[tuple[float, str, float, float]], origin: tuple[float, float]
+) -> tuple[Track, ...]:
+    """Return the tracks of recorded poses: time, vehicle and place on the map each."""
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    first: float | None = None
+    for at, vehicle, x, y in poses:
+        first = at if first is None else first
+        found.setdefault(vehicle, []).append((at - first + LEAD_S, x - origin[0], y - origin[1]))
+    return tuple(Track(vehicle, tuple(found[vehicle])) for vehicle in sorted(found))
+
+
+def four(seed: int, gap: float) -> tuple[Route, ...]:
+    """Return the routes of four vehicles, with about ``gap`` seconds from one event to the next.
+
+    Seed 0 has the paper's order of events; each other seed has an order, arms and times of its own.
+    """
+    chance = random.Random(seed)
+    order = _PAPER if seed == 0 else _shuffled(chance)
+    at = {
+        event: (slot + 1 + chance.uniform(-_JITTER, _JITTER)) * gap
+        for slot, event in enumerate(order)
+    }
+    return tuple(
+        Route(vehicle, at[str(number)], at[f"-{number}"], *chance.sample(_ARMS, 2))
+        for number, vehicle in enumerate(VEHICLES)
+    )
+
+
+def one(seed: int, gap: float) -> tuple[Route, ...]:
+    """Return the route of one vehicle that comes and leaves."""
+    arms = random.Random(seed).sample(_ARMS, 2)
+    return (Route(VEHICLES[0], gap, 4 * gap, *arms),)
+
+
+def many(seed: int, count: int) -> tuple[Route, ...]:
+    """Return the routes of many vehicles, each through one of the intersections in ``MIDDLES``.
+
+    One enters every ``SPACING_S`` seconds or so, at 20 to 50 km/h.
+    """
+    chance = random.Random(seed)
+    found = []
+    for number in range(count):
+        enters = (number + 1 + chance.uniform(-_JITTER, _JITTER)) * SPACING_S
+        leaves = enters + 2 * RADIUS_M / (chance.uniform(20, 50) / 3.6)
+        arms = chance.sample(_ARMS, 2)
+        middle = chance.choice(MIDDLES)
+        found.append(Route(f"vehicle{number:03}", enters, leaves, *arms, middle=middle))
+    return tuple(found)
+
+
+def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
+    """Return the routes, with a vehicle that falls silent in the middle."""
+    return tuple(
+        replace(route, vanishes=(route.enters + route.leaves) / 2)
+        if route.vehicle == vehicle
+        else route
+        for route in routes
+    )
+
+
+def _shuffled(chance: random.Random) -> list[str]:
+    """Return an order in which every vehicle stays for a while."""
+    numbers = range(len(VEHICLES))
+    events = [*(str(number) for number in numbers), *(f"-{number}" for number in numbers)]
+    while True:
+        chance.shuffle(events)
+        stays = (events.index(f"-{n}") - events.index(str(n)) for n in numbers)
+        if all(stay >= _SHORTEST_STAY for stay in stays):
+            return events

@@ -1,0 +1,110 @@
+"""The rules of `examples/experiment/`, and a plain script that says what they demand of some poses.
+
+It shares nothing with the event detector, so the two can be compared.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from .routes import Way
+
+RULES = Path(__file__).resolve().parents[2] / "examples" / "experiment" / "rules.yaml"
+
+
+@dataclass(frozen=True)
+class Near:
+    """A vehicle is near from `start` metres on, until it is `stop` away or silent for `timeout`."""
+
+    point: tuple[float, float]
+    start: float
+    stop: float
+    timeout: float
+
+    @classmethod
+    def read(cls) -> Near:
+        """Read what all rules of the experiment have in common."""
+        data: dict[str, Any] = yaml.safe_load(RULES.read_text())
+        (source,) = data["sources"].values()
+        (near,) = {json.dumps(rule["near"], sort_keys=True) for rule in data["rules"]}
+        found = json.loads(near)
+        point = found["point"]["x"], found["point"]["y"]
+        return cls(point, found["start"], found["stop"], float(source["timeout"].removesuffix("s")))
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a vehicle said that it was, and when."""
+
+    at: float
+    vehicle: str
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class Event:
+    """A vehicle joins or leaves."""
+
+    at: float
+    vehicle: str
+    joins: bool
+
+    def __str__(self) -> str:
+        return f"{self.vehicle} {'joins' if self.joins else 'leaves'}"
+
+
+def poses_in(record: Path) -> list[Pose]:
+    """Return what the participants sent."""
+    return [Pose(**json.loads(line)) for line in record.read_text().splitlines()]
+
+
+def predicted(ways: Iterable[Way], near: Near, until: float) -> list[Pose]:
+    """Return the poses of a drive that nothing holds up, ten for each second."""
+    x0, y0 = near.point
+    ways = tuple(ways)
+    places = (
+        (tick / 10, way.vehicle, way.position(tick / 10))
+        for tick in range(int(until * 10))
+        for way in ways
+        if way.sends(tick / 10)
+    )
+    return [Pose(at, vehicle, x0 + x, y0 + y) for at, vehicle, (x, y) in places]
+
+
+def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
+    """Return when something happens that leads to an event: a pose, or a vehicle's last one."""
+    poses = list(poses)
+    sent = {(pose.at, pose.vehicle) for pose in poses}
+    events = events_of(poses, near, until)
+    return sorted(
+        event.at if (event.at, event.vehicle) in sent else event.at - near.timeout
+        for event in events
+    )
+
+
+def events_of(poses: Iterable[Pose], near: Near, until: float) -> list[Event]:
+    """Return who joins and leaves until a time, in the order of time."""
+    return sorted(_events(list(poses), near, until), key=lambda event: event.at)
+
+
+def _events(poses: list[Pose], near: Near, until: float) -> Iterator[Event]:
+    by_vehicle: dict[str, list[Pose]] = {}
+    for pose in poses:
+        by_vehicle.setdefault(pose.vehicle, []).append(pose)
+    for vehicle in sorted(by_vehicle):
+        is_near, last = False, 0.0
+        for pose in by_vehicle[vehicle]:
+            distance, last = math.dist((pose.x, pose.y), near.point), pose.at
+            if is_near != (distance <= (near.stop if is_near else near.start)):
+                is_near = not is_near
+                yield Event(pose.at, vehicle, is_near)
+        if is_near and last + near.timeout < until:
+            yield Event(last + near.timeout, vehicle, False)

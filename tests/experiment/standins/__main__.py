@@ -1,0 +1,31 @@
+"""Stands in for `ros2 launch PACKAGE FILE NAME:=VALUE…` in the containers of the experiment."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+
+PROGRAMS = {
+    ("point_cloud_object_detection", "point_cloud_object_detection.launch.py"): "detection",
+    ("object_fusion", "fusion_function_launch.py"): "fusion",
+    ("mqtt_client", "standalone.launch.ros2.xml"): "mqtt_client",
+}
+"""The stand-in for each launch file of the reference's images."""
+OURS = ("demandops_ros", "parameter_sync.launch.xml")
+
+
+def main(launch: str, package: str, file: str, *arguments: str) -> None:
+    """Become the program that a launch file starts."""
+    assert launch == "launch", launch
+    given = dict(argument.split(":=", 1) for argument in arguments)
+    if (package, file) == OURS:
+        # what the launch file says; ROS's launch has no wheels
+        ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params"]]
+        command = [sys.executable, "-m", "demandops.cli.main", "parameter-sync", "--ros-args"]
+        os.execv(sys.executable, [*command, *ros_args])  # noqa: S606 - no shell on purpose
+    import_module(f".{PROGRAMS[package, file]}", __package__).main(given)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,20 @@
+"""What stands for every container's image."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+_PROGRAMS = {"ros2": __package__, "zenoh-bridge-ros2dds": f"{__package__}.zenoh_bridge"}
+
+
+def image(folder: Path) -> Path:
+    """Fill a folder: the working directory of the containers, with their programs."""
+    setup = folder / "install" / "setup.bash"
+    setup.parent.mkdir(exist_ok=True)
+    setup.write_text(f'PATH="{folder}:$PATH"\n')
+    for name, module in _PROGRAMS.items():
+        program = folder / name
+        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m {module} "$@"\n')
+        program.chmod(0o755)
+    return folder

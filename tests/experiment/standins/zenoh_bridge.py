@@ -1,0 +1,73 @@
+"""The Zenoh bridge: carries ROS messages, unread, by the real configuration over the real Zenoh.
+
+It stands in for zenoh-bridge-ros2dds, whose plugin is not among Zenoh's Python wheels. It tells a
+topic's type with each message.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import rclpy
+import zenoh
+from rclpy.node import Node
+
+from .running import message_class, spin
+
+_LOOK_S = 0.1
+
+
+class Bridge(Node):
+    """One node's bridge, for all its connections."""
+
+    def __init__(self, plugin: dict[str, Any], session: Any) -> None:
+        super().__init__(plugin["nodename"])
+        self._session = session
+        self._given, self._taken = (
+            re.compile("|".join(plugin["allow"].get(ends, ["(?!)"])))
+            for ends in ("publishers", "subscribers")
+        )
+        self._readers: dict[str, Any] = {}
+        self._writers: dict[str, Any] = {}
+        self._arrivals = session.declare_subscriber("**", self._take)
+        self.create_timer(_LOOK_S, self._find)
+
+    def _find(self) -> None:
+        """Subscribe to the topics that may be given out, once the ROS graph knows them."""
+        for topic, (kind, *_) in self.get_topic_names_and_types():
+            if topic not in self._readers and self._given.search(topic):
+                self._readers[topic] = self.create_subscription(
+                    message_class(kind),
+                    topic,
+                    lambda data, t=topic, k=kind: self._session.put(t[1:], data, attachment=k),
+                    10,
+                    raw=True,
+                )
+
+    def _take(self, sample: Any) -> None:
+        topic = f"/{sample.key_expr}"
+        if not self._taken.search(topic):
+            return
+        if topic not in self._writers:
+            kind = message_class(sample.attachment.to_string())
+            self._writers[topic] = self.create_publisher(kind, topic, 10)
+        self._writers[topic].publish(sample.payload.to_bytes())
+
+
+def main() -> None:
+    """Carry until the program is asked to end."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("-c", dest="config", type=Path, required=True)
+    config = json.loads(parser.parse_args().config.read_text())
+    plugin = config.pop("plugins")["ros2dds"]
+    rclpy.init(args=[], domain_id=plugin["domain"])
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
+        spin(Bridge(plugin, session))
+
+
+if __name__ == "__main__":
+    main()

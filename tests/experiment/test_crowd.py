@@ -1,0 +1,106 @@
+"""The larger experiment's world, and what its checks find. No ROS, no cluster."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from demandops.detection.rules import rule_file
+from demandops.detection.rules.rule_file import RuleFile
+
+from tests.experiment import crowd, report, routes
+from tests.experiment.experiment import Formed, Outcome, Settings
+from tests.experiment.rules import Near, predicted
+
+COUNT, OVER = 12, 60.0
+NEAR = Near.read()
+ROUTES = routes.many(1, COUNT)
+AT = {route.vehicle: routes.MIDDLES.index(route.middle) for route in ROUTES}
+PASSING = {vehicle: crowd.crossings(NEAR)[at] for vehicle, at in AT.items()}
+POSES = predicted(ROUTES, NEAR, OVER)
+EVENTS = crowd.events(POSES, PASSING, OVER)
+
+
+def formed() -> list[Formed]:
+    inside: dict[str, int] = {}
+    found = []
+    for event in EVENTS:
+        if event.joins:
+            inside[event.vehicle] = AT[event.vehicle]
+        else:
+            del inside[event.vehicle]
+        found.append(Formed("", event.vehicle, event.joins, {}, crowd.requesters(inside)))
+    return found
+
+
+def outcome(found: list[Formed]) -> Outcome:
+    nothing = frozenset[str]()
+    return Outcome(
+        settings=Settings(large=COUNT),
+        routes=ROUTES,
+        near=NEAR,
+        set_off=0.0,
+        over=OVER,
+        held=0.0,
+        poses=POSES,
+        events=EVENTS,
+        formed=found,
+        pods=[],
+        node_ids={},
+        inputs=[],
+        fused=[],
+        tracks=[],
+        arrivals={},
+        early=0,
+        published={},
+        carried={},
+        left=nothing,
+        before=nothing,
+        crossings=crowd.crossings(NEAR),
+    )
+
+
+def faults(found: list[Formed]) -> list[str]:
+    return [check.name for check in crowd.checks(outcome(found), AT) if not check.holds]
+
+
+def test_each_vehicle_passes_one_intersection() -> None:
+    assert sorted(str(event) for event in EVENTS) == sorted(
+        f"{route.vehicle} {word}" for route in ROUTES for word in ("joins", "leaves")
+    )
+    assert {*AT.values()} == {*range(len(routes.MIDDLES))}
+
+
+def test_demands_of_different_vehicles_may_overtake_and_others_are_found() -> None:
+    assert faults(formed()) == []
+    overtaken = [replace(one, books=None) for one in formed()]
+    overtaken[0], overtaken[1] = overtaken[1], overtaken[0]
+    assert faults(overtaken) == []
+    assert faults(formed()[1:])[0].startswith("the detector formed")
+    wrong = [replace(formed()[0], books={}), *formed()[1:]]
+    assert faults(wrong) == [
+        "the requesters of every service and connection are right after the demands that were "
+        "looked at"
+    ]
+
+
+def test_the_report_draws_a_crowd() -> None:
+    run = outcome(formed())
+    page = report.page(run, crowd.checks(run, AT))
+    assert page.count("<svg") == 3 and "vehicles near" in page
+    assert all(f">{station}<" in page for station in crowd.STATIONS)
+    assert "vehicle000 joins" in page
+    assert "carried to the edge" not in page
+
+
+def test_the_rules_have_each_intersection_and_its_own_edge_and_station() -> None:
+    file: RuleFile = rule_file.read(crowd.rules(NEAR), "rules.yaml")
+    assert [rule.name for rule in file.rules] == [f"at-{station}" for station in crowd.STATIONS]
+    for rule, edge, station in zip(file.rules, crowd.EDGES, crowd.STATIONS, strict=True):
+        text = str(rule.deployment_request)
+        ends = {*crowd.EDGES, *crowd.STATIONS}
+        assert {name for name in ends if name in text} == {edge, station}
+        assert "/edge'" not in text and "'edge'" not in text
+    first, second, _ = crowd.crossings(NEAR)
+    assert math.dist(first.point, second.point) == pytest.approx(1000)

@@ -1,0 +1,90 @@
+"""Demands that lack only room wait in the state repo, and any generator books them in turn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from demandops.ledger import waiting
+
+from tests.kit import rig
+from tests.kit.repo import read as file_of
+from tests.kit.rig import Person
+
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+NODES, DOMAINS = "inventory/nodes.yaml", "policy/access-domains.yaml"
+SOON_S = 0.1
+
+
+def _with_room_for_one(bare: Path) -> dict[str, str | None]:
+    """Return files in which the edge has room for one application, and others wait."""
+    appdef = file_of(bare, APPDEF)
+    service = "  object-fusion:\n"
+    assert service in appdef
+    return {
+        APPDEF: appdef.replace(service, f"{service}    requests: {{cpu: 1}}\n"),
+        NODES: file_of(bare, NODES).replace("- id: edge\n", "- id: edge\n    capacity: {cpu: 1}\n"),
+        DOMAINS: file_of(bare, DOMAINS).replace(
+            "    namespace: perception\n", "    namespace: perception\n    whenFull: wait\n"
+        ),
+    }
+
+
+def _put(name: str, **more: Any) -> dict[str, Any]:
+    inputs = {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]}
+    app = {"id": name, "type": "object-detection-fusion", "place": {"role": "edge"}}
+    head = {"kind": "Demand", "demand": name, "requesters": ["vehicle00"]}
+    return head | {"applications": [app | {"inputs": inputs}]} | more
+
+
+def _release(name: str) -> dict[str, Any]:
+    return {"kind": "Demand", "operation": "release", "demand": name, "requesters": ["vehicle00"]}
+
+
+def _runs(bare: Path) -> list[str]:
+    return sorted(rig.books(bare)["services"])
+
+
+def test_demands_wait_and_are_booked_in_turn_by_any_generator(
+    bare: Path, person: Person, tmp_path: Path
+) -> None:
+    person.change(_with_room_for_one(bare), "One at a time")
+    options: dict[str, Any] = {"fetch_interval": SOON_S}
+    with (
+        rig.running(bare.as_uri(), **options) as first,
+        rig.running(bare.as_uri(), data=tmp_path / "other", **options) as second,
+    ):
+        outcomes = [
+            receipt.outcome
+            for generator, goal in (
+                (first, _put("a")),
+                (second, _put("b", lease="10m")),
+                (first, _put("c", priority=1)),
+                (second, _put("d")),
+                (first, _put("b", lease="10m")),
+            )
+            for receipt in rig.book(generator, goal)
+        ]
+        assert outcomes == ["booked", *["waiting"] * 4]
+        (again,) = rig.book(second, _put("b", lease="10m"))
+        assert (again.commit, again.lease_s) == (rig.tip(bare), 600)
+        rig.book(second, _release("a"))
+        assert _runs(bare) == ["of-c"]
+    assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", waiting.WAITING_ROOT).split() == (
+        sorted(waiting.path_of(name) for name in ("b", "d"))
+    )
+    with rig.running(bare.as_uri(), **options) as third:
+        rig.book(third, _release("d"), _release("c"))
+        assert _runs(bare) == ["of-b"]
+        message = rig.git(bare, "log", "-1", "--format=%an%n%B", "main")
+        assert message.startswith("vehicle00\nPut b, derived/vehicle00/edge\n")
+        assert "It waited for room." in message
+        person.change({waiting.path_of("nobody"): "not: valid\n"}, "A file that is none")
+        rig.book(third, _release("b"))
+    assert _runs(bare) == []
+    operations = [commit.one("Operation") for commit in rig.commits(bare)]
+    made = [operation for operation in operations if operation not in ("", "follow")]
+    assert made == [
+        "put", "wait", "wait", "wait", "release", "put", "release", "release", "put", "release",
+    ]  # fmt: skip
+    rig.assert_sound(bare)

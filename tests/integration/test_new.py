@@ -1,0 +1,191 @@
+"""`demandops new`: what it lays down is valid, and the example demand runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema_rs
+import pytest
+import yaml
+
+from tests.kit.cli import Run
+from tests.kit.repo import git
+
+OPTIONS = [
+    *("--input", "camera=sensor_msgs/msg/Image", "--input", "ego=my_msgs/msg/Ego"),
+    *("--image", "registry.example/tracking:1.0.0"),
+    *("--service", "detector=tracking/detector.launch.py"),
+    *("--service", "multi-tracker=tracking/tracker.launch.py"),
+]
+APPLICATION = ["new", "application", "tracking", *OPTIONS]
+
+
+@pytest.fixture
+def laid(checkout: Path, demandops: Run) -> Path:
+    """Return a state repo with a new application, committed."""
+    assert demandops(*APPLICATION, "-C", checkout).code == 0
+    git(checkout, "add", "--all")
+    git(checkout, "commit", "--quiet", "--message=Add tracking")
+    return checkout
+
+
+def test_an_application_passes_check_at_once(checkout: Path, demandops: Run) -> None:
+    ran = demandops(*APPLICATION, "-C", checkout, "--output", "json")
+    files = ran.json()["files"]
+    assert (ran.code, ran.err) == (0, "")
+    changed = git(checkout, "status", "--porcelain", "--untracked-files=all").splitlines()
+    assert [line.split() for line in changed] == [["??", path] for path in files]
+    checked = demandops("check", checkout)
+    assert (checked.code, checked.err) == (0, "")
+    assert "_charts/tracking-0.1.0.yaml" in checked.out
+
+
+def test_its_example_demand_runs(laid: Path, demandops: Run, tmp_path: Path) -> None:
+    bare = tmp_path / "fleet.git"
+    git(tmp_path, "clone", "--quiet", "--bare", str(laid), str(bare))
+    demand = laid / "appdefs" / "tracking" / "demand.yaml"
+    dry = demandops("request", "--dry-run", demand, "--state-repo", bare)
+    assert (dry.code, dry.err) == (0, "")
+    assert demandops("request", demand, "--state-repo", bare).code == 0
+    tree = git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/")
+    (detector,) = [path for path in tree.splitlines() if "/detector-" in path]
+    (tracker,) = [path for path in tree.splitlines() if "/multitra-" in path]
+    values = [
+        yaml.safe_load(git(bare, "show", f"main:{path}"))["spec"]["values"]
+        for path in (detector, tracker)
+    ]
+    made = "/edge_tracking_detector"
+    assert [one["launch"]["arguments"] for one in values] == [
+        {
+            "node_name": "detector_edge_tracking_" + detector[-17:-5],
+            "camera_topics": "/camera",
+            "ego_topics": "/ego",
+            "result_topic": made,
+        },
+        {
+            "node_name": "multitra_edge_tracking_" + tracker[-17:-5],
+            "detector_topics": made,
+            "result_topic": "/edge_tracking_multi_tracker",
+        },
+    ]
+
+
+def test_a_fleet_from_nothing(demandops: Run, tmp_path: Path) -> None:
+    """As docs/appdef.md says: five nodes and an application, without a line by hand."""
+    repo = tmp_path / "fleet"
+    assert demandops("init", repo, "--example", "none").code == 0
+    ran = demandops(*APPLICATION, "-C", repo)
+    assert (ran.code, ran.out) == (1, "")
+    assert "demandops new node ID --type edge --cluster NAME" in ran.err
+    for id in ("edge", "cloud", "vehicle00", "vehicle01", "station00"):
+        options = ["--type", id.rstrip("01"), "--cluster", "site"]
+        assert demandops("new", "node", id, *options, "-C", repo).code == 0
+    assert demandops(*APPLICATION, "-C", repo).code == 0
+    ran = demandops("check", repo)
+    assert (ran.code, ran.err) == (0, "")
+
+
+def test_the_example_is_demanded_by_whom_the_rules_allow(checkout: Path, demandops: Run) -> None:
+    policy = checkout / "policy" / "access-domains.yaml"
+    rule = "    rules: [{name: cars, requesters: ['vehicle*']}]\n"
+    policy.write_text(policy.read_text().rstrip("\n") + "\n" + rule)
+    assert demandops(*APPLICATION, "-C", checkout).code == 0
+    demand = yaml.safe_load((checkout / "appdefs" / "tracking" / "demand.yaml").read_text())
+    assert demand["requesters"] == ["vehicle"]
+
+
+def test_an_access_domain_beside_one_that_has_every_node_is_refused(
+    demandops: Run, tmp_path: Path
+) -> None:
+    repo = tmp_path / "fleet"
+    assert demandops("init", repo, "--example", "none").code == 0
+    ran = demandops("new", "policy", "operations", "--node", "cloud", "-C", repo)
+    assert (ran.code, ran.err) == (
+        1,
+        "error: policy/access-domains.yaml: nodes: access domain 'fleet' has every node by its "
+        "pattern '*', so no other one can have any; narrow its patterns first\n",
+    )
+
+
+def test_an_access_domain_and_an_override(checkout: Path, demandops: Run) -> None:
+    policy = checkout / "policy" / "access-domains.yaml"
+    policy.write_text(policy.read_text().replace('nodes: ["*"]', 'nodes: ["[!c]*", vehicle0?]'))
+    policy.write_text(policy.read_text().replace('"[!c]*", ', "edge, station00, "))
+    options = ["--node", "cloud", "--requester", "operator*", "-C", checkout]
+    assert demandops("new", "policy", "cloud", *options).code == 0
+    select = ["--service", "object-detection", "--node", "edge"]
+    why = ["--reason", "a test", "--owner", "petra", "-C", checkout]
+    assert demandops("new", "override", "quiet", *select, "--effect", "deny", *why).code == 0
+    assert demandops("new", "override", "none", *select, "--replicas", "0", *why).code == 0
+    found = yaml.safe_load((checkout / "overrides" / "quiet.yaml").read_text())
+    assert found["select"] == [{"services": ["object-detection"], "nodes": ["edge"]}]
+    assert found["deny"] is True
+    assert demandops("check", checkout).code == 0
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "told"),
+    [
+        (
+            ["new", "application", "object-detection-fusion", *OPTIONS],
+            1,
+            "error: NAME: 'object-detection-fusion' exists already; choose another name",
+        ),
+        (["new", "application", "../x", *OPTIONS], 1, "error: "),
+        (["new", "application", "Big_Name", *OPTIONS], 1, "error: "),
+        ([*APPLICATION[:-1], "tracker=launch"], 2, "'tracker=launch' is not NAME=PACKAGE/FILE"),
+        (["new", "application", "x"], 2, "Missing option '--input'."),
+        (
+            ["new", "node", "edge", "--type", "edge", "--cluster", "c-its"],
+            1,
+            "error: ID: 'edge' is a node already; choose another id",
+        ),
+        (
+            [
+                "new",
+                "override",
+                "../x",
+                "--reason",
+                "r",
+                "--owner",
+                "o",
+                "--node",
+                "edge",
+                "--effect",
+                "hold",
+            ],
+            1,
+            "error: ",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_is_written(
+    checkout: Path, demandops: Run, args: list[str], code: int, told: str
+) -> None:
+    ran = demandops(*args, "-C", checkout)
+    assert (ran.code, ran.out) == (code, "")
+    assert told in ran.err
+    assert git(checkout, "status", "--porcelain") == ""
+    assert not (checkout.parent / "x.yaml").exists()
+
+
+def test_every_file_that_people_write_names_its_schema(demandops: Run, tmp_path: Path) -> None:
+    repo = tmp_path / "fleet"
+    assert demandops("init", repo).code == 0
+    assert demandops(*APPLICATION, "-C", repo).code == 0
+    written = [
+        path
+        for top in ("inventory", "policy", "registry", "appdefs")
+        for path in (repo / top).rglob("*.yaml")
+        if "charts" not in path.relative_to(repo).parts[1:-1]
+        or path.relative_to(repo).parts[:2] == ("registry", "charts")
+    ]
+    assert len(written) >= 12
+    for path in (repo / "demandops.yaml", *written):
+        first = path.read_text().splitlines()[0]
+        mark, _, place = first.partition("$schema=")
+        assert mark == "# yaml-language-server: ", path
+        schema = json.loads((path.parent / place).read_text())
+        validator = jsonschema_rs.validator_for(schema)
+        assert validator.is_valid(yaml.safe_load(path.read_text())), path

@@ -1,0 +1,108 @@
+"""The site of a real state repo, called without a network."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import pytest
+import yaml
+from demandops.service import Generator
+from demandops.staterepo.reader import Reader
+from demandops.web.follower import Follower
+from demandops.web.moment import Situation
+from demandops.web.site import Site
+from demandops.web.views import not_ready
+from demandops.web.views.rows import Filter
+from starlette.testclient import TestClient
+
+from tests.kit import goals
+from tests.kit.generator import book, running, wait_until
+from tests.kit.html import Page
+
+VIEWS = (
+    "/",
+    "/map",
+    "/demands",
+    "/services",
+    "/connections",
+    "/leases",
+    "/timeline",
+    "/overrides",
+    "/rates",
+)
+
+Look = Callable[..., Page]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A state repo with the first two demands of the paper's experiment, and its site."""
+
+    bare: Path
+    generator: Generator
+    follower: Follower
+    client: TestClient
+
+    def look(self, path: str, status: int = 200, **params: str) -> Page:
+        """Return a view of the newest commit."""
+        wait_until(
+            lambda: self.follower.newest.moment.commit == str(self.generator.snapshot.commit),
+            "the page has the newest commit",
+        )
+        answer = self.client.get(path, params=params)
+        assert answer.status_code == status, answer.text
+        return Page(answer.text)
+
+
+@contextmanager
+def showing(bare: Path) -> Iterator[Shown]:
+    with running(bare) as generator:
+        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
+        follower = Follower(Reader.of(str(bare)), {}, 0)
+        site = Site(follower, ("127.0.0.1", "localhost"))
+        client = TestClient(site.application, base_url="http://127.0.0.1:8080")
+        yield Shown(bare, generator, follower, client)
+        follower.close()
+
+
+@pytest.fixture
+def shown(bare: Path) -> Iterator[Shown]:
+    with showing(bare) as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def still(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
+    """One for all tests that change nothing in it."""
+    bare = tmp_path_factory.mktemp("still") / "state.git"
+    with showing(Path(shutil.copytree(bare_template, bare))) as made:
+        yield made
+
+
+@pytest.fixture
+def booked(shown: Shown) -> Generator:
+    return shown.generator
+
+
+@pytest.fixture
+def follower(shown: Shown) -> Follower:
+    return shown.follower
+
+
+@pytest.fixture
+def client(shown: Shown) -> TestClient:
+    return shown.client
+
+
+@pytest.fixture
+def look(shown: Shown) -> Look:
+    return shown.look
+
+
+def causes(now: Situation, follower: Follower, text: str = "") -> list[not_ready.Cause]:
+    return not_ready.causes(now, Filter(text), partial(follower.last_change, now.moment))

@@ -1,0 +1,305 @@
+"""What the page tells when the state repo changes: by demands, by people, and when it is away."""
+
+from __future__ import annotations
+
+import copy
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from demandops.service import Generator
+from demandops.web import view_pages
+from demandops.web.follower import Follower
+from demandops.web.moment import Moment
+from demandops.web.views import fleet_map, map_layout
+from demandops.web.views.lists import LISTS, rows_of
+from demandops.web.views.rows import Filter
+
+from tests.integration.web.conftest import VIEWS, Look, causes
+from tests.kit import goals
+from tests.kit.generator import Proposed, book, wait_until
+from tests.kit.repo import GitRepo, Person, away
+
+DENY = """apiVersion: demandops/v1
+kind: Override
+reason: The road is closed
+owner: traffic-control
+select: [{connections: [vehicle01/edge]}]
+deny: true
+"""
+DETECTION = "od-edge-vehicle00"
+
+
+def test_a_denied_connection_names_the_override_its_owner_and_since_when(
+    booked: Generator, person: Person, follower: Follower, look: Look
+) -> None:
+    person.override(roadworks=DENY)
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.state.config.overrides, "the override is in effect")
+    page = look("/")
+    assert page.texts("h1") == ["1 of 1 application is not ready"]
+    (cause,) = causes(follower.newest, follower)
+    assert (cause.kind, cause.told) == ("suspended", "The road is closed")
+    assert cause.remedy.who == "traffic-control, who owns the override"
+    assert cause.remedy.command == "git rm overrides/roadworks.yaml"
+    assert cause.requesters == ("station00", "vehicle01")
+    assert (
+        cause.since == follower.last_change(follower.newest.moment, "overrides/roadworks.yaml").time
+    )  # type: ignore[union-attr]
+    assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
+    assert "vehicle01/edge" not in look("/connections").text
+    for path in VIEWS:
+        look(path)
+
+
+def test_an_invalid_file_names_who_wrote_it(
+    booked: Generator, person: Person, follower: Follower, look: Look
+) -> None:
+    person.change({"registry/images.yaml": "images: [\n"}, "Break it")
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.problems, "the generator reports it")
+    page = look("/")
+    (cause,) = causes(follower.newest, follower)
+    assert cause.kind == "invalid"
+    assert cause.remedy.who == "Petra Platform <petra@example.org>, who changed it last"
+    assert cause.remedy.command.startswith("git show ")
+    assert "registry/images.yaml" in look("/overrides").text
+    assert "its last valid version stays in effect" in page.text
+
+
+def test_too_many_causes_are_counted(
+    booked: Generator, person: Person, look: Look, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person.change({"registry/images.yaml": "images: [\n", "registry/charts.yaml": "charts: [\n"})
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.problems, "the generator reports them")
+    assert "more causes" not in look("/").text
+    monkeypatch.setattr(view_pages, "_MOST_CAUSES", 1)
+    page = look("/")
+    assert len(page.texts("h3")) == 1 and "and 1 more causes; filter to see them" in page.text
+    assert page.texts("h1") == ["2 things need attention"]
+
+
+def test_a_proposal_names_the_branch_to_merge(
+    booked: Generator, person: Person, look: Look, follower: Follower
+) -> None:
+    person.policy(approval="required")
+    booked.fetch_now()
+    wait_until(lambda: not _approved(booked), "demands need approval")
+    proposed = Proposed(booked, goals.goal([goals.application("edge/new", who=["v"])], []))
+    branch = proposed.branch
+    wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
+    assert f"git merge origin/{branch}" in look("/").text
+    assert f"git push origin --delete {branch}" in look("/overrides").text
+
+
+def _approved(generator: Generator) -> bool:
+    return generator.snapshot.state.config.domains["perception"].approval == "none"
+
+
+def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
+    book(
+        booked,
+        {
+            "apiVersion": "demandops/v1",
+            "kind": "Demand",
+            "demand": "short",
+            "requesters": ["vehicle02"],
+            "lease": "10m",
+            "connections": [
+                {
+                    "id": "vehicle02/cloud",
+                    "type": "mqtt",
+                    "source": "vehicle02",
+                    "target": "cloud",
+                    "topics": [{"source": "/t"}],
+                }
+            ],
+        },
+    )
+    (row,) = look("/leases").texts("tr")[1:]
+    assert re.match(r"in (10 min|[0-9]+ s) vehicle02/cloud connection short vehicle02 600 s", row)
+
+
+def test_a_release_that_stopped_is_still_explained(booked: Generator, look: Look) -> None:
+    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
+    page = look("/release", name=DETECTION)
+    assert "It does not run" in page.text and "stopped" in page.texts("td")
+    assert look("/release", 404, name="never").text.startswith("Nothing to show")
+
+
+@pytest.mark.parametrize(
+    ("release", "told"),
+    [
+        (DETECTION, "object-detection on edge for vehicle00 is needed, but {} denies it"),
+        ("mqtt-vehicle00-edge-source-d3ca91c2df6c", "vehicle00/edge is booked, but {} denies it"),
+    ],
+)
+def test_the_file_that_stops_a_release_stops_it(
+    booked: Generator, person: Person, look: Look, state: GitRepo, release: str, told: str
+) -> None:
+    page = look("/release", name=release)
+    (text,) = [e.text for e in page.all("pre") if "kind: Override" in e.text]
+    (promise,) = [text for text in page.texts("p") if "This file would stop it" in text]
+    before = set(state.manifests())
+    name = text.splitlines()[0].removeprefix("# ")
+    person.change({name: text})
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.state.config.overrides, "the override is in effect")
+    assert look("/release", name=release).texts("h1") != [f"{release} unknown"]
+    assert told.format(name) in look("/").text
+    gone = {Path(path).stem for path in before - set(state.manifests())}
+    assert release in gone
+    named = {word for word in re.split(r"[ ,.]+", promise) if word.startswith(("od-", "mqtt-"))}
+    assert named == gone - {release}
+
+
+def test_an_override_that_another_holds_back_is_told(
+    booked: Generator, person: Person, look: Look
+) -> None:
+    select = "apiVersion: demandops/v1\nkind: Override\nreason: r\nowner: ada\n"
+    select += "select: [{services: [object-fusion]}]\n"
+    person.override(frozen=f"{select}hold: true\npriority: 1\n", more=f"{select}replicas: 2\n")
+    booked.fetch_now()
+    wait_until(lambda: len(booked.snapshot.state.config.overrides) == 2, "both are merged")
+    assert "held back" in look("/overrides").text
+
+
+def test_the_consequence_of_a_release_is_what_follows(
+    booked: Generator, look: Look, state: GitRepo
+) -> None:
+    goal: dict[str, Any] = {
+        "apiVersion": "demandops/v1",
+        "kind": "Demand",
+        "demand": "mine",
+        "requesters": ["vehicle02"],
+        "connections": [
+            {
+                "id": "vehicle02/cloud",
+                "type": "mqtt",
+                "source": "vehicle02",
+                "target": "cloud",
+                "topics": [{"source": "/t"}],
+            }
+        ],
+    }
+    book(booked, goal)
+    page = look("/demand", id="mine")
+    told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
+    (command,) = [e.text for e in page.all("pre")]
+    file = command.partition("<<'END'\n")[2].removesuffix("END")
+    before = set(state.manifests())
+    book(booked, yaml.safe_load(file))
+    gone = {
+        path.rsplit("/", 1)[1].removesuffix(".yaml") for path in before - set(state.manifests())
+    }
+    assert gone == told and len(gone) == 2
+
+
+def test_the_time_line_has_lanes_for_demands_overrides_and_people(
+    booked: Generator, person: Person, look: Look
+) -> None:
+    person.override(roadworks=DENY)
+    person.change({"README.md": "hello"}, "Greet")
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.state.config.overrides, "the override is in effect")
+    assert len(look("/timeline", lane="demands").texts("tr")[1:]) == 2
+    assert "A person's change" in look("/timeline", lane="overrides").text
+    assert "Greet" in look("/timeline", lane="people").text
+    assert len(look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
+
+
+def test_nodes_are_drawn_where_they_are_and_cover_no_other(
+    booked: Generator, person: Person, follower: Follower
+) -> None:
+    path = "inventory/nodes.yaml"
+    nodes = yaml.safe_load(person.read(path))
+    for number, node in enumerate(nodes["nodes"]):
+        node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
+    person.change({path: yaml.safe_dump(nodes)})
+    wait_until(lambda: next(iter(follower.newest.moment.config.nodes.values())).position, "places")
+    drawn = fleet_map.picture(follower.newest, Filter(""), "")
+    assert (drawn.layout, drawn.layouts) == ("place", ("cluster", "place"))
+    for layout in drawn.layouts:
+        cards = fleet_map.picture(follower.newest, Filter(""), layout).nodes
+        for one in cards:
+            assert one.x >= 0 and one.x + one.width <= map_layout.WIDTH
+            assert not [o for o in cards if o is not one and _cover(one, o)]
+    by_id = {card.id: card for card in drawn.nodes}
+    ids = [node["id"] for node in nodes["nodes"]]
+    assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
+    assert by_id[ids[-1]].y < by_id[ids[0]].y
+
+
+def _cover(one: map_layout.NodeCard, other: map_layout.NodeCard) -> bool:
+    return not (
+        one.x + one.width <= other.x
+        or other.x + other.width <= one.x
+        or one.y + one.height <= other.y
+        or other.y + other.height <= one.y
+    )
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) -> None:
+    command = [sys.executable, "-m", "demandops.cli.main", "web"]
+    process = subprocess.Popen(
+        [*command, "--state-repo", str(bare), "--listen", "127.0.0.1:0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    url = process.stdout.readline().strip()
+    with urllib.request.urlopen(url, timeout=10) as answer:  # noqa: S310 - the page
+        assert b"Nothing is demanded" in answer.read()
+    process.send_signal(stop)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out, err) == (0, "", "stopped\n")
+
+
+def test_what_is_taken_over_is_what_deriving_everything_gives(
+    booked: Generator, person: Person, follower: Follower, look: Look
+) -> None:
+    appdef = "appdefs/object-detection-fusion/appdef.yaml"
+    scaling = "{max: 4, per: {sources: 1}, dividesWork: true, downAfter: 1s}"
+    text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
+    person.change({appdef: text}, "Keep replicas")
+    wait_until(lambda: follower.newest.moment.config.files[appdef] == text, "the page has it")
+    joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
+    one_leaves = copy.deepcopy(joins[0]) | {"shutdown": True, "connections": []}
+    one_leaves["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station00"]
+    for goal in (joins[2], one_leaves, *joins[3:]):
+        book(booked, goal)
+        _assert_taken_over(follower, look)
+        wait_until(lambda: not booked.snapshot.state.ledger.kept.steps, "replicas come down")
+        _assert_taken_over(follower, look)
+
+
+def _assert_taken_over(follower: Follower, look: Look) -> None:
+    for name in LISTS:
+        look(f"/{name}")
+    now = follower.newest
+    anew = replace(now, moment=Moment(now.moment.snapshot, now.moment.entry, ()))
+    assert now.moment.targets == anew.moment.targets
+    assert now.moment.behind == anew.moment.behind
+    for name in LISTS:
+        assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
+
+
+def test_a_state_repo_that_is_away_is_told_and_followed_again(
+    bare: Path, follower: Follower, look: Look
+) -> None:
+    with away(bare):
+        wait_until(lambda: follower.newest.unread, "the page knows")
+        page = look("/", status=200)
+        assert "The state repo cannot be read" in page.text
+        assert "may be out of date" in look("/demands").texts("aside")[0]
+    wait_until(lambda: not follower.newest.unread, "the page follows again")

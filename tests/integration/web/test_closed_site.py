@@ -1,0 +1,93 @@
+"""The site shows and does nothing else: what it refuses, and what it never lets through."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from demandops.errors import InvalidInput
+from demandops.staterepo.reader import Reader
+from demandops.web.follower import Follower
+from demandops.web.server import WebServer
+from demandops.web.site import Site
+from starlette.testclient import TestClient
+
+from tests.integration.web.conftest import VIEWS, Shown
+from tests.kit.html import Page
+
+
+@pytest.fixture
+def shown(still: Shown) -> Shown:
+    """Nothing changes here."""
+    return still
+
+
+@pytest.fixture
+def bare(still: Shown) -> Path:
+    return still.bare
+
+
+@pytest.mark.parametrize("path", VIEWS)
+def test_every_answer_forbids_what_the_page_does_not_need(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    policy = answer.headers["content-security-policy"]
+    assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self';")
+    assert "unsafe" not in policy
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert answer.headers["cache-control"] == "no-store"
+    page = Page(answer.text)
+    for element in page.elements:
+        assert "style" not in element.attributes
+        assert not [name for name in element.attributes if name.startswith("on")]
+        for name in ("src", "href", "action"):
+            address = element.attributes.get(name, "/")
+            assert address.startswith(("/", "#")) and not address.startswith("//")
+    assert [script.text for script in page.all("script")] == [""]
+    assert page.all("style") == []
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "PATCH", "DELETE"])
+def test_nothing_can_be_sent(client: TestClient, method: str) -> None:
+    assert {client.request(method, path).status_code for path in (*VIEWS, "/events")} == {405}
+
+
+def test_the_documentation_comes_with_the_page_where_it_was_built(
+    shown: Shown, tmp_path: Path
+) -> None:
+    assert "Documentation" not in shown.client.get("/").text
+    assert shown.client.get("/docs/index.html").status_code == 404
+    tmp_path.joinpath("index.html").write_text("<script>1</script>")
+    site = Site(shown.follower, documentation=tmp_path)
+    client = TestClient(site.application)
+    assert '<a href="/docs/index.html">Documentation</a>' in client.get("/").text
+    page = client.get("/docs/index.html")
+    assert page.text == "<script>1</script>"
+    assert "script-src 'self' 'unsafe-inline'" in page.headers["Content-Security-Policy"]
+    assert client.get("/docs/..%2fsite.py").status_code == 404
+    for path in ("/", "/docs", "/docsy"):
+        assert "default-src 'none'" in client.get(path).headers["Content-Security-Policy"]
+
+
+def test_another_name_of_this_machine_is_refused(client: TestClient) -> None:
+    """So no other site can have its visitors' browsers read the page (DNS rebinding)."""
+    refused = client.get("/", headers={"Host": "attacker.example"})
+    assert refused.status_code == 400
+    assert client.get("/", headers={"Host": "localhost:8080"}).status_code == 200
+
+
+def test_an_address_that_others_reach_is_warned_of(
+    bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    server = WebServer("0.0.0.0:0", "--listen", Follower(Reader.of(str(bare)), {}, 0))
+    server.close()
+    assert "everybody who reaches http://0.0.0.0:" in caplog.text
+
+
+def test_an_address_that_cannot_be_used_is_named(bare: Path) -> None:
+    follower = Follower(Reader.of(str(bare)), {}, 0)
+    with pytest.raises(InvalidInput) as told:
+        WebServer("8080", "--web", follower)
+    follower.close()
+    assert str(told.value) == (
+        "--web: '8080' is not an address to listen on; write one like 127.0.0.1:8090"
+    )

@@ -1,0 +1,74 @@
+"""Text from outside stays text, shows what is not visible, and is no command of a shell."""
+
+from __future__ import annotations
+
+import json
+import shlex
+
+from demandops.service import Generator
+from demandops.staterepo.history.commit_log import PROPOSAL
+from demandops.web.follower import Follower
+
+from tests.integration.web.conftest import VIEWS, Look
+from tests.kit import goals
+from tests.kit.generator import book, wait_until
+from tests.kit.html import Page
+from tests.kit.repo import GitRepo, Person, git
+
+HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(1)>{{7*7}}"
+HIDDEN = "\u202e"
+
+
+def test_text_from_outside_stays_text(booked: Generator, person: Person, look: Look) -> None:
+    vehicle = "v<b>&amp;\"x'"
+    app = goals.application(f"edge/{HOSTILE}", who=[vehicle])
+    book(booked, goals.goal([app], [goals.connection(who=[vehicle])], id=HOSTILE))
+    override = {
+        "apiVersion": "demandops/v1",
+        "kind": "Override",
+        "reason": HOSTILE,
+        "owner": HOSTILE,
+        "select": [{"applications": ["edge/object_detection_fusion"]}],
+        "deny": True,
+    }
+    files = {"overrides/x.yaml": json.dumps(override), "inventory/brokers.yaml": f"{HOSTILE}: ["}
+    author = HOSTILE.replace("<", "(").replace(">", ")")
+    person.change(files, HOSTILE, (author, "x@example.org", 1_790_000_000))
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.problems, "the generator reports the broken file")
+    demand = next(one.demand for one in booked.snapshot.state.ledger if vehicle in one.requesters)
+    seen = ""
+    for path, params in [*((view, {}) for view in VIEWS), ("/demand", {"id": demand})]:
+        for query in ("", HOSTILE):
+            page = look(path, q=query, **params)
+            _assert_only_ours(page)
+            seen += page.text
+    assert HOSTILE in seen and vehicle in seen and "49" not in look("/", q=HOSTILE).text
+    _assert_only_ours(look("/release", 404, name=HOSTILE))
+    _assert_only_ours(look("/demands", 404, at=HOSTILE))
+
+
+def _assert_only_ours(page: Page) -> None:
+    assert [script.attributes["src"] for script in page.all("script")] in (["/static/page.js"], [])
+    assert [image.attributes["src"] for image in page.all("img")] in (["/static/icon.svg"], [])
+    assert not [name for e in page.elements for name in e.attributes if name.startswith("on")]
+    assert page.all("b") == []
+
+
+def test_a_branch_is_no_command_and_hides_nothing(
+    state: GitRepo, follower: Follower, look: Look
+) -> None:
+    """Whoever may push a branch could have an approver paste what its name says."""
+    branch = f"demand/x;$(touch${{IFS}}pwned)|'&{HIDDEN}"
+    commit = git(state.path, "commit-tree", "main^{tree}", "-p", "main", "-m", f"{HIDDEN}Propose")
+    message = f"Propose\n\n{PROPOSAL}: {HIDDEN}"
+    commit = git(state.path, "commit-tree", "main^{tree}", "-p", "main", "-m", message).strip()
+    git(state.path, "branch", branch, commit)
+    wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
+    shown = f"origin/{branch}".replace(HIDDEN, "\\u202e")
+    page = look("/overrides")
+    (merge,) = [text for text in page.texts("code") if text.startswith("git merge")]
+    assert shlex.split(merge) == ["git", "merge", shown, "&&", "git", "push"]
+    (merge,) = [text for text in look("/").texts("code") if text.startswith("git merge")]
+    assert shlex.split(merge) == ["git", "merge", shown]
+    assert HIDDEN not in page.text + look("/").text

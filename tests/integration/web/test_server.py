@@ -1,0 +1,116 @@
+"""The server with clients that do not behave: many, silent, and slow ones."""
+
+from __future__ import annotations
+
+import socket
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from urllib.parse import urlsplit
+
+import pytest
+from demandops.staterepo.reader import Reader
+from demandops.web import server, site
+from demandops.web.follower import Follower
+from demandops.web.server import WebServer
+
+from tests.integration.web.conftest import Shown
+from tests.kit.generator import PATIENCE_S, wait_until
+
+
+@pytest.fixture
+def follower(still: Shown) -> Follower:
+    return Follower(Reader.of(str(still.bare)), {}, 0)
+
+
+@pytest.fixture
+def served(follower: Follower) -> Iterator[WebServer]:
+    made = WebServer("127.0.0.1:0", "--listen", follower)
+    yield made
+    made.close()
+
+
+@contextmanager
+def asking(page: WebServer, text: str) -> Iterator[socket.socket]:
+    """A client that has sent this, and reads nothing."""
+    place = urlsplit(page.url)
+    with socket.create_connection((place.hostname, place.port), PATIENCE_S) as made:
+        made.sendall(text.replace("\n", "\r\n").encode())
+        yield made
+
+
+def status(page: WebServer, path: str = "") -> int:
+    try:
+        with urllib.request.urlopen(page.url + path, timeout=PATIENCE_S) as answer:  # noqa: S310
+            code: int = answer.status
+            return code
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+STREAM = "GET /events HTTP/1.1\nHost: localhost\n\n"
+
+
+def test_streams_of_events_are_bounded_and_end_with_the_server(
+    follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(site, "_MOST_LISTENERS", 3)
+    page = WebServer("127.0.0.1:0", "--listen", follower)
+    with ExitStack() as stack:
+        streams = [stack.enter_context(asking(page, STREAM)) for _ in range(3)]
+        assert {one.recv(12) for one in streams} == {b"HTTP/1.1 200"}
+        assert status(page, "events") == 503
+        assert status(page) == 200
+        streams[0].close()
+        wait_until(lambda: _is_open(page), "there is room for another")
+        page.close()
+        for one in streams[1:]:
+            while one.recv(4096):
+                pass
+
+
+def _is_open(page: WebServer) -> bool:
+    with asking(page, STREAM) as stream:
+        return stream.recv(12) == b"HTTP/1.1 200"
+
+
+@pytest.mark.parametrize(
+    "sent", ["", "GET / HTTP/1.1\nHost: loc", "GET /map HTTP/1.1\nHost: localhost\n\n" * 999]
+)
+def test_clients_that_neither_ask_nor_read_are_cut_off(
+    follower: Follower, monkeypatch: pytest.MonkeyPatch, sent: str
+) -> None:
+    monkeypatch.setattr(server, "_STUCK_S", 0.2)
+    monkeypatch.setattr(server, "_AT_ONCE", 4)
+    page = WebServer("127.0.0.1:0", "--listen", follower)
+    with ExitStack() as stack:
+        for _ in range(4):
+            with suppress(ConnectionError):
+                stack.enter_context(asking(page, sent))
+        wait_until(lambda: status(page) == 200, "the page answers others")
+    page.close()
+
+
+def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "_STUCK_S", 0.05)
+    monkeypatch.setattr(site, "_HEARTBEAT_S", 0.3)
+    page = WebServer("127.0.0.1:0", "--listen", follower)
+    with asking(page, STREAM) as stream:
+        got = b""
+        while got.count(b": still here") < 3:
+            chunk = stream.recv(4096)
+            assert chunk, got
+            got += chunk
+    page.close()
+
+
+def test_views_of_earlier_moments_keep_no_other_waiting(
+    served: WebServer, follower: Follower
+) -> None:
+    """More than there are threads for views; none ends while another moment is read."""
+    with ExitStack() as stack:
+        stack.enter_context(follower._loading)
+        for _ in range(60):
+            stack.enter_context(asking(served, "GET /?at=HEAD~1 HTTP/1.1\nHost: localhost\n\n"))
+        assert status(served) == 200

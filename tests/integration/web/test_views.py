@@ -1,0 +1,181 @@
+"""What the views of the page tell about a real state repo."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+
+import pytest
+from demandops.cluster.health.release_health import Health
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.ledger.waiting import WaitingDemand
+from demandops.web.follower import Follower
+from demandops.web.moment import Moment, Situation
+from demandops.web.views import fleet_map
+from demandops.web.views.lists import rows_of
+from demandops.web.views.rows import Filter
+from rpds import HashTrieMap
+
+from tests.integration.web.conftest import Look, Shown, causes
+from tests.kit.repo import GitRepo
+
+DENY = """apiVersion: demandops/v1
+kind: Override
+reason: The road is closed
+owner: traffic-control
+select: [{connections: [vehicle01/edge]}]
+deny: true
+"""
+DETECTION = "od-edge-vehicle00"
+IMAGE = "docker.io/rwthika/robotkube-object-detection:2025-04"
+
+
+@pytest.fixture
+def shown(still: Shown) -> Shown:
+    """Nothing changes here."""
+    return still
+
+
+@pytest.fixture
+def bare(still: Shown) -> Path:
+    return still.bare
+
+
+def with_health(follower: Follower, **named: Health) -> Situation:
+    statuses = {
+        name: ReleaseStatus(Health("healthy"), "abc") for name in follower.newest.moment.releases
+    }
+    for name, health in named.items():
+        statuses[name.replace("_", "-")] = ReleaseStatus(health, "abc", "2026-05-04T12:00:00Z")
+    return replace(follower.newest, statuses=statuses, watched=frozenset({"c-its"}))
+
+
+def test_without_clusters_the_page_says_what_it_cannot_know(look: Look) -> None:
+    page = look("/")
+    assert page.texts("h1") == ["Nothing in the state repo stands in the way"]
+    assert "does not watch the clusters" in page.text
+
+
+@pytest.mark.parametrize(
+    ("reason", "who"),
+    [
+        ("ImagePullBackOff: manifest unknown", f"the publisher of image {IMAGE}"),
+        ("pod not scheduled: 0/3 nodes: Insufficient cpu", "the operator of node edge in cluster"),
+        ("back-off: CrashLoopBackOff", "the maintainer of appdefs/object-detection-fusion"),
+    ],
+)
+def test_a_failing_release_names_who_can_mend_it(follower: Follower, reason: str, who: str) -> None:
+    health = Health("reconciled", reason, "HelmRelease perception/od-edge-vehicle00", failing=True)
+    now = with_health(follower, od_edge_vehicle00=health)
+    (cause,) = causes(now, follower)
+    assert cause.remedy.who.startswith(who)
+    assert cause.remedy.command == "kubectl -n perception describe helmrelease od-edge-vehicle00"
+    assert cause.told == f"HelmRelease perception/od-edge-vehicle00: {reason}"
+    assert cause.applications == ("edge/object_detection_fusion",)
+    assert cause.requesters == ("station00", "vehicle00")
+    assert f"{cause.since:%Y-%m-%d %H:%M}" == "2026-05-04 12:00"
+    assert causes(now, follower, "vehicle00") and not causes(now, follower, "requester=vehicle01")
+
+
+def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
+    away = Health("waiting", "cannot be read: it is away", "cluster c-its")
+    names = [name.replace("-", "_") for name in follower.newest.moment.releases]
+    now = with_health(follower, **dict.fromkeys(names, away))
+    (cause,) = causes(now, follower)
+    assert cause.kind == "waiting" and len(cause.releases) == len(names)
+    assert cause.remedy.who == "the operator of cluster c-its"
+
+
+def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:
+    def found(q: str) -> list[str]:
+        return [text for text in look("/services", q=q).texts("th") if text.startswith(("o", "m"))]
+
+    fusion = "of-edge-object-detection-fusion-cf7e0180a8bb"
+    assert found("") == ["od-edge-station00", DETECTION, fusion]
+    assert found("vehicle00 OD-EDGE") == ["od-edge-station00", DETECTION]
+    assert found("requester=vehicle01") == ["od-edge-station00", fusion]
+    assert found("release:od-edge") == ["od-edge-station00", DETECTION]
+    assert found("node=edg") == []
+
+
+def test_links_keep_the_filter_and_the_moment(look: Look, state: GitRepo) -> None:
+    page = look("/services", q="vehicle00", at=state.tip)
+    kept = f"at={state.tip}"
+    assert "q=vehicle00" in page.link("Node") and "sort=node" in page.link("Node")
+    assert "q=vehicle00" in page.link("Demands")
+    earlier = look("/services", q="vehicle00", at=f"{state.tip}~1")
+    assert f"at={state.tip}~1".replace("~", "%7E") in earlier.link("Map").replace("~", "%7E")
+    assert kept.startswith("at=")
+
+
+def test_rows_are_sorted_by_any_column_both_ways(look: Look) -> None:
+    down = look("/connections", sort="topic").texts("tr")[1:]
+    up = look("/connections", sort="-topic").texts("tr")[1:]
+    assert down == up[::-1] and len(down) == 3
+
+
+def test_a_release_is_explained(look: Look, state: GitRepo) -> None:
+    page = look("/release", name=DETECTION)
+    assert "station00, vehicle00" in page.text
+    file = f"clusters/c-its/perception/edge/{DETECTION}.yaml"
+    rendered = state.files("clusters/")[file]
+    difference, shown = [e.text for e in page.all("pre") if "kind: HelmRelease" in e.text]
+    assert shown == rendered
+    assert difference.splitlines()[1:] == [f"+{line}" for line in rendered.splitlines()]
+    assert "started" in page.texts("td")
+
+
+def test_a_moment_shows_the_books_of_then(look: Look, state: GitRepo) -> None:
+    assert len(look("/demands").texts("tr")) == 3
+    then = look("/demands", at=f"{state.tip}~1")
+    assert len(then.texts("tr")) == 2
+    assert "The state of" in then.texts("aside")[0]
+    assert look("/demands", 404, at="never").text.startswith("Nothing to show")
+
+
+def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
+    now = follower.newest
+    demand = next(one.demand for one in now.moment.state.ledger if "vehicle01" in one.requesters)
+    lit = fleet_map.picture(now, Filter(f"demand={demand}"), "")
+    assert {node.id for node in lit.nodes if node.is_lit} == {"edge", "station00", "vehicle01"}
+    services = {one.name for node in lit.nodes for one in node.services if one.is_lit}
+    assert DETECTION not in services and "od-edge-station00" in services
+
+
+def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: Follower) -> None:
+    newest = follower.newest
+    config = newest.moment.config
+    model = next(iter(config.nodes.values()))
+    far = {
+        f"far{number}": model.model_copy(update={"id": f"far{number}"}) for number in range(1000)
+    }
+    state = replace(newest.moment.state, config=replace(config, nodes={**config.nodes, **far}))
+    snapshot = replace(newest.moment.snapshot, state=state)
+    now = replace(newest, moment=Moment(snapshot, newest.moment.entry, ()))
+    drawn = fleet_map.picture(now, Filter(""), "")
+    assert (drawn.nodes, drawn.total) == ((), len(state.config.nodes))
+    squares = sum(mass.path.count("M") for mass in drawn.many_nodes)
+    assert squares == len(state.config.nodes)
+    few = fleet_map.picture(now, Filter("node=far7"), "")
+    assert [node.id for node in few.nodes] == ["far7"] and few.only_lit
+    # too many to draw alone are lit in their places
+    many = fleet_map.picture(now, Filter("node:far"), "")
+    assert many.is_dimmed and {node.id for node in many.nodes} == {
+        f"far{number}" for number in range(1_000)
+    }
+
+
+def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
+    newest = follower.newest
+    since = newest.now - timedelta(minutes=5)
+    waiting = WaitingDemand("later", "later", ("vehicle02",), since, 0, {})
+    ledger = replace(newest.moment.state.ledger, waiting=HashTrieMap({"later": waiting}))
+    state = replace(newest.moment.state, ledger=ledger)
+    snapshot = replace(newest.moment.snapshot, state=state)
+    now = replace(newest, moment=Moment(snapshot, newest.moment.entry, ()))
+    (cause,) = causes(now, follower, "vehicle02")
+    assert (cause.kind, cause.what.text, cause.since) == ("waiting", "later", since)
+    assert cause.why == "waits for room on a node"
+    rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
+    assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]

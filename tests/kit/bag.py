@@ -1,0 +1,49 @@
+"""Bags of vehicles' poses, MCAP or sqlite3, written without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from tests.kit.detection import POSE
+
+_STRING = "std_msgs/msg/String"
+_TYPES = get_typestore(Stores.ROS2_KILTED)
+
+
+def write_bag(
+    path: Path,
+    poses: Iterable[tuple[float, str, float, float]],
+    plugin: StoragePlugin = StoragePlugin.MCAP,
+    texts: Iterable[tuple[float, str, str]] = (),
+) -> None:
+    """Record poses, each of a time in seconds since 1970, a vehicle and a place.
+
+    Args:
+        path: the folder of the bag; it must not exist.
+        poses: in the order of time.
+        plugin: how the bag is stored.
+        texts: what comes before them on other topics: times, topics and texts.
+    """
+    new = _TYPES.types
+    topics: dict[str, Any] = {}
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        for at, topic, text in texts:
+            other = writer.add_connection(topic, _STRING, typestore=_TYPES)
+            data = _TYPES.serialize_cdr(new[_STRING](text), _STRING)
+            writer.write(other, round(at * 1e9), data)
+        for at, vehicle, x, y in poses:
+            nanoseconds = round(at * 1e9)
+            if vehicle not in topics:
+                topic = f"/vehicles/{vehicle}/pose"
+                topics[vehicle] = writer.add_connection(topic, POSE, typestore=_TYPES)
+            stamp = new["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
+            head = new["std_msgs/msg/Header"](stamp, "map")
+            turned = new["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+            place = new["geometry_msgs/msg/Point"](x, y, 0.0)
+            pose = new[POSE](head, new["geometry_msgs/msg/Pose"](place, turned))
+            writer.write(topics[vehicle], nanoseconds, _TYPES.serialize_cdr(pose, POSE))

@@ -1,0 +1,73 @@
+"""A headless Chromium of the system, and pages that note what must not happen."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+from playwright.sync_api import Browser, Page, sync_playwright
+
+_ALONE = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+
+_NOTE_LONG_TASKS = """
+window.longTasks = [];
+new PerformanceObserver((list) => {
+  for (const entry of list.getEntries()) window.longTasks.push(entry.duration);
+}).observe({ type: "longtask", buffered: true });
+"""
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """Run the browser for the length of a block; its profile is new."""
+    program = shutil.which("chromium")
+    assert program, "setup/system page installs chromium"
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=list(_ALONE))
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+class Visit:
+    """A page of the site, and everything that it asked for and complained about."""
+
+    def __init__(self, browser: Browser, url: str, *, width: int = 1280, **options: Any) -> None:
+        self.url = url
+        viewport = {"width": width, "height": 900 if width > 500 else 844}
+        self.context = browser.new_context(viewport=viewport, **options)  # type: ignore[arg-type]
+        self.context.add_init_script(_NOTE_LONG_TASKS)
+        self.hosts: set[str] = set()
+        self.complaints: list[str] = []
+        self.page = self.context.new_page()
+        self.page.on("request", lambda request: self.hosts.add(urlsplit(request.url).netloc))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("console", self._note)
+
+    def _note(self, message: Any) -> None:
+        if message.type in ("error", "warning"):
+            self.complaints.append(message.text)
+
+    def open(self, path: str) -> Page:
+        self.page.goto(f"{self.url}{path}", wait_until="load")
+        return self.page
+
+    def longest_task_ms(self) -> float:
+        """The longest time that the browser's main thread was busy, since the page was opened."""
+        self.page.wait_for_timeout(150)  # entries come a moment later
+        return float(self.page.evaluate("Math.max(0, ...window.longTasks)"))
+
+    def close(self) -> None:
+        self.context.close()

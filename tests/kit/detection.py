@@ -1,0 +1,65 @@
+"""Rules and observations for tests of the event detector."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from demandops import strict_yaml
+from demandops.detection.events.detection_state import Event, Observation, State
+from demandops.detection.events.event_engine import EventEngine
+from demandops.detection.rules import rule_file
+from demandops.detection.rules.rule_file import RuleFile
+
+POSE = "geometry_msgs/msg/PoseStamped"
+SOURCES = {
+    "cars": {"topic": "/cars/{entity}/pose", "type": POSE, "timeout": "3s"},
+    "bikes": {"topic": "/bikes/{entity}/pose", "type": POSE, "timeout": "2s"},
+    "batteries": {"topic": "/cars/{entity}/battery", "type": "sensor_msgs/msg/BatteryState"},
+}
+
+
+def demand(**fields: Any) -> dict[str, Any]:
+    """A demand that names the entities of an event."""
+    return {"demand": "{rule}/{entity}", "requesters": ["{entity}"]} | fields
+
+
+def rule(name: str, **fields: Any) -> dict[str, Any]:
+    """A rule with a condition, and a demand unless one is given."""
+    subjects = ["{rule}"]
+    subjects += [] if {"count", "schedule"} & set(fields) else ["{entity}"]
+    subjects += ["{other}"] if "together" in fields else []
+    own = {"demand": demand(demand="/".join(subjects), requesters=["r"])}
+    return {"name": name} | ({} if "deploymentRequest" in fields else own) | fields
+
+
+def text_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> str:
+    """The text of a file with some rules."""
+    head = {"apiVersion": "demandops/v1", "kind": "DetectorRules"}
+    return strict_yaml.dump({**head, "sources": sources, "rules": [*rules]})
+
+
+def file_of(*rules: dict[str, Any]) -> RuleFile:
+    return rule_file.read(text_of(*rules), "rules.yaml")
+
+
+def at(time: float, entity: str, x: float, y: float = 0.0, source: str = "cars") -> Observation:
+    return Observation(source, entity, time, (x, y))
+
+
+class Run:
+    """An engine and its state."""
+
+    def __init__(self, *rules: dict[str, Any], now: float = 0.0) -> None:
+        self.engine = EventEngine(file_of(*rules))
+        self.state: State = self.engine.start(now)
+
+    def step(self, now: float, *observations: Observation) -> list[Event]:
+        self.state, events = self.engine.step(self.state, observations, now)
+        return [*events]
+
+    def told(self, now: float, *observations: Observation) -> list[tuple[Any, ...]]:
+        """The events of a step in short: rule, entities, start or stop, time."""
+        return [
+            (event.rule, " ".join(event.subjects), "start" if event.starts else "stop", event.at)
+            for event in self.step(now, *observations)
+        ]

@@ -1,0 +1,80 @@
+"""A command on a terminal of its own, and a person who reads and types there."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+from tests.kit.generator import PATIENCE_S
+
+CTRL_C = "\x03"
+_SILENCE_S = 5.0
+
+
+class Dialogue:
+    """``demandops`` with its input, output and errors on a pseudoterminal."""
+
+    def __init__(self, *args: str | Path, folder: Path | None = None, **environment: str) -> None:
+        self.text, self._typed = "", b""
+        self._pid, self._master = pty.fork()
+        if self._pid == 0:
+            os.chdir(folder or Path.cwd())
+            os.environ.update(environment, TERM="xterm", COLUMNS="80", LINES="40", PAGER="cat")
+            command = [sys.executable, "-m", "demandops.cli.main", *map(str, args)]
+            os.execv(sys.executable, command)  # noqa: S606 - no shell is needed
+
+    def __enter__(self) -> Dialogue:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pid:
+            os.kill(self._pid, signal.SIGKILL)
+            os.waitpid(self._pid, 0)
+        os.close(self._master)
+
+    def read_until(self, wanted: str) -> None:
+        """Read what is printed until it has this text."""
+        end = time.monotonic() + PATIENCE_S
+        while wanted not in self.text:
+            assert self._read(end - time.monotonic()), f"no {wanted!r} in:\n{self.text}"
+
+    def type(self, text: str) -> None:
+        """Type on the terminal."""
+        self._typed = text.encode()
+        os.write(self._master, self._typed)
+
+    def end(self) -> int:
+        """Read the rest; return the exit code.
+
+        What was typed is typed again after some seconds of silence, as people do: Python can miss a
+        signal that comes just before it begins to read.
+        """
+        end = time.monotonic() + PATIENCE_S
+        while self._read(_SILENCE_S) or self._runs_silently():
+            assert time.monotonic() < end, f"it has not ended:\n{self.text}"
+        _, status = os.waitpid(self._pid, 0)
+        self._pid = 0
+        return os.waitstatus_to_exitcode(status)
+
+    def _runs_silently(self) -> bool:
+        """Return whether nothing came although it runs; type again then."""
+        if select.select([self._master], [], [], 0)[0]:
+            return self._read(0)
+        os.write(self._master, self._typed)
+        return True
+
+    def _read(self, wait_s: float) -> bool:
+        """Read what is there; return False at the end, or if nothing came in time."""
+        if not select.select([self._master], [], [], max(wait_s, 0))[0]:
+            return False
+        try:
+            part = os.read(self._master, 65536)
+        except OSError:  # Linux: the other end is closed
+            return False
+        self.text += part.decode("utf-8", "replace").replace("\r\n", "\n")
+        return bool(part)

@@ -1,0 +1,114 @@
+"""An API server with the objects that a test puts into it; they can be listed and watched."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from tests.kit.http import running
+
+Item = dict[str, Any]
+
+_BEAT_S = 0.5
+
+
+class KubeApi:
+    """The objects of one cluster, by plural, namespace and name."""
+
+    def __init__(self) -> None:
+        self.url = ""
+        self.closed = False
+        self._changed = threading.Condition()
+        self._items: dict[tuple[str, str, str], Item] = {}
+        self._log: list[tuple[str, str, Item]] = []
+
+    def put(self, plural: str, namespace: str, name: str, status: Item, **more: Any) -> None:
+        """Create or replace an object."""
+        with self._changed:
+            metadata = {"name": name, "namespace": namespace, "generation": 1}
+            metadata |= more.pop("metadata", {})
+            metadata["resourceVersion"] = str(len(self._log) + 1)
+            item = {"metadata": metadata, "status": status, **more}
+            self._items[plural, namespace, name] = item
+            self._log.append((plural, namespace, item))
+            self._changed.notify_all()
+
+    def listed(self, plural: str, namespace: str) -> Item:
+        with self._changed:
+            found = [item for key, item in self._items.items() if key[:2] == (plural, namespace)]
+            return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
+
+    def events(self, plural: str, namespace: str, since: int) -> Iterator[Item]:
+        """Yield each change since a version."""
+        while not self.closed:
+            with self._changed:
+                if len(self._log) == since:
+                    self._changed.wait(_BEAT_S)
+                new, since = self._log[since:], len(self._log)
+            for where, there, item in new:
+                if (where, there) == (plural, namespace):
+                    yield {"type": "MODIFIED", "object": item}
+
+    def flux(self, namespace: str, domain: str, commit: str) -> None:
+        """Say that Flux has applied a commit to an access domain."""
+        revision = f"main@sha1:{commit}"
+        ready = {"type": "Ready", "status": "True"}
+        status = {"lastAppliedRevision": revision, "conditions": [ready]}
+        self.put("kustomizations", namespace, domain, status)
+
+    def service(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
+        """Say that a Helm release is ready, or why it is not."""
+        ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
+        ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"
+        status = {"observedGeneration": 1, "conditions": [ready]}
+        self.put("helmreleases", namespace, name, status)
+
+    def deployment(self, namespace: str, name: str, available: int = 1) -> None:
+        """Say how many of a Deployment's one replica are available."""
+        status = {"observedGeneration": 1, "updatedReplicas": 1, "availableReplicas": available}
+        self.put("deployments", namespace, name, status, spec={"replicas": 1})
+
+
+@contextmanager
+def kube_api() -> Iterator[KubeApi]:
+    """Run an API server for the length of a block."""
+    api = KubeApi()
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Log nothing."""
+
+        def do_GET(self) -> None:
+            address = urlsplit(self.path)
+            *_, namespace, plural = address.path.split("/")
+            query = parse_qs(address.query)
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            if "watch" not in query:
+                body = json.dumps(api.listed(plural, namespace)).encode()
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+                return
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            try:
+                for event in api.events(plural, namespace, int(query["resourceVersion"][0])):
+                    line = json.dumps(event).encode() + b"\n"
+                    self.wfile.write(b"%x\r\n%s\r\n" % (len(line), line))
+                self.wfile.write(b"0\r\n\r\n")
+            except OSError:
+                self.close_connection = True
+
+    try:
+        with running(ThreadingHTTPServer(("127.0.0.1", 0), Handler)) as api.url:
+            yield api
+    finally:
+        api.closed = True

@@ -1,0 +1,134 @@
+"""A fleet in the middle of a day, for tests of the page: something runs, something does not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import yaml
+from demandops.cluster.access import ClusterAccess
+from demandops.service import Generator
+from demandops.staterepo.reader import Reader
+from demandops.web.follower import Follower
+from demandops.web.server import WebServer
+
+from tests.kit import goals
+from tests.kit.generator import book, wait_until
+from tests.kit.goals import Goal
+from tests.kit.http import kubeconfig
+from tests.kit.kube_api import KubeApi, kube_api
+from tests.kit.repo import Person
+
+NAMESPACE = "perception"
+FAILING = "od-edge-vehicle00"
+FAULT = "Helm install failed: container detection: ImagePullBackOff: manifest unknown"
+DENIED = "vehicle03/edge"
+
+OVERRIDES = {
+    "roadworks": """apiVersion: demandops/v1
+kind: Override
+reason: The road is closed until the bridge is mended
+owner: traffic-control
+select: [{connections: [vehicle03/edge]}]
+deny: true
+""",
+    "old": """apiVersion: demandops/v1
+kind: Override
+reason: Left from a demonstration
+owner: Petra Platform
+select: [{services: [gone]}]
+replicas: 2
+""",
+}
+
+
+def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
+    """A demand for detection on a vehicle's point cloud, which lasts as long as its lease."""
+    return {
+        "apiVersion": "demandops/v1",
+        "kind": "Demand",
+        "demand": id,
+        "requesters": [vehicle],
+        "lease": lease,
+        "connections": [
+            {
+                "id": f"{vehicle}/cloud",
+                "type": "mqtt",
+                "source": vehicle,
+                "target": "cloud",
+                "topics": [{"source": f"/vehicles/{vehicle}/ego_data"}],
+            }
+        ],
+    }
+
+
+def released(id: str, vehicle: str) -> Goal:
+    """The end of such a demand."""
+    goal = leased(id, vehicle) | {"operation": "release"}
+    return {key: value for key, value in goal.items() if key not in ("lease", "connections")}
+
+
+@dataclass
+class Story:
+    """The fleet: its state repo, generator and cluster, a person, and the page."""
+
+    bare: Path
+    generator: Generator
+    api: KubeApi
+    person: Person
+    server: WebServer
+    follower: Follower
+
+    @property
+    def url(self) -> str:
+        return self.server.url.rstrip("/")
+
+    def settle(self, *, mended: bool = False) -> None:
+        """Have the cluster apply the newest commit; one release fails, unless it is mended."""
+        commit = str(self.generator.snapshot.commit)
+        since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
+        self.api.flux(NAMESPACE, "perception", commit)
+        for release, target in self.follower.at(commit).moment.targets:
+            if target.by_helm:
+                fault = FAULT if release.name == FAILING and not mended else ""
+                self.api.service(NAMESPACE, release.name, fault, since)
+            else:
+                self.api.deployment(NAMESPACE, release.name)
+
+
+@contextmanager
+def story(bare: Path, folder: Path) -> Iterator[Story]:
+    """Run the fleet and its page for the length of a block."""
+    with ExitStack() as stack:
+        api = stack.enter_context(kube_api())
+        generator = Generator(str(bare), fetch_interval=0.2)
+        stack.callback(generator.close)
+        person = Person(bare, folder / "person")
+        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:4]))
+        book(generator, leased("vehicle01-to-cloud", "vehicle01"))
+        access = ClusterAccess(kubeconfig=kubeconfig(folder, api.url))
+        follower = Follower(Reader.of(str(bare)), {"c-its": access}, 0)
+        server = WebServer("127.0.0.1:0", "--listen", follower)
+        stack.callback(server.close)
+        told = Story(bare, generator, api, person, server, follower)
+        person.override(**OVERRIDES)
+        wait_until(lambda: _denies(generator), "the override is in effect")
+        wait_until(lambda: _is_at(told), "the page has the newest commit")
+        told.settle()
+        wait_until(lambda: _is_seen(told), "the page sees what fails")
+        yield told
+
+
+def _denies(generator: Generator) -> bool:
+    return "roadworks" in generator.snapshot.state.config.overrides
+
+
+def _is_at(told: Story) -> bool:
+    return told.follower.newest.moment.commit == str(told.generator.snapshot.commit)
+
+
+def _is_seen(told: Story) -> bool:
+    return told.follower.newest.status(FAILING).health.failing

@@ -1,0 +1,132 @@
+"""The blocks of a documentation page, and how its commands are run.
+
+A comment before a block says what a test does with it::
+
+    <!-- run -->                  the commands are run, in the order of the page, in one folder
+    <!-- tested by tests/… -->    a test of its own runs the like, or needs a cluster
+    <!-- not run: WHY -->
+
+A block with a title (```yaml title="PATH") is a file that the reader writes. In a `console` block,
+the lines after a command are what it prints. `…` stands for anything, on a line of its own for
+any lines.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import textwrap
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+_TAG = re.compile(r"\s*<!-- (run|tested by [^>]*|not run: [^>]*) -->\s*")
+_FENCE = re.compile(r"(\s*)(`{3,})(\w*)(?: title=\"([^\"]*)\")?\s*")
+_SHELL = ("sh", "bash", "shell", "console")
+_COMMAND = re.compile(
+    r"(?:\$ |\.venv/|\. |(?:[A-Z_]+=\S+ )*(?:"
+    r"apt-get|argocd|cat|cd|chmod|colcon|cp|curl|demandops|docker|export|flux|gh|git|glab|helm|k3d|"
+    r"kubectl|kustomize|make|mkdir|mv|pip|pipx|podman|pytest|python3?|rm|ros2|sed|ssh|ssh-keygen|"
+    r"sudo|systemctl|tar|wget) )"
+)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block of code, with the comment before it."""
+
+    line: int
+    language: str
+    title: str
+    text: str
+    tag: str
+
+    @property
+    def has_commands(self) -> bool:
+        """Whether the reader is to type it."""
+        if self.language:
+            return self.language in _SHELL
+        return any(_COMMAND.match(line) for line in self.text.splitlines())
+
+
+def blocks(markdown: str) -> Iterator[Block]:
+    """Yield the fenced and the indented blocks of a page."""
+    lines = markdown.splitlines()
+    tag, at, blank = "", 0, True
+    while at < len(lines):
+        line = lines[at]
+        fence = _FENCE.fullmatch(line)
+        if told := _TAG.fullmatch(line):
+            tag = told[1]
+        elif fence:
+            end = next(n for n in range(at + 1, len(lines)) if lines[n].strip() == fence[2])
+            body = textwrap.dedent("\n".join(lines[at + 1 : end]))
+            yield Block(at + 1, fence[3], fence[4] or "", body, tag)
+            tag, at = "", end
+        elif blank and line.startswith("    ") and not re.match(r"\s*(?:[-*|]|\d+\.) ", line):
+            end = at
+            while end < len(lines) and (not lines[end].strip() or lines[end].startswith("    ")):
+                end += 1
+            yield Block(at + 1, "", "", textwrap.dedent("\n".join(lines[at:end])).strip(), tag)
+            tag, at = "", end - 1
+        elif line.strip():
+            tag = ""
+        blank = not lines[at].strip() or fence is not None or told is not None
+        at += 1
+
+
+def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
+    """Write the files of a page and run its commands; raise an AssertionError at a difference."""
+    state = folder / ".state"
+    state.write_text(f"cd {folder}\n")
+    for block in blocks(markdown):
+        if block.title:
+            path = folder / block.title
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(f"{block.text}\n")
+        elif block.tag == "run":
+            for command, expected in _commands(block):
+                ran = _ran(command, state, environment)
+                said = f"line {block.line}: {command}\n{ran.stdout}"
+                if expected is None:
+                    assert ran.returncode == 0, said
+                else:
+                    assert _pattern(expected).fullmatch(f"{ran.stdout.rstrip()}\n"), said
+
+
+def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
+    """Yield the commands of a block, and what each prints (None: it must not fail)."""
+    if block.language != "console":
+        yield block.text, None
+        return
+    for part in re.split(r"(?m)^\$ ", block.text)[1:]:
+        command, _, printed = part.partition("\n")
+        yield command, printed.rstrip() or None
+
+
+def _ran(
+    command: str, state: Path, environment: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """Run commands where the last ones ended, with what they exported."""
+    script = (
+        f"set -e\n. {state}\n"
+        f'trap \'{{ printf "cd %q\\n" "$PWD"; export -p; }} >{state}\' EXIT\n{command}\n'
+    )
+    return subprocess.run(
+        ["bash", "-c", script],
+        env=dict(environment),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+
+
+def _pattern(expected: str) -> re.Pattern[str]:
+    """Return the pattern of what is printed. How many spaces separate words does not count."""
+    lines = []
+    for line in expected.splitlines():
+        words = [".*?".join(map(re.escape, word.split("…"))) for word in line.split()]
+        lines.append("(?:.*\\n)*?" if words == [".*?"] else f" *{' +'.join(words)} *\\n")
+    return re.compile("".join(lines))

@@ -1,0 +1,135 @@
+"""Demands that leave the node to the generator, nodes that are full or drained, and waiting.
+
+Once more from what docs/placement.md promises, and nothing of the program is imported. Here each
+such demand has one application of its own, and each of the nodes has room for one. Which of the
+free nodes it gets is left open: ``told`` says which one it got, and that must be a free one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from tests.model import leases
+from tests.model.leases import Goal, Promises, Subject
+
+Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "waits"]
+"""``waits``: it waited already, as it does now."""
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A demand that waits: its turn, whose it is and what it asks for."""
+
+    priority: int
+    since: str
+    who: frozenset[str]
+    goal: Goal
+
+    def turn(self, demand: str) -> tuple[int, str, str]:
+        """Return its place among those that wait."""
+        return -self.priority, self.since, demand
+
+
+@dataclass
+class Places(Promises):
+    """Promises, and what waits for one of the ``nodes``, of which some are ``drained``."""
+
+    nodes: frozenset[str] = frozenset()
+    drained: frozenset[str] = frozenset()
+    waiting: dict[str, Waiting] = field(default_factory=dict)
+    told: Mapping[Subject, str] = field(default_factory=dict)
+
+    def take(self, goal: Goal, now: int, received: str = "") -> Outcome:  # type: ignore[override]
+        """Book, replace, release, renew or let wait as a whole, or refuse as a whole."""
+        demand, who = goal.get("demand", ""), frozenset(goal.get("requesters", ()))
+        waits = self.waiting.get(demand)
+        if waits and goal.get("operation", "put") != "put":
+            if not who & waits.who:
+                return "refused"
+            if goal["operation"] == "renew":
+                return "unchanged"
+            del self.waiting[demand]
+            return "released"
+        if not is_placed(goal) or not who:
+            return super().take(goal, now)
+        standing = self.held.get(demand)
+        if standing is not None:
+            return self._put_again(goal, now, next(iter(standing.items())))
+        if waits and not who & waits.who:
+            return "refused"
+        if self.free():
+            first = min(self.waiting, key=self._turn, default=demand)
+            # only while it is tried in vain may one that waits find room
+            assert first == demand or not self.told, f"{first} waits, but {demand} gets room"
+            return self._place(demand, goal, now)
+        if self.nodes <= self.drained:
+            return "refused"
+        since = waits.since if waits else received
+        self.waiting[demand] = Waiting(goal.get("priority", 0), since, who, goal)
+        return "waits" if self.waiting[demand] == waits else "waiting"
+
+    def _put_again(self, goal: Goal, now: int, held: tuple[Subject, leases.Held]) -> Outcome:
+        """What is on a node that is not drained stays there; else it needs another one."""
+        subject, what = held
+        node = what.what["node"]
+        if not what.requesters & {*goal["requesters"]}:
+            return "refused"
+        if node in self.drained:
+            if not self.free():
+                return "refused"
+            node = self._told(subject)
+        return super().take(_at(goal, node), now)  # type: ignore[return-value]
+
+    def _place(self, demand: str, goal: Goal, now: int) -> Outcome:
+        self.waiting.pop(demand, None)
+        subject = ("applications", goal["applications"][0]["id"])
+        return super().take(_at(goal, self._told(subject)), now)  # type: ignore[return-value]
+
+    def _told(self, subject: Subject) -> str:
+        node = self.told.get(subject) or min(self.free())
+        assert node in self.free(), f"{subject} is placed on {node}, but {self.free()} are free"
+        return node
+
+    def _turn(self, demand: str) -> tuple[int, str, str]:
+        return self.waiting[demand].turn(demand)
+
+    def free(self) -> frozenset[str]:
+        """Return the nodes with room that are not drained."""
+        taken = {
+            held.what.get("node") for subjects in self.held.values() for held in subjects.values()
+        }
+        return self.nodes - self.drained - taken
+
+    def has_room(self, demand: str, now: int) -> None:
+        """Book a demand that waited, at ``now`` at the earliest."""
+        assert demand in self.waiting, f"{demand} is booked, and did not wait"
+        first = min(self.waiting, key=self._turn)
+        assert demand == first, f"{demand} is booked before {first}"
+        assert self._place(demand, self.waiting[demand].goal, now) == "booked"
+
+    def moved(self, demand: str, subject: Subject) -> None:
+        """Move an application off a drained node."""
+        held = self.held[demand][subject]
+        assert held.what["node"] in self.drained, f"{subject} moved off a node that is not drained"
+        self.held[demand][subject] = replace(held, what=held.what | {"node": self._told(subject)})
+
+    def drain(self, node: str, drained: bool) -> None:
+        """Take a node out of service, or back in."""
+        self.drained = self.drained | {node} if drained else self.drained - {node}
+
+    def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:
+        """Return who waits, since when and how urgently."""
+        return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
+
+
+def is_placed(goal: Goal) -> bool:
+    """Return whether a goal leaves the node of its application to the generator."""
+    apps: list[dict[str, Any]] = goal.get("applications", [])
+    return any("place" in app for app in apps)
+
+
+def _at(goal: Goal, node: str) -> Goal:
+    app = {key: value for key, value in goal["applications"][0].items() if key != "place"}
+    return goal | {"applications": [app | {"node": node}]}

@@ -1,0 +1,59 @@
+"""`make release`: what it builds, and that one version is everywhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import demandops
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+NAME = f"demandops-{demandops.__version__}"
+
+
+def test_everything_has_the_same_version() -> None:
+    manifests = (
+        "ros_bridge/ros_package/package.xml",
+        "ros_bridge/interfaces/demandops_interfaces/package.xml",
+    )
+    chart = yaml.safe_load(ROOT.joinpath("deploy/chart/Chart.yaml").read_text())
+    found = {path: _version(path) for path in manifests} | {
+        "the chart": chart["version"],
+        "the chart's app": chart["appVersion"],
+    }
+    assert set(found.values()) == {demandops.__version__}, found
+    assert f'\nversion = "{demandops.__version__}"\n' in ROOT.joinpath("pyproject.toml").read_text()
+
+
+def _version(manifest: str) -> str | None:
+    found = re.search("<version>(.*)</version>", ROOT.joinpath(manifest).read_text())
+    return found and found[1]
+
+
+@pytest.mark.slow
+@pytest.mark.limit(600)
+def test_a_release_is_built_and_tried_in_an_empty_environment(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [str(ROOT / "deploy" / "release"), str(tmp_path)],
+        env=os.environ | {"PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "release: a state repo, a check of it, a demand\nrelease: ready: " in done.stdout
+    assert zipfile.is_zipfile(tmp_path / f"{NAME}-py3-none-any.whl")
+    with tarfile.open(tmp_path / f"{NAME}.tar.gz") as sdist:
+        assert f"{NAME}/pyproject.toml" in sdist.getnames()
+    with tarfile.open(tmp_path / f"{NAME}-docs.tar.gz") as docs:
+        assert {f"{NAME}-docs/index.html", f"{NAME}-docs/generated/commands.html"} <= set(
+            docs.getnames()
+        )
+    subprocess.run(["sha256sum", "--check", "--quiet", f"{NAME}.sha256"], cwd=tmp_path, check=True)

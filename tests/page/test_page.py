@@ -1,0 +1,229 @@
+"""The page in a browser: what a person sees, by mouse, by keyboard, and by a screen reader."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from demandops.staterepo.reader import Reader
+from demandops.web.follower import Follower
+from demandops.web.server import WebServer
+from playwright.sync_api import Browser, expect
+
+from tests.kit.browser import Visit
+from tests.kit.generator import book
+from tests.kit.page_story import FAILING, Story, leased, released
+from tests.page.conftest import FIGURES, Visits
+
+BUILD = Path(__file__).parents[2] / "build" / "page"
+VIEWS = {
+    "not-ready": "/",
+    "map": "/map",
+    "map-of-a-vehicle": "/map?q=vehicle00",
+    "demands": "/demands",
+    "services": "/services",
+    "connections": "/connections",
+    "leases": "/leases",
+    "timeline": "/timeline",
+    "moment": "/timeline?at=HEAD~2",
+    "release": f"/release?name={FAILING}",
+    "demand": "/demand?id=vehicle01-to-cloud",
+    "overrides": "/overrides",
+    "rates": "/rates",
+}
+SERIOUS = ("serious", "critical")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_view_can_be_read_by_anybody(visit: Visits, scheme: str) -> None:
+    """No serious finding of axe-core, nothing wider than the window, no fault in the console."""
+    BUILD.mkdir(parents=True, exist_ok=True)
+    seen = visit(color_scheme=scheme)
+    axe = Axe()
+    for name, path in VIEWS.items():
+        page = seen.open(path)
+        expect(page.locator("main h1")).to_be_visible()
+        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true })")
+        found = axe.run(page).response["violations"]
+        assert [
+            (one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in SERIOUS
+        ] == []
+        seen.open(path).screenshot(path=BUILD / f"{name}-{scheme}.png")
+
+
+def test_every_view_fits_a_phone(visit: Visits) -> None:
+    seen = visit(width=390)
+    for name, path in VIEWS.items():
+        page = seen.open(path)
+        page.screenshot(path=BUILD / f"{name}-phone.png")
+        width = page.evaluate("document.documentElement.scrollWidth")
+        assert width <= 390, f"{path} is {width} wide"
+
+
+def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
+    page = visit().open("/?q=vehicle00")
+    cause = page.locator(".cause").first
+    expect(cause).to_contain_text("object-detection on edge for vehicle00 fails")
+    expect(cause).to_contain_text("manifest unknown")
+    expect(cause.locator("time")).to_have_text(re.compile(r"^1\d min ago$"))
+    expect(cause.locator("dd").first).to_contain_text(
+        "robotkube-object-detection:2025-04: push the image"
+    )
+    expect(cause).to_contain_text("edge/object_detection_fusion")
+
+
+def test_a_commit_is_on_the_page_within_a_second(visit: Visits, fleet: Story) -> None:
+    """The best of three, so that a busy machine does not decide."""
+    page = visit().open("/demands")
+    expect(page.locator("#live")).to_have_text("live")
+    waits = []
+    for number in range(3):
+        book(fleet.generator, leased(f"arrival-{number}", "vehicle02", "40m"))
+        start = time.monotonic()
+        expect(page.locator("main")).to_contain_text(f"arrival-{number}")
+        waits.append(time.monotonic() - start)
+    assert min(waits) < 1.0, waits
+
+
+def test_an_update_keeps_where_a_person_is(visit: Visits, fleet: Story) -> None:
+    page = visit().open("/demands?q=vehicle01")
+    expect(page.locator("#live")).to_have_text("live")
+    link = page.get_by_role("link", name="vehicle01-to-cloud").first
+    link.focus()
+    page.locator("#q").evaluate("(field) => { field.value = 'half typ' }")
+    book(fleet.generator, leased("vehicle01-too", "vehicle01"))
+    expect(page.get_by_role("link", name="vehicle01-too").first).to_be_visible()
+    assert page.evaluate("document.activeElement.textContent") == "vehicle01-to-cloud"
+    assert page.locator("#q").input_value() == "half typ"
+    expect(page.get_by_role("status")).to_have_text("updated")
+
+
+def test_the_filter_works_while_typing_and_links_keep_it(visit: Visits) -> None:
+    page = visit().open("/services")
+    expect(page.locator("tbody tr")).to_have_count(3)
+    page.keyboard.press("/")
+    page.keyboard.type("requester=vehicle03")
+    expect(page.locator("tbody tr")).to_have_count(2)
+    assert page.url.endswith("/services?q=requester%3Dvehicle03")
+    page.get_by_role("navigation", name="Views").get_by_role("link", name="Connections").click()
+    expect(page.locator("tbody tr")).to_have_count(1)
+    assert page.locator("#q").input_value() == "requester=vehicle03"
+
+
+def test_a_keyboard_reaches_everything(visit: Visits) -> None:
+    page = visit().open("/map")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.textContent") == "Skip to the content"
+    page.keyboard.press("Enter")
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        if page.evaluate("document.activeElement.classList.contains('node')"):
+            break
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/services?**")
+
+
+def test_the_map_leads_to_what_is_on_a_node(visit: Visits) -> None:
+    page = visit().open("/map")
+    page.locator(".node", has_text="edge").first.click()
+    page.wait_for_url("**/services?q=node%3Dedge")
+    expect(page.locator("tbody tr")).to_have_count(3)
+
+
+def test_a_dot_of_the_time_line_opens_the_books_of_then(visit: Visits) -> None:
+    page = visit().open("/timeline?lane=demands&span=1h")
+    page.locator("a .dot").first.click()
+    expect(page.locator(".moment")).to_contain_text("The state of")
+    page.get_by_role("navigation", name="Views").get_by_role("link", name="Demands").click()
+    expect(page.locator(".moment")).to_contain_text("The state of")
+    page.get_by_role("link", name="Back to now").click()
+    expect(page.locator(".moment")).to_have_count(0)
+
+
+def test_it_works_without_scripts(visit: Visits) -> None:
+    page = visit(java_script_enabled=False).open("/")
+    expect(page.locator(".cause").first).to_contain_text("manifest unknown")
+    page.get_by_role("link", name="Services").click()
+    page.locator("#q").fill("od-edge-vehicle00")
+    page.locator("#q").press("Enter")
+    expect(page.locator("tbody tr")).to_have_count(1)
+
+
+def test_health_is_live(visit: Visits, fleet: Story) -> None:
+    page = visit().open(f"/release?name={FAILING}")
+    expect(page.locator("h1 .badge")).to_have_text("failing")
+    fleet.settle(mended=True)
+    expect(page.locator("h1 .badge")).to_have_text("healthy")
+    page.goto(f"{fleet.url}/timeline?lane=health&q={FAILING}")
+    expect(page.locator(".events tbody tr").first).to_contain_text("was failing, is healthy")
+    fleet.settle()
+    page.goto(f"{fleet.url}/")
+    expect(page.locator(".cause.bad").first).to_contain_text("manifest unknown")
+
+
+class _Away(BaseHTTPRequestHandler):
+    """What a reverse proxy answers while its server is away."""
+
+    def do_GET(self) -> None:
+        self.send_error(502)
+
+    def log_message(self, *args: object) -> None:
+        pass
+
+
+def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet: Story) -> None:
+    def serve(address: str) -> WebServer:
+        return WebServer(address, "--listen", Follower(Reader.of(str(fleet.bare)), {}, 0))
+
+    server = serve("127.0.0.1:0")
+    visit = Visit(browser, server.url.rstrip("/"))
+    page, address = visit.open("/demands"), urlsplit(server.url).netloc
+    expect(page.locator("#live")).to_have_text("live")
+    server.close()
+    host, port = address.split(":")
+    with ThreadingHTTPServer((host, int(port)), _Away) as proxy:
+        thread = threading.Thread(target=proxy.serve_forever)
+        thread.start()
+        expect(page.locator("#live")).to_have_text("not current: waiting for the server")
+        with page.expect_response(lambda answer: answer.status == 502):
+            pass  # which ends a stream of events for good, as far as the browser is concerned
+        proxy.shutdown()
+        thread.join()
+    book(fleet.generator, leased("meanwhile", "vehicle03"))
+    server = serve(address)
+    expect(page.locator("main")).to_contain_text("meanwhile")
+    visit.close()
+    server.close()
+
+
+def test_a_demand_that_ended_is_not_shown_any_longer(browser: Browser, fleet: Story) -> None:
+    book(fleet.generator, leased("short", "vehicle03"))
+    visit = Visit(browser, fleet.url)
+    page = visit.open("/demand?id=short")
+    expect(page.locator("h1")).to_have_text("Demand short")
+    expect(page.locator("#live")).to_have_text("live")
+    book(fleet.generator, released("short", "vehicle03"))
+    expect(page.locator("h1")).to_have_text("Nothing to show")
+    visit.close()
+
+
+def test_the_figures_of_the_docs_come_from_here(visit: Visits, tmp_path: Path) -> None:
+    for name in ("page", "page-map"):
+        path = {"page": "/", "page-map": "/map?q=vehicle00"}[name]
+        file = tmp_path / f"{name}.png"
+        visit(width=1180).open(path).screenshot(
+            path=file, clip={"x": 0, "y": 0, "width": 1180, "height": 620}
+        )
+        assert file.stat().st_size < 200_000
+        if os.environ.get("FIGURES"):
+            FIGURES.mkdir(exist_ok=True)
+            shutil.copy(file, FIGURES / file.name)
+        assert (FIGURES / file.name).stat().st_size < 200_000

@@ -1,0 +1,218 @@
+"""The event detector as people run it: vehicles publish where they are, the node books demands."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+import yaml
+from demandops import strict_yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rosgraph_msgs.msg import Clock
+
+from examples.experiment import paper
+from tests.kit.detection import POSE
+from tests.kit.generator import wait_until
+from tests.kit.goals import put
+from tests.kit.repo import POLICY, GitRepo, git
+from tests.kit.ros import Served, Servers
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
+STATION = (-5352.679, -3363.067)
+S, V0, V1, V2, V3 = paper.S, paper.V0, paper.V1, paper.V2, paper.V3
+
+
+class Fleet:
+    """Vehicles that publish where they are, ten times a second, while a test waits."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain)
+        self.node = rclpy.create_node("fleet", context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._publishers: dict[str, Any] = {}
+        self._away: dict[str, float] = {}
+        self.statuses: dict[str, Any] = {}
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
+        self._clock = self.node.create_publisher(Clock, "/clock", 10)
+        self._seconds, self.pace = 1000.0, 1.0
+        """The simulated time, and how fast it passes."""
+        self.node.create_timer(0.1, self._publish)
+
+    def _hear(self, message: Any) -> None:
+        self.statuses |= {status.name: status for status in message.status}
+
+    def drive(self, vehicle: str, away: float) -> None:
+        """Move a vehicle to a distance from the station."""
+        if vehicle not in self._publishers:
+            topic = f"/vehicles/{vehicle}/pose"
+            self._publishers[vehicle] = self.node.create_publisher(PoseStamped, topic, 10)
+        self._away[vehicle] = away
+
+    def mute(self, vehicle: str) -> None:
+        del self._away[vehicle]
+
+    def _publish(self) -> None:
+        for vehicle, away in self._away.items():
+            message = PoseStamped()
+            message.pose.position.x, message.pose.position.y = STATION[0] + away, STATION[1]
+            self._publishers[vehicle].publish(message)
+        self._seconds += 0.1 * self.pace
+        message = Clock()
+        message.clock.sec = int(self._seconds)
+        message.clock.nanosec = int(self._seconds % 1 * 1e9)
+        self._clock.publish(message)
+
+    def entities(self) -> str:
+        """Return how many entities the detector has seen."""
+        status = self.statuses.get("demandops_detector: data")
+        return {pair.key: pair.value for pair in status.values}["entities"] if status else ""
+
+    def until(self, true: Callable[[], object], what: str) -> None:
+        """Publish until something holds."""
+        next_look = [0.0]
+
+        def spun() -> object:
+            self._executor.spin_once(timeout_sec=0.05)
+            began = time.monotonic()
+            if began < next_look[0]:
+                return False
+            found = true()
+            took = time.monotonic() - began
+            next_look[0] = time.monotonic() + max(0.2, took)  # it must not stop the vehicles
+            return found
+
+        wait_until(spun, what, 60)
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=1)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+
+
+@pytest.fixture
+def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
+    started = Servers(tmp_path, ros_domain)
+    yield started
+    started.kill()
+
+
+@pytest.fixture
+def fleet(ros_domain: int) -> Iterator[Fleet]:
+    made = Fleet(ros_domain)
+    yield made
+    made.close()
+
+
+def commits(served: Served) -> list[str]:
+    form = "--format=%(trailers:key=Operation,valueonly)"
+    return git(served.state_repo, "log", "--reverse", form, "main").split()
+
+
+def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_paper(
+    servers: Servers, fleet: Fleet, new_repo: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """And a restart of the detector changes none of them. Time is simulated."""
+    served = servers.start(str(new_repo("state.git")))
+
+    def detect() -> Served:
+        simulated = ("--ros-args", "-p", "use_sim_time:=true")
+        return servers.run(served.state_repo, "detect", str(EXAMPLE), *simulated)
+
+    def expect(step: int) -> None:
+        def is_so() -> bool:
+            return paper.observed(served.bookkeeping()) == paper.expected(step)
+
+        fleet.until(is_so, f"the bookkeeping of step {step}")
+
+    detecting = detect()
+    for vehicle in (V0, V1, V2, V3):
+        fleet.drive(vehicle, 85)
+    for step, vehicle in enumerate((V0, V1, V3, V2), start=1):
+        fleet.drive(vehicle, 83)
+        expect(step)
+    fleet.drive(V2, 89)  # it stops at 90 m
+    fleet.drive(V0, 91)
+    expect(5)
+    assert detecting.stop() == 0
+    fleet.mute(V1)  # gone before the detector is back
+    fleet.statuses.clear()
+    detecting = detect()
+    fleet.until(lambda: fleet.entities() == "3", "the others are seen")
+    fleet.pace = 10
+    expect(6)
+    assert "demands booked before the start: 3" in detecting.log.read_text()
+    fleet.drive(V2, 91)
+    expect(7)
+    fleet.mute(V3)
+    expect(8)
+    assert detecting.stop() == 0
+    log = detecting.log.read_text()
+    assert "vehicle01 was not seen since the start" in log
+    assert "vehicle03 is silent for 5 s" in log
+    assert commits(served) == ["init", *["join"] * 4, *["shutdown"] * 4]
+
+
+def rules_of(**fields: Any) -> str:
+    """Rules by which each vehicle near the station demands an application."""
+    goal = put("near/{entity}", "{entity}", topic=("/vehicles/{entity}/ego_data", "{entity}"))
+    demand = {name: value for name, value in goal.items() if name != "kind"}
+    demand["applications"][0]["id"] = "edge/near-{entity}"
+    near = {"point": {"x": STATION[0], "y": STATION[1]}, "start": 84, "stop": 90}
+    rule = {"name": "near", "near": {"source": "vehicles", **near}, "demand": demand}
+    return strict_yaml.dump(
+        {
+            "apiVersion": "demandops/v1",
+            "kind": "DetectorRules",
+            "sources": {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE}},
+            "rules": [rule | {"retry": "1s"} | fields],
+        }
+    )
+
+
+def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried_again(
+    servers: Servers, fleet: Fleet, new_repo: Callable[[str], Path], tmp_path: Path
+) -> None:
+    bare = new_repo("state.git")
+    policy = yaml.safe_load(GitRepo(bare).files(POLICY)[POLICY])
+    policy["domains"][0]["leases"] = {"default": "2s", "slack": "0s"}
+    GitRepo(bare).commit({POLICY: yaml.safe_dump(policy)})
+    served = servers.start(str(bare))
+    rules = tmp_path / "rules.yaml"
+    rules.write_text(rules_of().replace("node: edge", "node: egde"))
+    detecting = servers.run(served.state_repo, "detect", str(rules))
+
+    def status(part: str) -> Any:
+        return fleet.statuses.get(f"demandops_detector: {part}")
+
+    fleet.drive(V0, 50)
+    fleet.until(lambda: "unknown-node" in detecting.log.read_text(), "the demand is refused")
+    fleet.until(lambda: served.log.read_text().count("unknown-node") > 2, "it is tried again")
+    assert detecting.log.read_text().count("unknown-node") == 1, "it is logged once"
+    fleet.until(
+        lambda: "failed and are tried again" in status("demands").message, "it is on /diagnostics"
+    )
+    rules.write_text(rules_of(near={"source": "vehicle"}))
+    fleet.until(lambda: status("rules").level == b"\x01", "an invalid file is reported")
+    assert (
+        "rules.yaml:9: rules[0].near.stop: is missing; add it; the last valid"
+        in detecting.log.read_text()
+    )
+    rules.write_text(rules_of())
+    books = "edge/near-vehicle00"
+    fleet.until(lambda: books in json.dumps(served.bookkeeping()), "the new rules are in effect")
+    fleet.until(lambda: commits(served).count("renew") >= 3, "its lease is renewed")
+    assert books in json.dumps(served.bookkeeping())
+    detecting.process.send_signal(signal.SIGKILL)
+    detecting.process.wait(10)
+    fleet.until(lambda: commits(served)[-1] == "expire", "its lease ends without the detector")
+    assert served.bookkeeping()["services"] == {}

@@ -1,0 +1,164 @@
+"""`demandops parameter-sync`: a running node follows a ConfigMap, by a watch."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from queue import Empty, Queue
+
+import pytest
+from demandops.errors import InvalidInput
+from demandops_ros.parameter_sync.parameter_file import parameters_of
+from rclpy.parameter import Parameter
+
+from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.ros import Client
+
+TARGET = "of_edge_fusion"
+FILE = """
+of_edge_fusion:
+  ros__parameters:
+    additional_inputs: {{topics_objectlist: {topics}, length: 0}}
+"""
+DONE = f"set 2 parameters of /{TARGET}"
+FILE_NAME = "ConfigMap perception/of-params params.yml"
+
+
+class Cluster:
+    """An API server with one ConfigMap, which answers a watch when the ConfigMap changes."""
+
+    def __init__(self) -> None:
+        self.item = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {}}
+        self.changes: Queue[int] = Queue()
+        self.reads = 0
+
+    def hold(self, *topics: str, text: str = "") -> None:
+        self.item["data"] = {"params.yml": text or FILE.format(topics=list(topics))}
+        self.changes.put(1)
+
+    def answer(self, call: Call) -> Answer:
+        assert call.path.startswith("/api/v1/namespaces/perception/configmaps?")
+        assert "fieldSelector=metadata.name%3Dof-params" in call.path
+        if "watch=" not in call.path:
+            self.reads += 1
+            listed = {"metadata": {"resourceVersion": "1"}, "items": [self.item]}
+            return Answer.json({"kind": "ConfigMapList", "apiVersion": "v1", **listed})
+        try:
+            self.changes.get(timeout=10)
+        except Empty:
+            return Answer.json({})
+        return Answer.json({"type": "MODIFIED", "object": self.item})
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    made = Cluster()
+    with serving(made.answer) as server:
+        kubeconfig(tmp_path, server.url)
+        yield made
+        made.changes.put(0)
+
+
+Start = Callable[..., "subprocess.Popen[bytes]"]
+
+
+@pytest.fixture
+def start(tmp_path: Path, ros_domain: int) -> Iterator[Start]:
+    """Start a Python module with a log; its end is the test's."""
+    environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain), "PYTHONFAULTHANDLER": "1"}
+    with ExitStack() as stack:
+
+        def run(module: str, *arguments: str) -> subprocess.Popen[bytes]:
+            log = stack.enter_context((tmp_path / f"{module}.log").open("ab"))
+            command = [sys.executable, "-m", module, *arguments]
+            process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+            stack.callback(lambda: (process.kill(), process.wait(10)))
+            return process
+
+        yield run
+
+
+def start_sync(start: Start, folder: Path) -> subprocess.Popen[bytes]:
+    given = {"configmap_name": "of-params", "namespace": "perception", "target_ros_node": TARGET}
+    parameters = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
+    config = str(folder / "kubeconfig")
+    options = ["parameter-sync", "--kubeconfig", config, "--ros-args", *parameters]
+    return start("demandops.cli.main", *options)
+
+
+def start_fusion(start: Start) -> subprocess.Popen[bytes]:
+    names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
+    topics = [f"{name}_topic:=/{name}" for name in names]
+    arguments = ["object_fusion", "fusion_function_launch.py", f"node_name:={TARGET}", *topics]
+    return start("tests.experiment.standins", "launch", *arguments)
+
+
+def read_by_the_fusion(client: Client) -> set[str]:
+    names = client.node.get_node_names()
+    if TARGET not in names:
+        return set()
+    topics = client.node.get_subscriber_names_and_types_by_node(TARGET, "/")
+    return {name for name, _ in topics} - {"/raw_object_lists"}
+
+
+def test_a_node_follows_without_a_restart_and_after_one(
+    cluster: Cluster, start: Start, client: Client, tmp_path: Path
+) -> None:
+    cluster.hold("/a", "/b")
+    fusion = start_fusion(start)
+    sync = start_sync(start, tmp_path)
+    client.wait(lambda: read_by_the_fusion(client) == {"/a", "/b"})
+    cluster.hold("/b", "/c")
+    client.wait(lambda: read_by_the_fusion(client) == {"/b", "/c"})
+    assert cluster.reads <= 3  # it watches: it does not read again and again
+    log = tmp_path / "demandops.cli.main.log"
+    cluster.hold(text="of_edge_fusion: 5")
+    fault = f"{FILE_NAME}: of_edge_fusion.ros__parameters: must be a mapping"
+    client.wait(lambda: f"{fault}; {TARGET} keeps its parameters" in log.read_text())
+    cluster.hold("")
+    client.wait(lambda: read_by_the_fusion(client) == set())
+    times = log.read_text().count(DONE)
+    assert fusion.poll() is None
+    fusion.kill()
+    start_fusion(start)
+    client.wait(lambda: log.read_text().count(DONE) > times)
+    sync.terminate()
+    assert sync.wait(10) == 0, log.read_text()
+
+
+def test_parameters_have_dotted_names_and_a_node_overrides_all_nodes() -> None:
+    text = "/**: {ros__parameters: {a: 1, b: {c: 2}}}\n/node: {ros__parameters: {b: {c: [x]}}}\n"
+    assert parameters_of("node", text, "f") == {"a": 1, "b.c": ["x"]}
+    assert Parameter("b.c", value=["x"]).type_ is Parameter.Type.STRING_ARRAY
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- 1", "f: must map nodes to their parameters"),
+        ("other: {}", "f: node: has no parameters of the node; write node: {ros__parameters: …}"),
+        ("node: {}", "f: node.ros__parameters: must be a mapping"),
+    ],
+)
+def test_a_file_that_gives_a_node_nothing_is_refused(text: str, message: str) -> None:
+    with pytest.raises(InvalidInput) as refused:
+        parameters_of("/node", text, "f")
+    assert str(refused.value) == message
+
+
+def test_a_kubeconfig_that_is_none_is_refused(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "kubeconfig").write_text("kind: Config")
+    assert start_sync(start, tmp_path).wait(30) == 1
+    log = (tmp_path / "demandops.cli.main.log").read_text()
+    assert f"error: {tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con" in log
+
+
+def test_what_is_not_set_is_named(start: Start, tmp_path: Path) -> None:
+    process = start("demandops.cli.main", "parameter-sync")
+    assert process.wait(30) == 2
+    log = (tmp_path / "demandops.cli.main.log").read_text()
+    assert "parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE" in log

@@ -1,0 +1,149 @@
+"""Rules on recorded bags: the demands are those that a plain script over the same poses gives."""
+
+from __future__ import annotations
+
+import json
+import random
+from math import cos, hypot, sin
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy
+import pytest
+import yaml
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tests.kit.bag import write_bag
+from tests.kit.cli import Run
+from tests.kit.detection import POSE
+from tests.kit.goals import EXPERIMENT
+
+RULES = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
+STATION = (-5352.679, -3363.067)
+VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
+START_S = 1_700_000_000
+Poses = list[tuple[float, str, float, float]]
+
+
+def driven(seed: int) -> Poses:
+    """Vehicles on lines past the station, ten poses a second; some are silent for a while."""
+    chance, poses = random.Random(seed), []
+    for vehicle in VEHICLES:
+        heading, beside = chance.uniform(0, 6.28), chance.uniform(-90, 90)
+        speed, first = chance.uniform(8, 20), chance.uniform(0, 15)
+        silent_from, silent_for = chance.uniform(5, 40), chance.choice([0, 3, 8, 60])
+        for tick in range(400):
+            time = first + tick / 10
+            if silent_from <= time < silent_from + silent_for:
+                continue
+            along = speed * (time - first) - 250
+            x = STATION[0] + along * cos(heading) - beside * sin(heading)
+            y = STATION[1] + along * sin(heading) + beside * cos(heading)
+            poses.append((time, vehicle, x, y))
+    return sorted(poses)
+
+
+def record(path: Path, poses: Poses, plugin: StoragePlugin) -> None:
+    later = ((START_S + time, vehicle, x, y) for time, vehicle, x, y in poses)
+    write_bag(path, later, plugin, [(START_S, "/vehicles/tram/pose", "ding")])
+
+
+def plainly(poses: Poses) -> list[tuple[float, str, str]]:
+    """When each vehicle comes and goes, by the rule alone: 84 m, 90 m, 5 s of silence."""
+    found, end = [], poses[-1][0]
+    for vehicle in VEHICLES:
+        is_near, heard = False, 0.0
+        for time, _, x, y in [pose for pose in poses if pose[1] == vehicle]:
+            away = hypot(x - STATION[0], y - STATION[1])
+            if is_near and time - heard >= 5:
+                found.append((heard + 5, vehicle, "stop"))
+                is_near = False
+            if not is_near and away <= 84:
+                found.append((time, vehicle, "start"))
+                is_near = True
+            elif is_near and away > 90:
+                found.append((time, vehicle, "stop"))
+                is_near = False
+            heard = time
+        if is_near and end - heard >= 5:
+            found.append((heard + 5, vehicle, "stop"))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_bag_gives_the_demands_of_a_plain_script(
+    demandops: Run, tmp_path: Path, seed: int, plugin: StoragePlugin
+) -> None:
+    poses, plot = driven(seed), tmp_path / "plot.svg"
+    record(tmp_path / "bag", poses, plugin)
+    ran = demandops(
+        "detect", RULES, "--replay", tmp_path / "bag", "--plot", plot, "--output", "json"
+    )
+    assert ran.code == 0
+    assert ran.err == (
+        "warning: /vehicles/tram/pose has the type std_msgs/msg/String, and is not read\n"
+    )
+    data = ran.json()
+    told = [(one["second"], one["entities"][0], one["change"]) for one in data["events"]]
+    expected = plainly(poses)
+    assert [(who, change) for _, who, change in told] == [(w, c) for _, w, c in expected]
+    assert [one[0] for one in told] == pytest.approx([time for time, *_ in expected], abs=0.002)
+    assert data["messages"] == len(poses)
+    joins: dict[str, Any] = {}
+    for file in EXPERIMENT[:4]:
+        goal = yaml.safe_load(file.read_text())
+        joins[goal["connections"][0]["source_node_id"]] = {**goal, "shutdown": False}
+    for one in data["events"]:
+        if one["change"] == "start":
+            assert {**one["goal"], "shutdown": False} == joins[one["entities"][0]]
+    drawn = ElementTree.parse(plot).getroot()  # noqa: S314
+    bars = drawn.findall("{*}rect")[1:]
+    assert len(bars) == sum(change == "start" for _, _, change in expected)
+
+
+EGO = "perception_msgs/msg/EgoData"
+EGO_FIELDS = "std_msgs/Header header\nperception_msgs/ObjectState state\n"
+STATE_FIELDS = "string model\nfloat64[] continuous_state\n"
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
+    demandops: Run, tmp_path: Path, plugin: StoragePlugin
+) -> None:
+    """Their package is not installed; only the fields that the detector reads are as they are."""
+    types = get_typestore(Stores.ROS2_KILTED)
+    types.register(get_types_from_msg(STATE_FIELDS, "perception_msgs/msg/ObjectState"))
+    types.register(get_types_from_msg(EGO_FIELDS, EGO))
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        topic = writer.add_connection("/vehicles/vehicle01/pose", EGO, typestore=types)
+        for tick, away in enumerate((100.0, 80.0, 89.0, 95.0)):
+            place = numpy.array([STATION[0] + away, STATION[1], 0.0])
+            state = types.types["perception_msgs/msg/ObjectState"]("ego", place)
+            stamp = types.types["builtin_interfaces/msg/Time"](0, 0)
+            ego = types.types[EGO](types.types["std_msgs/msg/Header"](stamp, "map"), state)
+            writer.write(topic, (START_S + tick) * 10**9, types.serialize_cdr(ego, EGO))
+    rules = tmp_path / "rules.yaml"
+    rules.write_text(RULES.read_text().replace(POSE, EGO))
+    ran = demandops("detect", rules, "--replay", tmp_path / "bag", "--output", "json")
+    told = [(one["second"], one["entities"], one["change"]) for one in ran.json()["events"]]
+    assert told == [(1.0, ["vehicle01"], "start"), (3.0, ["vehicle01"], "stop")]
+
+
+def test_what_is_no_bag_or_has_no_topic_of_the_rules_is_refused(
+    demandops: Run, tmp_path: Path
+) -> None:
+    ran = demandops("detect", RULES, "--replay", tmp_path)
+    assert ran.code == 1
+    assert ran.err.startswith(f"error: {tmp_path}: is not a bag that can be read: ")
+    record(tmp_path / "bag", [(0.0, "vehicle00", 0.0, 0.0)], StoragePlugin.MCAP)
+    rules = tmp_path / "rules.yaml"
+    rules.write_text(RULES.read_text().replace("/vehicles/{", "/cars/{"))
+    ran = demandops("detect", rules, "--replay", tmp_path / "bag", "--output", "json")
+    (fault,) = json.loads(ran.out)["faults"]
+    assert fault["message"].startswith(
+        "has no topic that the rules read: /cars/{entity}/pose (geometry_msgs/msg/PoseStamped); "
+        "it has /vehicles/tram/pose (std_msgs/msg/String), "
+    )

@@ -1,0 +1,54 @@
+"""Commands on a real pseudoterminal: questions, and what is shown while git is slow."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from tests.kit.dialogue import CTRL_C, Dialogue
+from tests.kit.http import kubeconfig
+from tests.kit.repo import GitRepo
+
+
+def test_what_is_not_given_is_asked_for(checkout: Path) -> None:
+    with Dialogue("new", "application", "tracking", folder=checkout) as talk:
+        talk.read_until("Inputs (role=type, separated by spaces): ")
+        talk.type("camera=sensor_msgs/msg/Image\n")
+        talk.read_until("Services (name=package/file, separated by spaces): ")
+        talk.type("tracker=tracking/tracker.launch.py\n")
+        talk.read_until("Image, with a tag or digest: ")
+        talk.type("ghcr.io/me/tracking:1.0\n")
+        assert talk.end() == 0, talk.text
+    assert "to check it: demandops check" in talk.text
+    assert (checkout / "appdefs" / "tracking" / "values" / "tracker.yaml.j2").is_file()
+
+
+def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) -> None:
+    config = tmp_path / "gitconfig"
+    config.write_text('[remote "origin"]\n\tuploadpack = sleep 1.5 && git-upload-pack\n')
+    url = state.path.as_uri()
+    get = ("get", "demands", "-o", "name", "--state-repo", url)
+    with Dialogue(*get, folder=tmp_path, GIT_CONFIG_GLOBAL=str(config)) as talk:
+        assert talk.end() == 0, talk.text
+    shown, _, after = talk.text.rpartition("\x1b[2K")
+    assert f"fetching {url}, 1 s" in shown
+    assert "fetching" not in after
+    assert not after.strip(), "nothing is demanded"
+
+
+def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c(
+    state: GitRepo, tmp_path: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        config = kubeconfig(tmp_path, f"http://127.0.0.1:{silent.getsockname()[1]}")
+        clusters = tmp_path / "clusters.yaml"
+        clusters.write_text(
+            "apiVersion: demandops/v1\nkind: ClusterAccess\n"
+            f"clusters: {{c-its: {{kubeconfig: {config}}}}}\n"
+        )
+        asked = ("status", "--state-repo", state.path, "--clusters", clusters)
+        with Dialogue(*asked) as talk:
+            talk.read_until("asking the clusters, 1 s")
+            talk.type(CTRL_C)
+            assert talk.end() == 130, talk.text
+    assert talk.text.endswith("\ninterrupted\n")

@@ -1,0 +1,95 @@
+"""Each command at 80 columns, as ``tests/terminal/expected`` has it; no name is ever cut."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import jsonschema_rs
+import pytest
+import yaml
+from demandops.cli import main
+
+from tests.kit.cli import Run
+from tests.terminal.outputs import (
+    COMMANDS,
+    FOLDER,
+    NOT_SHOWN,
+    file_of,
+    make_fleet,
+    printed,
+    same_ids,
+)
+
+SCHEMA = yaml.safe_load((Path(__file__).parents[2] / "docs" / "json.schema.yaml").read_text())
+
+
+@pytest.fixture(scope="module")
+def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPatch]:
+    """The fleet, made once: the commands leave it as it is."""
+    with pytest.MonkeyPatch.context() as made:
+        folder = tmp_path_factory.mktemp("fleet")
+        made.setenv("DEMANDOPS_DATA_HOME", str(folder / "home"))
+        make_fleet(folder, made)
+        yield made
+
+
+@pytest.fixture(autouse=True)
+def _home(data_home: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Give each test the journals of the fleet, not its own."""
+    with pytest.MonkeyPatch.context() as made:
+        made.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
+        yield
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_it_prints_what_it_printed(command: str, patch: pytest.MonkeyPatch) -> None:
+    assert printed(command, patch) == file_of(command).read_text(), "make golden; review the diff"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch) -> None:
+    """Each word on the terminal is one of the same output in a pipe, where nothing is left out."""
+    lines = file_of(command).read_text().splitlines()
+    wider = [line for line in lines if line.startswith("more columns in a wider terminal: ")]
+    piped = {*words(same_ids(demandops(*shlex.split(command)).out)), *words(" ".join(wider))}
+    assert [word for line in lines for word in words(line) if word not in piped] == []
+    if command.startswith("get ") and not command.endswith("-o wide"):
+        assert max(map(len, lines)) <= 80
+
+
+def words(text: str) -> list[str]:
+    """Return the words of a text, without the commas between them."""
+    return [word.strip(",") for word in text.split()]
+
+
+def test_every_command_is_shown_or_says_why_not() -> None:
+    shown = {command.split()[0] for command in COMMANDS}
+    assert shown | NOT_SHOWN.keys() == main.COMMANDS.keys()
+    assert shown & NOT_SHOWN.keys() == set()
+    assert {path.name for path in FOLDER.iterdir()} == {file_of(each).name for each in COMMANDS}
+
+
+def schema_of(command: str) -> str:
+    """Return the name of a command's schema: its own, with that of a subcommand."""
+    words = command.split()
+    return "-".join(words[: 2 if words[0] in ("config", "override") else 1])
+
+
+@pytest.mark.parametrize(
+    "command", [*(one for one in COMMANDS if one != "schema"), "config list", "version"]
+)
+def test_its_json_is_as_the_schema_says(
+    demandops: Run, command: str, patch: pytest.MonkeyPatch
+) -> None:
+    made = demandops(*shlex.split(command.replace("-o wide", "")), "-o", "json")
+    schema = SCHEMA | {"$ref": f"#/$defs/{schema_of(command)}"}
+    validator = jsonschema_rs.validator_for(schema)
+    found = validator.iter_errors(made.json())
+    assert [f"{error.instance_path}: {error.message}" for error in found] == []
+
+
+def test_every_schema_is_that_of_a_command_or_of_a_thing_in_one() -> None:
+    commands = {schema_of(command) for command in COMMANDS} | {"config-list", "version"}
+    assert commands - {"schema"} <= SCHEMA["$defs"].keys()

@@ -1,0 +1,29 @@
+"""``make golden``: write what each command prints anew. Review the diff before you commit it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from tests.terminal.outputs import COMMANDS, FOLDER, file_of, make_fleet, printed
+
+
+def main() -> None:
+    """Write the output of every command."""
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    FOLDER.mkdir()
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(Path(folder) / "home"))
+        make_fleet(Path(folder), patch)
+        for command in COMMANDS:
+            file_of(command).write_text(printed(command, patch))
+        os.chdir(FOLDER)
+    print(f"terminal: {len(COMMANDS)} files")
+
+
+if __name__ == "__main__":
+    main()

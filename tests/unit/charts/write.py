@@ -1,0 +1,55 @@
+"""Writes what follows from other files of the charts: their schemas, and tables in READMEs.
+
+Run ``python -m tests.unit.charts.write`` and review the diff.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import yaml
+from demandops.charts import chart_schema, values_table
+
+ROOT = Path(__file__).parents[3]
+LIBRARY = ROOT / "appdefs" / "charts" / "ros-service"
+CHARTS = [
+    path.parent
+    for top in ("appdefs", "examples")
+    for path in sorted((ROOT / top).rglob("Chart.yaml"))
+    if path.parent != LIBRARY
+]
+
+
+def schema(chart: Path) -> str:
+    """Return the text that the schema of a chart should have, by its own part of it."""
+    known = json.loads((chart / "values.schema.json").read_text())
+    library = json.loads((LIBRARY / "values.schema.json").read_text())
+    own = chart_schema.own_properties(known, library)
+    values, shared = ((each / "values.yaml").read_text() for each in (chart, LIBRARY))
+    data = chart_schema.composed(known["title"], own, values, library, shared)
+    return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+
+
+def readme(chart: Path) -> str:
+    """Return the text that the README of a chart should have, with its table of values."""
+    text = (chart / "README.md").read_text()
+    values = (chart / "values.yaml").read_text()
+    root = f"exports.{chart_schema.EXPORT}" if chart == LIBRARY else ""
+    metadata = yaml.safe_load((chart / "Chart.yaml").read_text())
+    assert text.startswith(f"# {metadata['name']}\n\n{metadata['description']}\n")
+    return re.sub(
+        r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: values_table.table(values, root), text
+    )
+
+
+def main() -> None:
+    for chart in CHARTS:
+        (chart / "values.schema.json").write_text(schema(chart))
+    for chart in (LIBRARY, *CHARTS):
+        (chart / "README.md").write_text(readme(chart))
+
+
+if __name__ == "__main__":
+    main()

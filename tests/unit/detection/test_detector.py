@@ -1,0 +1,117 @@
+"""The detector goes on after a restart and with other rules: nothing ends and starts again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from demandops.detection.booked_events import booked_events
+from demandops.detection.detector import Detector
+from demandops.detection.events.detection_state import Key
+
+from tests.kit.detection import at, demand, file_of, rule
+
+NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
+REQUEST = {
+    "id": "station/perception",
+    "connections": [{"id": "{entity}/edge", "requester_ids": ["{entity}", "station"]}],
+}
+RULES = [
+    rule("joins", near=NEAR, deploymentRequest=REQUEST, entities=["car*"]),
+    rule("puts", near=NEAR, entities=["bus*"]),
+    rule("pair", together={"source": "cars", "start": 5, "stop": 8}),
+    rule(
+        "full",
+        count={"source": "cars", "point": {"x": 0, "y": 0}, "radius": 9, "start": 2, "stop": 1},
+    ),
+    rule(
+        "there",
+        near=NEAR,
+        demand=demand(demand="at/{entity}", positions=[{"node": "n", "x": "{x}"}]),
+    ),
+]
+
+
+def entry(*requesters: str, request: str = "", joined: bool = False) -> dict[str, Any]:
+    action = "DeploymentRequest" if joined else "Demand"
+    return {"action": action, "request": request, "requesters": sorted(requesters)}
+
+
+def test_the_booked_demands_of_rules_are_told_from_all_others() -> None:
+    books = {
+        "demands": {
+            "f00d": entry("station", "car7", request="station/perception", joined=True),
+            "f01d": entry("station", "tram", request="station/perception", joined=True),
+            "f02d": entry("car8", request="station/perception", joined=True),
+            "f03d": entry("station", "car7", request="other", joined=True),
+            "puts/bus1": entry("r"),
+            "puts/car1": entry("r"),
+            "puts/bus1/x": entry("r"),
+            "pair/a/b": entry("r"),
+            "full": entry("r"),
+            "at/car9": entry("car9"),
+            "at/car8": entry("car9"),
+        },
+        "waiting": [{"demand": "puts/bus2", "requesters": ["r"], "since": "", "priority": 0}],
+    }
+    booked = booked_events(file_of(*RULES), books)
+    assert {key: goal.id for key, goal in booked.items()} == {
+        ("joins", ("car7",)): "station/perception",
+        ("puts", ("bus1",)): "puts/bus1",
+        ("puts", ("bus2",)): "puts/bus2",
+        ("pair", ("a", "b")): "pair/a/b",
+        ("full", ()): "full",
+        ("there", ("car9",)): "at/car9",
+    }
+    assert booked["there", ("car9",)].ended().data == {
+        "demand": "at/car9",
+        "requesters": ["car9"],
+        "operation": "release",
+    }
+    assert booked_events(file_of(*RULES), {"services": {}}) == {}
+
+
+def started(*rules: dict[str, Any]) -> Detector:
+    detector = Detector(file_of(*rules), 0)
+    detector.step([at(1, "car1", 80)], 1)
+    return detector
+
+
+def changes(detector: Detector, *rules: dict[str, Any]) -> dict[Key, Any]:
+    wants = detector.replace_rules(file_of(*rules), 2, 5)
+    return {want.key: want.goal and want.goal.data for want in wants}
+
+
+def test_events_last_if_the_rules_are_replaced_by_the_same() -> None:
+    detector = started(rule("a", near=NEAR))
+    assert changes(detector, rule("b", near=NEAR), rule("a", near=NEAR)) == {}
+    assert [event.rule for event, _ in detector.step([at(3, "car1", 85)], 3)] == []
+    assert [event.rule for event, _ in detector.step([at(4, "car1", 91)], 4)] == ["a"]
+
+
+def test_the_demands_of_a_rule_that_is_gone_or_for_others_end() -> None:
+    assert changes(started(rule("a", near=NEAR))) == {("a", ("car1",)): None}
+    others = rule("a", near=NEAR, entities=["bus*"])
+    assert changes(started(rule("a", near=NEAR)), others) == {("a", ("car1",)): None}
+
+
+def test_a_changed_demand_is_wanted_with_the_values_of_the_events_start() -> None:
+    positions = [{"node": "n", "x": "{x}"}]
+    detector = started(rule("a", near=NEAR))
+    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=positions))
+    assert changes(detector, changed) == {
+        ("a", ("car1",)): {
+            "demand": "car1",
+            "requesters": ["car1"],
+            "positions": [{"node": "n", "x": 80}],
+        }
+    }
+
+
+def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:
+    detector = Detector(file_of(*RULES), 0)
+    booked = booked_events(file_of(*RULES), {"demands": {"puts/bus1": entry("r")}})
+    (want,) = detector.resume(booked, 0, 5)
+    assert want.goal is not None and want.goal.id == "puts/bus1"
+    assert detector.step([], 4.9) == []
+    ((event, want),) = detector.step([], 5)
+    assert (event.why, want.goal) == ("bus1 was not seen since the start", None)

@@ -1,0 +1,158 @@
+"""A file of rules: each mistake is told with its line, its field and how to mend it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jsonschema_rs
+import pytest
+import yaml
+from demandops.cli.repo import schema
+from demandops.detection.rules import rule_file
+from demandops.errors import InvalidInput
+
+from tests.kit.detection import demand, rule, text_of
+
+ROOT = Path(__file__).parents[3]
+NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
+REQUEST: dict[str, Any] = {
+    "id": "r",
+    "connections": [{"requester_ids": ["{entity}"], "source_node_id": "{entity}"}],
+}
+
+
+def faults(text: str) -> list[str]:
+    with pytest.raises(InvalidInput) as caught:
+        rule_file.read(text, "rules.yaml")
+    return [str(one) for one in caught.value.faults]
+
+
+@pytest.mark.parametrize(
+    ("mistake", "told"),
+    [
+        (
+            rule("a", near={**NEAR, "stop": 84}),
+            "rules.yaml:21: rules[0].near: stop 84 must be above start 84: between them nothing "
+            "changes, so that an entity on the edge does not start and stop again and again",
+        ),
+        (
+            rule("a", near={**NEAR, "source": "car"}),
+            "rules.yaml:22: rules[0].near.source: 'car' is not in sources; did you mean 'cars'?",
+        ),
+        (
+            rule("a", near={**NEAR, "source": "batteries"}),
+            "rules.yaml:22: rules[0].near.source: 'batteries' has no position; name its fields in "
+            "sources.batteries.x and y",
+        ),
+        (
+            rule("a", near=NEAR, count=None, threshold={"source": "cars", "field": "x..y"}),
+            "rules.yaml:31: rules[0].threshold.field: 'x..y' is not a field; write it like "
+            "pose.position.x or ranges[0]",
+        ),
+        (
+            rule("a"),
+            "rules.yaml:16: rules[0]: needs one of near, together, count, threshold, schedule",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(demand="{entiti}")),
+            "rules.yaml:18: rules[0].demand.demand: '{entiti}' has no value in this rule; did you "
+            "mean 'entity'?",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(demand="{entity", lease="1 day")),
+            "rules.yaml:18: rules[0].demand.demand: has a single '{'; write '{{' for one brace",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(lease="1 day")),
+            "rules.yaml:21: rules[0].demand.lease: '1 day' is not a duration; write one like 90s, "
+            "10m, 1h30m or 2d",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(demand="{rule}")),
+            "rules.yaml:18: rules[0].demand.demand: must name {entity}: or two events would share "
+            "one demand",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(demand="{entity}/{x}")),
+            "rules.yaml:18: rules[0].demand.demand: '{x}' changes; an id must stay the same",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(operation="release")),
+            "rules.yaml:21: rules[0].demand.operation: is set by the detector; remove it",
+        ),
+        (
+            rule("a", near=NEAR, deploymentRequest={**REQUEST, "shutdown": True}),
+            "rules.yaml:30: rules[0].deploymentRequest.shutdown: is set by the detector; remove it",
+        ),
+        (
+            rule(
+                "a",
+                near=NEAR,
+                deploymentRequest={"id": "r", "connections": [{"requester_ids": ["s"]}]},
+            ),
+            "rules.yaml:27: rules[0].deploymentRequest.connections[0].requester_ids: must name "
+            "{entity}: a shutdown finds its claims by their requesters",
+        ),
+    ],
+)
+def test_a_mistake_is_told_with_its_line(mistake: dict[str, Any], told: str) -> None:
+    assert told in faults(text_of(mistake))
+
+
+def test_mistakes_of_sources_are_told_together() -> None:
+    sources = {
+        "a": {"topic": "/a/pose", "type": "geometry_msgs/msg/PoseStamped"},
+        "b": {"topic": "b/{entity}", "type": "PoseStamped"},
+        "c": {"topic": "/c/{entity}/{entity}", "type": "p/msg/M", "x": "x"},
+        "d": {"topic": "/d/{entity}", "type": "p/msg/M", "timeout": "0s"},
+    }
+    assert faults(text_of(rule("r", near={**NEAR, "source": "a"}), sources=sources)) == [
+        "rules.yaml:4: sources.a: needs the name of the entity once: {entity} as a part of topic, "
+        "or the field with it in entity",
+        "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
+        "letters, digits and '_' between single '/', no part starting with a digit",
+        "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
+        "std_msgs/msg/String",
+        "rules.yaml:11: sources.c.topic: has {entity} twice; name the entity once",
+        "rules.yaml:14: sources.d: timeout must be one second or more",
+    ]
+
+
+def test_a_zone_and_a_text_that_nobody_knows_are_mistakes() -> None:
+    hours = {"start": "06:30", "stop": "24:00", "zone": "Europe/Berlim"}
+    assert faults(text_of(rule("a", schedule=hours)))[-2:] == [
+        "rules.yaml:23: rules[0].schedule.stop: '24:00' is not a time of day; write it like "
+        '"07:30", in quotes',
+        "rules.yaml:24: rules[0].schedule.zone: 'Europe/Berlim' is not a time zone; write it like "
+        "Europe/Berlin",
+    ]
+    assert faults("\ud800") == ["rules.yaml: not valid YAML: a tag or number is not allowed there"]
+
+
+def test_the_mistakes_of_the_documentation_are_told_as_it_says() -> None:
+    example = (ROOT / "examples" / "experiment" / "rules.yaml").read_text()
+    told = faults(example.replace("stop: 90", "stop: 80", 1))
+    told += faults(example.replace("{entity}/edge", "{entiti}/edge", 1))
+    assert "\n".join(f"    {one}" for one in told) in (ROOT / "docs" / "detector.md").read_text()
+
+
+def test_a_value_cannot_change_the_form_of_a_demand() -> None:
+    named = demand(request='{entity}", "x": {{}}', positions=[{"node": "{entity}", "x": "{x}"}])
+    file = rule_file.read(text_of(rule("a", near=NEAR, demand=named)), "rules.yaml")
+    goal = file.rules[0].template.goal({"rule": "a", "entity": "{y}", "x": 1.5})
+    assert goal.data == {
+        "demand": "a/{y}",
+        "requesters": ["{y}"],
+        "request": '{y}", "x": {}',
+        "positions": [{"node": "{y}", "x": 1.5}],
+    }
+
+
+def test_the_schema_takes_rules_and_nothing_misspelt() -> None:
+    model, _ = schema.SCHEMAS["detector-rules"]
+    validator = jsonschema_rs.validator_for(model.model_json_schema(by_alias=True))
+    data = yaml.safe_load(text_of(rule("a", near=NEAR), rule("b", near=NEAR)))
+    assert validator.is_valid(data)
+    data["rules"][0]["nearly"] = {}
+    assert not validator.is_valid(data)

@@ -1,0 +1,168 @@
+"""What services request of nodes: counted by what changes, and never more than a node has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+from random import Random
+from typing import Any
+
+import pytest
+from demandops.config.inventory import Node, amount_of, amount_text
+from demandops.config.load import load
+from demandops.decision import Decision, State
+from demandops.demand.demand_request import Expire
+from demandops.errors import Refused
+from demandops.ledger.claim_changes import ClaimChange
+from demandops.ledger.ledger import Ledger
+from demandops.plan.nodes.capacity import whole_usage
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.kit.memory import MemoryRepo
+from tests.scenarios.running import configuration
+
+VEHICLES = ("vehicle00", "vehicle01")
+CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
+"""What nodes have of cpu; the others have no capacity."""
+
+
+@cache
+def recorders() -> State:
+    """Return a state in which a recorder requests 1 cpu for each replica, and a driver too."""
+    nodes = [
+        {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
+        | ({"capacity": {"cpu": CAPACITY[id]}} if id in CAPACITY else {})
+        for id in (*VEHICLES, "west", "east")
+    ]
+    requests = {"cpu": 1}
+    files = configuration(
+        ("recorder",),
+        {
+            "appdefs/recorder/appdef.yaml": {"services": {"recorder": {"requests": requests}}},
+            "appdefs/driver/service.yaml": {"requests": requests},
+            "inventory/nodes.yaml": {"nodes": nodes},
+            "inventory/brokers.yaml": {"brokers": [{"node": "west", "host": "broker"}]},
+            "policy/access-domains.yaml": {"domains": [{"name": "all", "namespace": "all"}]},
+        },
+    )
+    return State.of(load(files), Ledger())
+
+
+def recorder(random: Random) -> dict[str, Any]:
+    """Return an application by chance; a recorder has a replica for each two of its topics."""
+    known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
+    topics = random.sample(known, random.randint(1, 5))
+    where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))
+    return {
+        "id": f"app{random.randrange(4)}",
+        "type": "recorder",
+        "inputs": {"point_cloud": [{"topic": topic, "source": of} for of, topic in topics]},
+    } | where
+
+
+def goal(random: Random) -> dict[str, Any]:
+    who = random.choice(VEHICLES)
+    made = {"kind": "Demand", "demand": f"{who}-{random.randrange(3)}", "requesters": [who]}
+    if random.random() < 0.25:
+        return made | {"operation": "release"}
+    apps = {app["id"]: app for app in (recorder(random) for _ in range(random.randint(1, 3)))}
+    return made | {"applications": list(apps.values())}
+
+
+def used(repo: MemoryRepo) -> Counter[str]:
+    """Return the cpu that the services in the books request, by node."""
+    found: Counter[str] = Counter()
+    for entry in repo.books()["services"].values():
+        topics = sum(map(len, entry["inputs"].values()))
+        replicas = min(3, -(-topics // 2)) if entry["service"] == "recorder" else 1
+        found[entry["node"]] += replicas
+    return found
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.randoms(use_true_random=False))
+def test_it_is_counted_by_what_changes_and_no_node_gets_more_than_it_has(random: Random) -> None:
+    repo = MemoryRepo(state=recorders())
+    refused = 0
+    for _ in range(8):
+        before = used(repo)
+        demand = goal(random)
+        taken = repo.take(demand)
+        now = used(repo)
+        assert {id: repo.state.usage().of(id, "cpu") / 1000 for id in now} == dict(now)
+        assert repo.state.usage().amounts == whole_usage(repo.state).amounts
+        assert all(now[id] <= most for id, most in CAPACITY.items())
+        if isinstance(taken, Refused):
+            refused += 1
+            assert "operation" not in demand or {f.code for f in taken.faults} == {"not-held"}
+            assert now == before
+    claims = list(repo.state.ledger)
+    random.shuffle(claims)
+    half = claims[: len(claims) // 2]
+    known = repo.state
+    known.usage()
+    ledger = known.ledger.without(half)
+    edited = known.with_ledger(ledger, [ClaimChange(claim, None) for claim in half])
+    anew = replace(known, ledger=ledger)
+    assert edited.usage().amounts == anew.usage().amounts
+
+
+def test_what_ends_with_its_lease_is_given_back() -> None:
+    repo = MemoryRepo(state=recorders())
+    cloud = {"point_cloud": [{"topic": "/t", "source": "vehicle00"}]}
+    app = {"id": "a", "type": "recorder", "node": "east", "inputs": cloud}
+    goal = {"kind": "Demand", "demand": "d", "requesters": ["v"], "applications": [app]}
+    repo.send(goal | {"lease": "1s"})
+    assert dict(repo.state.usage().amounts) == {("east", "cpu"): 1000, ("vehicle00", "cpu"): 1000}
+    later = repo.now.replace(year=repo.now.year + 1)
+    assert isinstance(repo.take(Expire(id="d", demand="d"), later), Decision)
+    assert dict(repo.state.usage().amounts) == {}
+
+
+def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> None:
+    repo = MemoryRepo(state=recorders())
+    cloud = {"point_cloud": [{"topic": "/t", "source": "vehicle01"}]}
+    app = {"id": "a", "type": "recorder", "node": "east", "inputs": cloud}
+    repo.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "applications": [app]})
+    assert repo.bookkeeping()["nodes"] == {
+        "east": {"cpu": {"requested": "1", "capacity": "3"}},
+        "vehicle00": {"cpu": {"requested": "0", "capacity": "2"}},
+        "west": {"cpu": {"requested": "0", "capacity": "5"}},
+    }
+    assert "nodes" not in MemoryRepo().bookkeeping()
+
+
+@pytest.mark.parametrize(
+    ("text", "thousandths", "shown"),
+    [
+        ("2", 2_000, "2"),
+        ("500m", 500, "0.5"),
+        ("1.25", 1_250, "1.25"),
+        ("2k", 2_000_000, "2000"),
+        ("1.5Ki", 1_536_000, "1536"),
+        ("0", 0, "0"),
+    ],
+)
+def test_a_quantity_is_read_as_kubernetes_does(text: str, thousandths: int, shown: str) -> None:
+    assert amount_of(text) == thousandths
+    assert amount_text(thousandths, "cpu") == shown
+
+
+def test_memory_is_shown_in_the_largest_unit_that_is_exact() -> None:
+    texts = [amount_text(amount_of(text), "memory") for text in ("1024Mi", "1.5Gi", "1000", "0")]
+    assert texts == ["1Gi", "1536Mi", "1000", "0"]
+
+
+@pytest.mark.parametrize("text", ["", "-1", "1e3", "1 Gi", "0.5m", "1.2345", "many", "1GB"])
+def test_what_is_no_quantity_is_a_fault(text: str) -> None:
+    with pytest.raises(ValueError, match=r"is not a quantity|is finer than a thousandth"):
+        amount_of(text)
+
+
+def test_a_node_limits_what_it_declares() -> None:
+    plain = Node(id="a", type="edge", cluster="c")
+    node = plain.model_copy(update={"capacity": {"gpu": "2"}})
+    assert [plain.most(name) for name in ("cpu", "gpu")] == [None, None]
+    assert [node.most(name) for name in ("cpu", "memory", "gpu", "fpga")] == [None, None, 2000, 0]

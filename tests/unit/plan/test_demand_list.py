@@ -1,0 +1,23 @@
+"""The list of demands has those that hold something and those that wait, the oldest first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import timedelta
+
+from demandops.ledger.waiting import WaitingDemand
+from demandops.plan.views.demand_list import demands
+
+from tests.kit.goals import perception
+from tests.kit.memory import NOW, MemoryRepo
+
+
+def test_a_demand_that_waits_is_listed_and_holds_nothing() -> None:
+    repo = MemoryRepo()
+    repo.send(perception())
+    one = WaitingDemand("later", "r", ("vehicle01",), NOW + timedelta(days=1), 0, {})
+    ledger = repo.state.ledger
+    ledger = replace(ledger, waiting=ledger.waiting.insert("later", one))
+    first, last = demands(replace(repo.state, ledger=ledger))
+    assert (first.state, len(first.connections)) == ("held", 1)
+    assert (last.name, last.state, last.applications) == ("later", "waiting", ())

@@ -1,0 +1,136 @@
+"""Services that overrides move: what they read and deliver comes with them, and goes back."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from random import Random
+from typing import Any
+
+import yaml
+from demandops.config.config import Config
+from demandops.config.load import load
+from demandops.config.override import Override, OverrideFile, Selector
+from demandops.decision import State, rendered_files
+from demandops.errors import Refused
+from demandops.plan.nodes.relocation import following_overrides
+from demandops.plan.override_lifecycle import changed_claim_files
+from demandops.plan.release import ServiceKey
+from demandops.plan.release_keys import all_keys
+from demandops.plan.views.policy_warnings import warnings
+from demandops.plan.views.release_causes import releases
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.kit.chance import chances, examples
+from tests.kit.config import configuration, override
+from tests.kit.goals import application, goal
+from tests.kit.memory import MemoryRepo, ledger_in
+from tests.unit.plan.test_flows import (
+    NODES,
+    Demands,
+    Graphs,
+    assert_every_topic_comes_in_one_way,
+    in_clusters,
+    instances,
+)
+
+
+def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
+    """Yield overrides that move some services, or all of an application."""
+    names = sorted({name for services in graphs.services.values() for name in services})
+    for number in range(random.randint(0, 2)):
+        by_service = Selector(services=(random.choice(names),))
+        file = OverrideFile(
+            apiVersion="demandops/v1",
+            kind="Override",
+            reason="by chance",
+            owner="petra",
+            priority=number,
+            select=(random.choice([by_service, by_service, Selector(applications=("x",))]),),
+            node=random.choice(NODES),
+        )
+        yield Override.from_file(f"o{number}", file)
+
+
+def wanted(
+    graphs: Graphs, app: dict[str, Any], active: Iterable[Override]
+) -> dict[str, str | None]:
+    """Return where overrides move which services of an application, the highest one last."""
+    return {
+        name: override.node
+        for override in active
+        for name, service in graphs.services[app["type"]].items()
+        if not service["at_source"] and service["scope"] != "cluster"
+        if name in (override.select[0].services or [name] * (app["id"] == "x"))
+    }
+
+
+def configure(repo: MemoryRepo, config: Config) -> tuple[tuple[str, str], ...]:
+    """Take a configuration in as a generator does, and return what overrides do not move."""
+    state = State.of(config, repo.state.ledger)
+    moved = following_overrides(state)
+    for path, text in changed_claim_files(state.ledger, moved.ledger, moved.keys).items():
+        repo.files.pop(path) if text is None else repo.files.update({path: text})
+    repo.state = replace(state, ledger=moved.ledger)
+    for path in in_clusters(repo.files):
+        del repo.files[path]
+    repo.files |= in_clusters(rendered_files(repo.state))
+    return moved.stays
+
+
+@examples(12)
+@given(chances, st.integers(1, 6))
+def test_every_topic_comes_in_one_way_while_overrides_move_services(
+    random: Random, length: int
+) -> None:
+    graphs = Graphs(random)
+    demands = Demands(random, graphs)
+    repo = MemoryRepo(graphs.files)
+    plain = repo.config
+    for _ in range(length):
+        before = copy.deepcopy(demands.held), dict(demands.where)
+        taken = repo.take(demands.next())
+        if isinstance(taken, Refused):
+            demands.held, demands.where = before
+            assert {fault.code for fault in taken.faults} == {"conflict"}
+        active = {one.name: one for one in overrides(random, graphs)}
+        stays = configure(repo, replace(plain, overrides=active))
+        ledger = repo.state.ledger
+        apps = [app for apps in demands.held.values() for app in apps]
+        booked = {app["id"]: ledger.application(app["id"]) for app in apps}
+        moved = {id: dict(app.moved) for id, app in booked.items() if app}
+        for app in apps:
+            if not any(f"'{app['id']}'" in why for _, why in stays):
+                assert moved[app["id"]] == wanted(graphs, app, active.values())
+        assert ledger_in(repo.files) == ledger
+        running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
+        assert running == {key for app in apps for key in instances(graphs, app, moved[app["id"]])}
+        assert_every_topic_comes_in_one_way(repo, demands)
+    configure(repo, plain)
+    assert not repo.state.ledger.moved_applications()
+    assert_every_topic_comes_in_one_way(repo, demands)
+
+
+def test_what_a_quota_does_not_let_move_stays_and_check_says_so() -> None:
+    head = {"apiVersion": "demandops/v1", "kind": "AccessDomains"}
+    places = (("edges", ["edge", "vehicle*"], {}), ("cloud", ["cloud"], {"servicesPerNode": 1}))
+    domains = [
+        {"name": name, "namespace": name, "nodes": nodes, "quotas": quotas}
+        for name, nodes, quotas in places
+    ]
+    files = {"policy/access-domains.yaml": yaml.safe_dump(head | {"domains": domains})}
+    repo = MemoryRepo(files)
+    for id in ("a", "b"):
+        repo.send(goal([application(id, ego=[("/ego", "vehicle00")], clouds=[])], id=id))
+    moves = override({"services": ["object-fusion"]}, node="cloud")
+    stays = configure(repo, load(configuration(files | {"overrides/away.yaml": moves})))
+    ((path, why),) = stays
+    assert path == "overrides/away.yaml"
+    assert why.startswith("does not move object-fusion of application 'b' to 'cloud': 'cloud' ")
+    assert [f.message for f in warnings(repo.state) if f.file == path] == [why]
+    booked = (repo.state.ledger.application(id) for id in ("a", "b"))
+    assert [app and dict(app.moved) for app in booked] == [{"object-fusion": "cloud"}, {}]
+    repo.send(goal([application("b", ego=[("/more", "vehicle00")], clouds=[])], id="b"))
+    assert [release.node.id for release in releases(repo.state)] == ["cloud", "edge"]

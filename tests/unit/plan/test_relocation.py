@@ -1,0 +1,117 @@
+"""The applications of a drained node: whatever they read and deliver, it comes with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+from typing import Any
+
+from demandops.config.config import Config
+from demandops.decision import State, rendered_files
+from demandops.demand.application import Requirement
+from demandops.ledger.operations.drain import Drain
+from demandops.plan.release import ServiceKey
+from demandops.plan.release_keys import all_keys
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.kit.chance import chances, examples
+from tests.kit.memory import MemoryRepo, rebuilt
+from tests.unit.plan.test_flows import (
+    NODES,
+    Demands,
+    Graphs,
+    assert_every_topic_comes_in_one_way,
+    in_clusters,
+    instances,
+)
+
+
+class Placed(Demands):
+    """Demands that say in ``place`` what the nodes must have."""
+
+    def _application(self, id: str) -> dict[str, Any]:
+        app = super()._application(id)
+        del app["node"]
+        return app | {"place": {"capabilities": ["gpu"]}}
+
+    def note_nodes(self, repo: MemoryRepo) -> None:
+        """Note the nodes that the applications are on."""
+        for app in (app for apps in self.held.values() for app in apps):
+            found = repo.state.ledger.application(app["id"])
+            assert found is not None
+            app["node"] = found.node
+
+
+def with_nodes(config: Config, drained: str | None = None) -> Config:
+    """Return the configuration with a GPU on some nodes, and one of them drained."""
+    nodes = {
+        id: node.model_copy(
+            update={"capabilities": ("gpu",) * (id in NODES), "drained": id == drained}
+        )
+        for id, node in config.nodes.items()
+    }
+    return replace(config, nodes=nodes)
+
+
+def configure(repo: MemoryRepo, config: Config) -> None:
+    repo.state = State.of(config, repo.state.ledger)
+
+
+@examples(12)
+@given(chances, st.integers(1, 6))
+def test_every_topic_still_comes_in_one_way_after_a_node_is_drained(
+    random: Random, length: int
+) -> None:
+    graphs = Graphs(random)
+    demands = Placed(random, graphs)
+    repo = MemoryRepo(graphs.files)
+    config = with_nodes(repo.config)
+    configure(repo, config)
+    for _ in range(length):
+        goal = demands.next()
+        for app in goal.get("applications", ()):
+            app.pop("node", None)
+        repo.send(goal)
+        demands.note_nodes(repo)
+        node = random.choice(NODES)
+        before = {claim.key: claim for claim in repo.state.ledger if claim.is_on_application}
+        configure(repo, with_nodes(config, node))
+        decision = repo.send(Drain(node))
+        configure(repo, config)
+        assert decision.warnings == ()
+        assert not repo.state.ledger.applications_on.get(node)
+        for key, claim in before.items():
+            moved = repo.state.ledger.get(key)
+            assert moved is not None
+            assert replace(claim, held=moved.held) == moved
+            assert (moved.application == claim.application) is (claim.application.node != node)
+        demands.note_nodes(repo)
+        held = [app for apps in demands.held.values() for app in apps]
+        running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
+        assert running == {key for app in held for key in instances(graphs, app)}
+        assert_every_topic_comes_in_one_way(repo, demands)
+        assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))
+
+
+def test_what_leaves_a_node_is_spread_over_the_others() -> None:
+    repo = MemoryRepo()
+    config = with_nodes(repo.config)
+    configure(repo, config)
+    for number in range(4):
+        app = {
+            "id": f"app{number}",
+            "type": "object-detection-fusion",
+            "place": {"capabilities": ["gpu"], "labels": ["node_id=cloud"]},
+            "inputs": {"ego_data": [{"topic": "/ego", "source": "cloud"}]},
+        }
+        goal = {"kind": "Demand", "demand": f"d{number}", "requesters": ["v"]}
+        repo.send(goal | {"applications": [app]})
+    claims = [
+        replace(one, held=replace(one.application, place=Requirement(capabilities=("gpu",))))
+        for one in repo.state.ledger
+    ]
+    ledger = rebuilt(claims)
+    repo.state = State.of(with_nodes(config, "cloud"), ledger)
+    moved = repo.decide(Drain("cloud")).state.ledger
+    assert dict(moved.applications_on) == {"edge": 2, "vehicle01": 2}

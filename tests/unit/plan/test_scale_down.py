@@ -1,0 +1,146 @@
+"""Replicas come down after the time that the definition names, and the ledger alone says when."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime, timedelta
+from functools import lru_cache
+from pathlib import Path
+
+import pytest
+import yaml
+from demandops.config.appdef import Scaling
+from demandops.decision import rendered_files
+from demandops.ledger.kept_replicas import extended, path_of, read, text_of
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from tests.appdefs.test_scaling import books, demand, fact, release, replicas_by_overrides
+from tests.kit.chance import examples
+from tests.kit.memory import NOW, MemoryRepo, ledger_in
+
+PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
+WINDOW = timedelta(minutes=10)
+SCALING = "{max: 9, per: {topics: 1}, downAfter: 10m}"
+STEPS = st.lists(
+    st.tuples(st.integers(0, 400), st.one_of(st.none(), st.integers(0, 9))), max_size=25
+)
+"""Seconds that pass, and the topics demanded then; none: the generator only looks at the clock."""
+
+
+@lru_cache(maxsize=1)
+def empty() -> MemoryRepo:
+    return books(SCALING)
+
+
+def replicas(repo: MemoryRepo) -> int:
+    found: int = release(repo)["spec"]["values"]["replicas"]
+    return found
+
+
+@given(STEPS)
+@examples(30)
+def test_a_service_has_the_most_that_it_needed_in_the_time(
+    steps: list[tuple[int, int | None]],
+) -> None:
+    repo, now = empty().copy(), NOW
+    needs: list[tuple[datetime, int]] = []
+    """Since when it needed how many; as long as it runs."""
+    for seconds, topics in [(0, 1), *steps]:
+        now += timedelta(seconds=seconds)
+        repo.scale_down(now)
+        if topics:
+            repo.send(demand(topics=topics), now)
+            needs.append((now, topics))
+        elif topics == 0 and needs:
+            repo.send(demand() | {"operation": "release", "applications": []}, now)
+            needs = []
+        assert ledger_in(repo.files) == repo.state.ledger
+        again = rendered_files(repo.state)
+        assert {path: repo.files[path] for path in again} == again
+        if not needs:
+            assert not repo.state.ledger.kept.steps
+            assert not any(path.startswith("ledger/replicas/") for path in repo.files)
+            continue
+        ends = [*(since for since, _ in needs[1:]), now + WINDOW]
+        recent = [count for (_, count), end in zip(needs, ends, strict=True) if end + WINDOW > now]
+        assert replicas(repo) == max(recent)
+
+
+def test_it_goes_up_at_once_and_says_until_when_it_stays_up() -> None:
+    repo = books(SCALING)
+    repo.send(demand(topics=3))
+    assert not [one for one in repo.send(demand(topics=4), NOW).warnings if "keeps" in one]
+    fewer = repo.send(demand(topics=2), NOW + timedelta(minutes=1))
+    name = release(repo)["metadata"]["name"]
+    assert fewer.warnings[-1:] == (
+        f"{name} keeps 4 replicas until 2026-01-31T12:11:00Z (downAfter), then as many as its "
+        "demands need",
+    )
+    assert fact(repo) == "4 until 2026-01-31T12:11:00Z"
+    assert repo.scale_down(NOW + timedelta(minutes=10, seconds=59)) == []
+    assert repo.scale_down(NOW + timedelta(minutes=11)) == [name]
+    assert (fact(repo), replicas(repo)) == ("2", 2)
+
+
+def test_a_person_decides_at_once() -> None:
+    """An override sets the number, and a definition with fewer at most or no time is obeyed."""
+    repo = books(SCALING, **replicas_by_overrides(1))
+    repo.send(demand(topics=4))
+    repo.send(demand(topics=2))
+    assert replicas(repo) == 1
+    for scaling, left in (
+        ("{max: 9, per: {topics: 1}}", "2"),
+        ("{max: 3, per: {topics: 1}, downAfter: 10m}", "3 until 2026-01-31T12:10:00Z"),
+    ):
+        changed = books(scaling)
+        other = MemoryRepo(state=changed.state)
+        other.state = type(changed.state).of(changed.config, repo.state.ledger)
+        (found,) = (text for path, text in rendered_files(other.state).items() if "/rec-" in path)
+        assert yaml.safe_load(found)["spec"]["values"]["replicas"] == int(left.split()[0])
+
+
+def test_a_clock_that_was_set_back_gives_a_valid_record() -> None:
+    late, early = NOW + timedelta(hours=1), NOW
+    steps = extended((), 3, 5, late, late + WINDOW)
+    steps = extended(steps, 1, 3, early, early + WINDOW)
+    assert [one.replicas for one in steps] == [5]
+    instance = ("replicas", "service", "edge", "app", "", "", "", "")
+    text = text_of(instance, steps)
+    assert read(text, path_of(instance)) == (instance, steps)
+    assert read(text, path_of((*instance[:-1], "other"))) is None
+
+
+@pytest.mark.parametrize(
+    ("scaling", "problem"),
+    [
+        ("{downAfter: 10m}", "downAfter does nothing without per or sizes; remove it"),
+        (
+            "{max: 3, autoscaler: {cpu: 70}, downAfter: 10m}",
+            "downAfter does nothing without per or sizes; an autoscaler has a time of its own; "
+            "remove it",
+        ),
+        ("{max: 3, per: {topics: 1}, downAfter: 0s}", "downAfter is zero; leave it out"),
+        ("{max: 3, per: {topics: 1}, downAfter: soon}", "'soon' is not a duration"),
+    ],
+)
+def test_a_time_that_does_nothing_is_a_fault(scaling: str, problem: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(problem)):
+        Scaling.model_validate(yaml.safe_load(scaling))
+
+
+def test_the_example_of_the_page() -> None:
+    section = PAGE[PAGE.index("### Coming down later") :].partition("\n## ")[0]
+    (scaling,) = re.findall(r"^    scaling: (\{.*\})$", section, re.MULTILINE)
+    rows = re.findall(
+        r"^\| (\d\d:\d\d) \| (?:(\d+) topics)?[^|]* \| (\d) \|$", section, re.MULTILINE
+    )
+    assert len(rows) > 5
+    repo = books(scaling)
+    for time, topics, wanted in rows:
+        now = NOW.replace(hour=int(time[:2]), minute=int(time[3:]))
+        repo.scale_down(now)
+        if topics:
+            repo.send(demand(topics=int(topics)), now)
+        assert replicas(repo) == int(wanted), time

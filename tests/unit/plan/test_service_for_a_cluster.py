@@ -1,0 +1,162 @@
+"""The scope ``cluster``: one service for all applications of a cluster that use it."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+import yaml
+from demandops.decision import rendered_files
+from demandops.errors import InvalidInput
+from demandops.plan.release import ServiceKey
+from hypothesis import given
+
+from tests.kit.chance import chances, examples
+from tests.kit.config import edited, skeleton
+from tests.kit.memory import MemoryRepo, ledger_in
+
+PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+(EXAMPLE,) = (
+    re.sub("^    ", "", found, flags=re.MULTILINE)
+    for found in re.findall(r"(?:^    .*\n)+", PAGE, re.MULTILINE)
+    if "scope: cluster" in found
+)
+
+
+def files(service: str = EXAMPLE, **more: str) -> dict[str, str]:
+    nodes = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
+    for node in nodes["nodes"]:
+        node["cluster"] = "depot" if node["id"] in ("vehicle02", "vehicle03") else "c-its"
+    clusters = yaml.safe_load(skeleton()["inventory/clusters.yaml"])
+    clusters["clusters"].append({"name": "depot"})
+    used = "uses: {map-server: {objects: object-fusion.fused_objects}}\ninputs:\n"
+    return {
+        "inventory/nodes.yaml": yaml.safe_dump(nodes),
+        "inventory/clusters.yaml": yaml.safe_dump(clusters),
+        "appdefs/map-server/service.yaml": service,
+        "appdefs/map-server/values/map-server.yaml.j2": "replicas: {{ replicas }}\n",
+        **edited(APPDEF, "inputs:\n", used),
+        **more,
+    }
+
+
+@lru_cache(maxsize=1)
+def empty() -> MemoryRepo:
+    return MemoryRepo(files())
+
+
+def put(demand: str, node: str = "edge", topic: str = "/ego") -> dict[str, Any]:
+    inputs = {"ego_data": [{"topic": topic, "source": "vehicle00"}]}
+    app = {"id": f"{node}/{demand}", "type": "object-detection-fusion", "node": node}
+    made = {"kind": "Demand", "demand": demand, "requesters": [f"for-{demand}"]}
+    return made | {"applications": [app | {"inputs": inputs}]}
+
+
+def release(demand: str) -> dict[str, Any]:
+    made = put(demand)
+    return made | {"operation": "release", "applications": []}
+
+
+def servers(repo: MemoryRepo) -> dict[str, list[str]]:
+    """Return node → the applications that its map server serves."""
+    return {
+        entry["node"]: entry["applications"]
+        for entry in repo.books()["services"].values()
+        if entry["service"] == "map-server"
+    }
+
+
+@given(chances)
+@examples(12)
+def test_one_runs_while_any_application_of_the_cluster_uses_it(random: Random) -> None:
+    repo, held = empty().copy(), dict[str, str]()
+    for _ in range(8):
+        name = random.choice("abcd")
+        if name in held and random.random() < 0.5:
+            repo.send(release(name))
+            del held[name]
+        else:
+            held[name] = random.choice(("edge", "cloud"))
+            repo.send(put(name, held[name]))
+        wanted = sorted(f"{node}/{name}" for name, node in held.items())
+        assert servers(repo) == ({"cloud": wanted} if wanted else {})
+        topics = [
+            topic.topic
+            for key, one in repo.state.plans.items()
+            if isinstance(key, ServiceKey) and key.for_cluster
+            for topic in one.inputs["objects"]
+        ]
+        assert len(topics) == len(held), "it reads what each of them makes"
+        for application in wanted:
+            node = application.partition("/")[0]
+            carried = repo.books()["connections"].get(f"derived/{node}/cloud", {"topics": {}})
+            named = f"/{application.replace('/', '_')}_global_objectlist"
+            assert named in topics
+            assert (named in carried["topics"]) is (node != "cloud")
+        assert ledger_in(repo.files) == repo.state.ledger
+        again = rendered_files(repo.state)
+        assert {path: repo.files[path] for path in again} == again
+    for name in held:
+        repo.send(release(name))
+    assert repo.files == empty().files
+
+
+def test_a_cluster_without_a_node_for_it_is_refused() -> None:
+    demanded = put("a", "vehicle02")
+    demanded["applications"][0]["connect"] = "none"
+    assert MemoryRepo(files()).faults(demanded) == [
+        "applications[0].node: 'vehicle02' is in cluster 'depot', where map-server, which it "
+        "needs, has no node; choose a node in c-its, or have nodes in "
+        "appdefs/map-server/service.yaml changed"
+    ]
+
+
+def test_its_node_counts_it_and_its_rules_hold() -> None:
+    domains = [
+        {"name": "most", "namespace": "most", "nodes": ["vehicle*", "station*", "edge"]},
+        {
+            "name": "servers",
+            "namespace": "servers",
+            "nodes": ["cloud"],
+            "rules": [{"name": "a", "requesters": ["for-a"], "peers": ["most"]}],
+            "quotas": {"servicesPerNode": 1},
+        },
+    ]
+    domains[0]["rules"] = [{"name": "all", "peers": ["servers"]}]
+    head = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": domains}
+    repo = MemoryRepo(files() | {"policy/access-domains.yaml": yaml.safe_dump(head)})
+    assert repo.send(put("a")).outcome == "booked"
+    assert "no rule of access domain 'servers' is for 'for-b'" in repo.faults(put("b"))[0]
+    moved = put("a", "cloud")
+    assert "'cloud' would run 2 services" in repo.faults(moved)[0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("nodes: {c-its: cloud}\n", "", "scope 'cluster' needs nodes, the node of each cluster"),
+        ("scope: cluster", "scope: node", "scope 'cluster' needs nodes, the node of each cluster"),
+        (
+            "nodes: {c-its: cloud}",
+            "nodes: {c-its: cloud}\nplacement: source",
+            "scope 'cluster' runs at its nodes; leave out placement",
+        ),
+        (
+            "nodes: {c-its: cloud}",
+            "nodes: {depot: cloud}",
+            "nodes.depot: 'cloud' is in cluster 'c-its'; name a node of 'depot'",
+        ),
+        ("{c-its: cloud}", "{c-its: clod}", "nodes.c-its: 'clod' is not in nodes.yaml"),
+        ("{c-its: cloud}", "{town: cloud}", "nodes.town: 'town' is not in clusters.yaml"),
+    ],
+)
+def test_a_definition_that_does_not_fit_is_a_fault(old: str, new: str, fault: str) -> None:
+    assert old in EXAMPLE
+    with pytest.raises(InvalidInput) as raised:
+        MemoryRepo(files(EXAMPLE.replace(old, new)))
+    assert fault in str(raised.value)

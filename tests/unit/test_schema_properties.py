@@ -1,0 +1,60 @@
+"""Every property of the published schemas says what it means, with an example that is valid."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import jsonschema_rs
+import pytest
+from demandops.cli.repo import schema, schema_properties
+
+FILE = "templates/schemas/properties.yaml"
+
+
+def properties(name: str) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Yield name, schema and document of each property of a published schema."""
+    document = json.loads(schema.text(name))
+    root = schema.SCHEMAS[name][0].__name__
+    for model, part in {root: document, **document.get("$defs", {})}.items():
+        for field, one in part.get("properties", {}).items():
+            yield f"{model}.{field}", one, document
+
+
+@pytest.mark.parametrize("name", schema.SCHEMAS)
+def test_every_property_has_a_description_and_a_valid_example(name: str) -> None:
+    bare = [
+        field
+        for field, one, _ in properties(name)
+        if not one.get("description") or not one.get("examples")
+    ]
+    assert bare == [], f"add them to {FILE}"
+    for field, one, document in properties(name):
+        own = {"$schema": document["$schema"], "$defs": document.get("$defs", {}), **one}
+        validator = jsonschema_rs.validator_for(own)
+        for example in one["examples"]:
+            faults = [error.message for error in validator.iter_errors(example)]
+            assert faults == [], (field, example)
+
+
+def test_each_entry_is_a_description_and_at_most_an_example() -> None:
+    odd = [
+        (model, field, said)
+        for model, fields in schema_properties._properties().items()
+        if model != "inherits"
+        for field, said in fields.items()
+        if len(said) > 2 or not isinstance(said[0], str)
+    ]
+    assert odd == []
+
+
+def test_nothing_is_described_that_is_not_there() -> None:
+    known = {field for name in schema.SCHEMAS for field, *_ in properties(name)}
+    listed = {
+        f"{model.rpartition('/')[2]}.{field}"
+        for model, fields in schema_properties._properties().items()
+        if model != "inherits"
+        for field in fields
+    }
+    assert listed - known == set()
