@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -9,8 +10,10 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from demandops.runtime import REAL
 from rclpy.action import ActionClient
+from rclpy.action.client import ClientGoalHandle
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from unique_identifier_msgs.msg import UUID
 
 from demandops_ros.ros_process import ExecutorThread
 
@@ -21,6 +24,8 @@ burst, because a client's queue also gets the answers to other clients."""
 _UNHEARD_S = 5.0
 """Seconds until a goal counts as lost; a node accepts a goal within milliseconds."""
 
+_ASK_AGAIN_S = 0.2
+
 
 class DemandError(Exception):
     """Raised when a demand fails. ``code`` is a word for programs, such as ``unknown-node``."""
@@ -28,6 +33,16 @@ class DemandError(Exception):
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
+
+
+def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
+    """Ask a node to cancel a goal that nobody has sent; its answer shows that it knows the client.
+
+    A client discovers the node before the node discovers the client, and an answer to a client
+    that is not discovered yet is lost.
+    """
+    nobodys = UUID(uuid=list(uuid.uuid4().bytes))
+    return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
 
 
 class GoalSender:
@@ -68,6 +83,7 @@ class GoalSender:
             feedback_sub_qos_profile=DEEP_QOS,
         )
         self._thread = ExecutorThread(self._node, "client")
+        self._is_discovered = False
 
     def close(self) -> None:
         """Stop the thread and destroy the node."""
@@ -95,12 +111,22 @@ class GoalSender:
             raise DemandError(
                 "no-server", f"no node serves {self._action_name}; start one with demandops serve"
             )
+        self._wait_until_discovered(deadline)
         handle, lost = self._send_until_heard(goal, on_feedback, deadline)
         if not handle.accepted:
             message = "the node accepts no demands now, and its log says why; send it again later"
             raise DemandError("rejected", message)
         answer = self._await(handle.get_result_async(), deadline)
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
+
+    def _wait_until_discovered(self, deadline: float) -> None:
+        """Wait until a node answers; if none does in time, the goal says so."""
+        while not self._is_discovered and REAL.monotonic() < deadline:
+            try:
+                self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
+            except DemandError:
+                continue
+            self._is_discovered = True
 
     def _send_until_heard(
         self,
@@ -110,8 +136,8 @@ class GoalSender:
     ) -> tuple[Any, bool]:
         """Send a goal until the node responds; return its handle and whether an attempt was lost.
 
-        The response is lost if the node has not discovered this client yet. Sending again is
-        harmless: a demand that is put twice counts once.
+        The response is lost if the node was replaced by one that has not discovered this client
+        yet. Sending again is harmless: a demand that is put twice counts once.
         """
         lost = False
         while True:

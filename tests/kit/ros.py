@@ -25,7 +25,7 @@ from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.cli.main import run
 from demandops.settings import DEFAULT_ACTION_NAME
-from demandops_ros.action_endpoints import DEEP_QOS
+from demandops_ros.action_endpoints import DEEP_QOS, ask_the_node
 from demandops_ros.messages import fill_message
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
@@ -234,7 +234,19 @@ class Client:
         return bool(self._client.server_is_ready())
 
     def ready(self) -> None:
+        """Wait until the node and this client have discovered each other."""
         self.wait(self.reaches_a_node)
+        asked: list[Any] = []
+        ask_at = 0.0
+
+        def is_answered() -> bool:
+            nonlocal ask_at
+            if time.monotonic() > ask_at:
+                ask_at = time.monotonic() + 1
+                asked.append(ask_the_node(self._client))
+            return any(one.done() for one in asked)
+
+        self.wait(is_answered)
 
     def send(self, goal: dict[str, Any]) -> Sent:
         """Send a goal; its answers arrive while the client waits for a condition."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops_ros import DemandClient, DemandError
+from demandops_ros import DemandClient
 
 from tests.kit import sync
 from tests.kit.generator import wait_until
@@ -95,12 +95,6 @@ def caller(shared: Served) -> Iterator[Client]:
 
 @pytest.fixture(scope="session")
 def vehicle(shared: Served) -> Iterator[DemandClient]:
-    """A client of the shared node for DemandOps' own action.
-
-    The node has answered it once. Before, it may not have discovered the client: the answer to a
-    goal is then lost, the client sends the goal again, and a demand is ``unchanged``.
-    """
+    """A client of the shared node for DemandOps' own action."""
     with DemandClient("vehicle00", domain_id=shared.domain) as made:
-        with pytest.raises(DemandError, match="not-held"):
-            made.renew("nothing")
         yield made

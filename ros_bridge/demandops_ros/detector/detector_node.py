@@ -21,6 +21,7 @@ from demandops.input_file import read_input
 from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops_interfaces.msg import Bookkeeping
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
@@ -34,6 +35,8 @@ _DISCOVERY_S = 0.5
 _RELOAD_S = 1.0
 _PATIENCE_S = 10.0
 _MOST_OBSERVATIONS = 100_000
+_UNHEARD_CLOCK = 0.0
+"""The time until the first message of a simulated clock. What starts from it is soon long ago."""
 _SET_CLOCK_S = 1.0
 """If a clock jumps by more, somebody has set it, or a simulation was restarted."""
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
@@ -57,8 +60,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         ros_process.log_to(self.get_logger(), settings["log_level"])
         self._path, self._settle_s = Path(settings["rules"]), float(settings["settling_time"])
         file, self._text = _read_rules(self._path)
-        self._last_now = self._now()
-        self._last_look = REAL.monotonic()
+        self._last_now, self._last_look = self._now(), REAL.monotonic()
         self._detector = Detector(file, self._last_now)
         self._is_started = False
         self._observations: deque[Observation] = deque(maxlen=_MOST_OBSERVATIONS)
@@ -69,13 +71,17 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._log,
         )
         self._topics = self._subscribe(file)
+        self._bookkeeping: Mapping[str, Any] | None = None
         self._books: Any = None
         if settings["bookkeeping_topic"]:
             self._books = self.create_subscription(
                 Bookkeeping, settings["bookkeeping_topic"], self._hear_books, _LATCHED
             )
         else:
-            self._start({})
+            self._bookkeeping = {}
+        self._patience = self.create_timer(
+            _PATIENCE_S, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         self.create_timer(settings["period"], self._step)
         self.create_timer(_DISCOVERY_S, self._refresh)
         self.create_timer(_RELOAD_S, self._reload_if_changed)
@@ -99,26 +105,43 @@ class DetectorNode(Node):  # type: ignore[misc]
         return float(self.get_clock().now().nanoseconds) / 1e9
 
     def _subscribe(self, file: RuleFile) -> SourceSubscriptions:
-        topics = SourceSubscriptions(self, file, self._now, self._observations.append)
+        topics = SourceSubscriptions(self, file, self._now, self._observe)
         topics.refresh()
         return topics
+
+    def _observe(self, observation: Observation) -> None:
+        if observation.at != _UNHEARD_CLOCK:
+            self._observations.append(observation)
 
     # ---- the start: which demands are ours ----
 
     def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
-        if not self._is_started:
-            self._start(json.loads(message.bookkeeping_json))
+        self._bookkeeping = json.loads(message.bookkeeping_json)
 
-    def _start(self, bookkeeping: Mapping[str, Any]) -> None:
+    def _start(self, bookkeeping: Mapping[str, Any], now: float) -> None:
         booked = booked_events(self._detector.file, bookkeeping)
-        self._sender.want(self._detector.resume(booked, self._now(), self._settle_s), booked)
+        self._sender.want(self._detector.resume(booked, now, self._settle_s), booked)
         self._is_started = True
-        self._last_now, self._last_look = self._now(), REAL.monotonic()
+        self._last_now, self._last_look = now, REAL.monotonic()
+        if self._books is not None:
+            self.destroy_subscription(self._books)
         self._log(
             "info",
             f"detecting; rules: {len(self._detector.file.rules)}, demands booked before "
             f"the start: {len(booked)}",
         )
+
+    def _say_what_is_missing(self) -> None:
+        self._patience.cancel()
+        if self._is_started:
+            return
+        if self._now() == _UNHEARD_CLOCK:
+            missing = "no clock was heard yet, so nothing is demanded: use_sim_time is set, and "
+            missing += "who publishes /clock?"
+        else:
+            missing = "no bookkeeping was heard yet, so nothing is demanded: is demandops serve "
+            missing += "running, and is bookkeeping_topic its topic?"
+        self.get_logger().warning(missing)
 
     # ---- again and again ----
 
@@ -128,16 +151,9 @@ class DetectorNode(Node):  # type: ignore[misc]
     def _step(self) -> None:
         now = self._now()
         if not self._is_started:
-            if REAL.monotonic() - self._last_look > _PATIENCE_S:
-                self.get_logger().warning(
-                    "no bookkeeping was heard yet, so nothing is demanded: is demandops serve "
-                    "running, and is bookkeeping_topic its topic?",
-                    once=True,
-                )
-            return
-        if self._books is not None:  # its own callback must not destroy it
-            self.destroy_subscription(self._books)
-            self._books = None
+            if self._bookkeeping is None or now == _UNHEARD_CLOCK:
+                return
+            self._start(self._bookkeeping, now)
         observations = [self._observations.popleft() for _ in range(len(self._observations))]
         self._follow_clock(now)
         for event, want in self._detector.step(observations, now):
