@@ -135,7 +135,17 @@ def test_an_access_domain_and_an_override(checkout: Path, demandops: Run) -> Non
         (["new", "application", "../x", *OPTIONS], 1, "error: "),
         (["new", "application", "Big_Name", *OPTIONS], 1, "error: "),
         ([*APPLICATION[:-1], "tracker=launch"], 2, "'tracker=launch' is not NAME=PACKAGE/FILE"),
-        (["new", "application", "x"], 2, "Missing option '--input'."),
+        (["new", "application", "x"], 2, "Missing options '--input', '--service', '--image'."),
+        (
+            ["new", "application", "object-detection-fusion"],
+            1,
+            "error: NAME: 'object-detection-fusion' exists already; choose another name",
+        ),
+        (
+            ["new", "application", "x", *OPTIONS, "--input", "camera=sensor_msgs/Image"],
+            2,
+            "write camera=sensor_msgs/msg/Image",
+        ),
         (
             ["new", "node", "edge", "--type", "edge", "--cluster", "c-its"],
             1,

@@ -50,6 +50,16 @@ class ApplicationPlan:
     node: str
 
 
+def refuse_known(name: str, config: Config) -> None:
+    """Refuse a name that an application, a chart or an image has.
+
+    Raises:
+        InvalidInput: the configuration has one of this name.
+    """
+    if name in config.appdefs or name in config.charts or name in config.images:
+        raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
+
+
 def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> dict[str, str]:
     """Return path → text of a new application.
 
@@ -61,8 +71,7 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
     Raises:
         InvalidInput: the configuration has an application or a chart of this name.
     """
-    if plan.name in config.appdefs or plan.name in config.charts or plan.name in config.images:
-        raise InvalidInput.at("NAME", f"'{plan.name}' exists already; choose another name")
+    refuse_known(plan.name, config)
     known = config.files if f"{LIBRARY_FOLDER}/Chart.yaml" in config.files else library
     root = f"appdefs/{plan.name}"
     found = {f"{root}/appdef.yaml": _appdef(plan, _prefixes(plan, config))}
