@@ -226,7 +226,7 @@ def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
     found += [f"  {verb} {claim.subject} of {claim.demand}" for claim in entry.claims]
-    return found or [f"  {verb} nothing now"]
+    return found or ["  affects nothing now"]
 
 
 def warn_of_idle(entry: Entry) -> None:
