@@ -132,8 +132,13 @@ def test_an_access_domain_and_an_override(checkout: Path, demandops: Run) -> Non
             1,
             "error: NAME: 'object-detection-fusion' exists already; choose another name",
         ),
-        (["new", "application", "../x", *OPTIONS], 1, "error: "),
-        (["new", "application", "Big_Name", *OPTIONS], 1, "error: "),
+        (["new", "application", "../x", *OPTIONS], 1, "error: NAME: '../x' cannot be used here"),
+        (
+            ["new", "application", "Big_Name", *OPTIONS],
+            1,
+            "error: NAME: 'Big_Name' cannot be used here; write lower-case letters, digits and '-' "
+            "between them, such as c-its\n",
+        ),
         ([*APPLICATION[:-1], "tracker=launch"], 2, "'tracker=launch' is not NAME=PACKAGE/FILE"),
         (["new", "application", "x"], 2, "Missing options '--input', '--service', '--image'."),
         (

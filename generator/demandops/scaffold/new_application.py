@@ -18,9 +18,12 @@ from demandops.config.policy import matches
 from demandops.config.registry import Image
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.errors import InvalidInput
+from demandops.identifiers import PATTERN_WORDS
+from demandops.quoting import quoted
 from demandops.scaffold.written import document
 
 LIBRARY_FOLDER = f"appdefs/charts/{chart_schema.LIBRARY}"
+_NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 _RESULT = "result"
 _REQUESTER = "operator"
 _VERSION = "0.1.0"
@@ -50,12 +53,17 @@ class ApplicationPlan:
     node: str
 
 
-def refuse_known(name: str, config: Config) -> None:
-    """Refuse a name that an application, a chart or an image has.
+def refuse_name(name: str, config: Config) -> None:
+    """Refuse a name that cannot be used, or that an application, a chart or an image has.
 
     Raises:
-        InvalidInput: the configuration has one of this name.
+        InvalidInput: the name is one of these.
     """
+    if not _NAME.fullmatch(name):
+        raise InvalidInput.at(
+            "NAME",
+            f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}",
+        )
     if name in config.appdefs or name in config.charts or name in config.images:
         raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
 
@@ -71,7 +79,7 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
     Raises:
         InvalidInput: the configuration has an application or a chart of this name.
     """
-    refuse_known(plan.name, config)
+    refuse_name(plan.name, config)
     known = config.files if f"{LIBRARY_FOLDER}/Chart.yaml" in config.files else library
     root = f"appdefs/{plan.name}"
     found = {f"{root}/appdef.yaml": _appdef(plan, _prefixes(plan, config))}

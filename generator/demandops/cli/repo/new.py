@@ -98,7 +98,7 @@ def application(  # noqa: PLR0913 - as many as options
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
 
     def made(config: Config) -> Files:
-        new_application.refuse_known(name, config)
+        new_application.refuse_name(name, config)
         values = _completed(given)
         made_services = tuple(_service(one) for one in values["--service"])
         plan = ApplicationPlan(
