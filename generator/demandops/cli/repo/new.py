@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.config.load import load
 from demandops.config.registry import Image
 from demandops.decision import State, try_configuration
@@ -109,6 +109,13 @@ def application(  # noqa: PLR0913 - as many as options
             _image(values["--image"][0]),
             node or _example_node(config),
         )
+        if domain := new_application.closed_domain(plan, config):
+            then.insert(
+                0,
+                f"to let it be demanded: no rule of access domain '{domain.name}' allows it on "
+                f"{plan.node}; widen one, such as '{domain.rules[0].name}', in "
+                f"{config.file_of(DOMAINS_FILE, domain.name)}",
+            )
         return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
 
     then = [
