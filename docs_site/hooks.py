@@ -43,6 +43,8 @@ OF_THE_ROOT = {
 _LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(#[^)\s]*)?(?=\))")
 _CODE = re.compile(r"^```[\s\S]*?^```|^(?: {4}|\t).*$|`[^`\n]+`", re.MULTILINE)
 _BAR = re.compile(r"`[^`\n]*\\\|[^`\n]*`")
+# The path above a file, which forges need because they show no title of a block.
+_PATH = re.compile(r"^`([^`\n]+)`:\n\n(?=```\w* title=\"\1\")", re.MULTILINE)
 # A paragraph that begins like a list or holds a table's bar: markdown has not read it as one.
 _LOST = re.compile(r"<p>(?:[-*|] |\d+\. )|<p>[^<]*\n(?:[-*|] |\d+\. )")
 _OTHER_HOST = re.compile(
@@ -80,9 +82,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Let links out of docs/ lead to the site's page; show `\\|` in a table as the forges do."""
+    """Let links out of docs/ lead to the site's page; show `\\|` in a table as the forges do.
+
+    A file's path stands above it for the forges; here its block has it as the title.
+    """
     if page.file.src_uri not in (*OF_THE_ROOT.values(), *GENERATED):
         markdown = _moved(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
+    markdown = _PATH.sub("", markdown)
     return _BAR.sub(lambda code: code[0].replace("\\|", "|"), markdown)
 
 

@@ -150,15 +150,21 @@ def fault(field: str, message: str, *, code: str = "invalid") -> Fault:
     return Fault(code=code, field=field, message=message)
 
 
+def closest(word: str, known: Iterable[str]) -> str | None:
+    """Return the similar word that is known, or None."""
+    close = get_close_matches(word, _neighbors(word, sorted(known)), n=1)
+    return close[0] if close else None
+
+
 def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     """Return ``; did you mean 'x'?`` for a similar word, else the known words.
 
     Return an empty string if no words are known.
     """
     names = sorted(known)
-    close = get_close_matches(word, _neighbors(word, names), n=1)
+    close = closest(word, names)
     if close:
-        return f"; did you mean '{close[0]}'?"
+        return f"; did you mean '{close}'?"
     if not names:
         return ""
     listed = ", ".join(names[:most]) + (", …" if len(names) > most else "")

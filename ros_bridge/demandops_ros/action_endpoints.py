@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -41,7 +40,7 @@ def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rcl
     A client discovers the node before the node discovers the client, and an answer to a client
     that is not discovered yet is lost.
     """
-    nobodys = UUID(uuid=list(uuid.uuid4().bytes))
+    nobodys = UUID(uuid=list(bytes.fromhex(REAL.fresh_id().replace("-", ""))))
     return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
 
 

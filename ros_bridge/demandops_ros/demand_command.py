@@ -77,7 +77,7 @@ def _read_document(file: str) -> dict[str, Any]:
     name, text = read_input(file)
     data = strict_yaml.load(text, name)
     if not isinstance(data, dict) or data.get("kind") != "Demand":
-        message = "must be a mapping with kind: Demand"
+        message = "must be a mapping with kind: Demand; for a DeploymentRequest: demandops request"
         raise InvalidInput([fault("kind", message).within(name)])
     return data
 

@@ -53,3 +53,14 @@ def test_commands_say_what_runs_them(page: str) -> None:
     for block in BLOCKS[page]:
         for path in re.findall(r"tests/[\w/.]*\w", block.tag):
             assert ROOT.joinpath(path).exists(), f"{page}:{block.line}: there is no {path}"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_file_has_its_path_above_it_because_forges_show_no_title(page: str) -> None:
+    text = ROOT.joinpath(page).read_text()
+    untold = [
+        title
+        for title in re.findall(r"^```\w* title=\"([^\"]*)\"", text, re.MULTILINE)
+        if not re.search(rf"^`{re.escape(title)}`:\n\n```\w* title=", text, re.MULTILINE)
+    ]
+    assert untold == [], "put the path as `PATH`: above the block"

@@ -229,6 +229,7 @@ class TestWhy:
             ("od-edge-vehicle09", DETECTION),  # which ran once
             ("vehicle02/edgy", "vehicle02/edge"),
             (f"{FUSION[:-1]}x", FUSION),
+            ("fuson", "fusion"),  # a part of a release's name, which is enough
         ):
             told = f"error: nothing called '{name}' runs or ever ran; did you mean '{hint}'?\n"
             assert demandops("why", name, "--state-repo", played.path) == (1, "", told)

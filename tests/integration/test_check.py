@@ -186,10 +186,19 @@ def test_what_the_merge_target_has_already_is_no_consequence(
 
 def test_a_folder_that_is_no_state_repo(demandops: Run, tmp_path: Path) -> None:
     said = (
-        f"error: {tmp_path} is not a state repo, because it has no demandops.yaml; `demandops "
-        "init` makes one\n"
+        f"error: {tmp_path} is not a state repo, because it has no demandops.yaml; name a "
+        "checkout of one, or make one with `demandops init`\n"
     )
     assert demandops("check", tmp_path) == (1, "", said)
+
+
+def test_a_bare_repository_has_nothing_to_check(demandops: Run, state: GitRepo) -> None:
+    assert demandops("check", state.path) == (
+        1,
+        "",
+        f"error: {state.path} is a bare repository, which has no files to edit; clone it, and use "
+        f"the clone: git clone {state.path}\n",
+    )
 
 
 def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None:

@@ -146,6 +146,9 @@ def test_names_and_filters_that_fit_nothing_known_are_refused(
     ran = demandops("get", "vehicles", *where)
     assert ran.code == 2
     assert "there is no kind 'vehicles'; did you mean 'services'?" in ran.err
+    ran = demandops("get", "--state-repo", fleet.path)
+    assert ran.code == 2
+    assert "Missing argument 'KIND': one of claims, connections, demands, " in ran.err
     assert demandops("get", "leases", "--node", "cloud", *where).out == "no leases\n"
 
 
@@ -227,8 +230,11 @@ class TestWhichStateRepo:
         monkeypatch.chdir(clone)
         before = fleet.tip
         ran = demandops("request", "-", stdin=yaml.safe_dump(perception(id="more")))
-        assert (ran.code, ran.err) == (0, "")
+        assert (ran.code, ran.err) == (0, "to see it in this checkout: git pull\n")
         assert git(fleet, "rev-parse", "main~1") == before
+        more = yaml.safe_dump(perception(id="again"))
+        told = demandops("request", "-", "--state-repo", fleet.path, stdin=more)
+        assert (told.code, told.err) == (0, "")
         git(clone, "remote", "remove", "origin")
         ran = demandops("request", "-", stdin=yaml.safe_dump(goal()))
         assert ran.code == 2

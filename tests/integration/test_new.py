@@ -92,7 +92,21 @@ def test_the_example_is_demanded_by_whom_the_rules_allow(checkout: Path, demando
     policy.write_text(policy.read_text().rstrip("\n") + "\n" + rule)
     assert demandops(*APPLICATION, "-C", checkout).code == 0
     demand = yaml.safe_load((checkout / "appdefs" / "tracking" / "demand.yaml").read_text())
-    assert demand["requesters"] == ["vehicle"]
+    assert demand["requesters"] == ["vehicle00"]
+
+
+def test_rules_that_do_not_allow_the_application_are_told(checkout: Path, demandops: Run) -> None:
+    policy = checkout / "policy" / "access-domains.yaml"
+    rule = "    rules: [{name: cars, requesters: ['vehicle*'], applications: ['object-*']}]\n"
+    policy.write_text(policy.read_text().rstrip("\n") + "\n" + rule)
+    ran = demandops(*APPLICATION, "-C", checkout)
+    assert ran.code == 0
+    assert (
+        "to let it be demanded: no rule of access domain 'perception' allows it on edge; widen "
+        "one, such as 'cars', in policy/access-domains.yaml\n"
+    ) in ran.out
+    demand = yaml.safe_load((checkout / "appdefs" / "tracking" / "demand.yaml").read_text())
+    assert demand["requesters"] == ["vehicle00"]
 
 
 def test_an_access_domain_beside_one_that_has_every_node_is_refused(
@@ -132,10 +146,25 @@ def test_an_access_domain_and_an_override(checkout: Path, demandops: Run) -> Non
             1,
             "error: NAME: 'object-detection-fusion' exists already; choose another name",
         ),
-        (["new", "application", "../x", *OPTIONS], 1, "error: "),
-        (["new", "application", "Big_Name", *OPTIONS], 1, "error: "),
+        (["new", "application", "../x", *OPTIONS], 1, "error: NAME: '../x' cannot be used here"),
+        (
+            ["new", "application", "Big_Name", *OPTIONS],
+            1,
+            "error: NAME: 'Big_Name' cannot be used here; write lower-case letters, digits and '-' "
+            "between them, such as c-its\n",
+        ),
         ([*APPLICATION[:-1], "tracker=launch"], 2, "'tracker=launch' is not NAME=PACKAGE/FILE"),
-        (["new", "application", "x"], 2, "Missing option '--input'."),
+        (["new", "application", "x"], 2, "Missing options '--input', '--service', '--image'."),
+        (
+            ["new", "application", "object-detection-fusion"],
+            1,
+            "error: NAME: 'object-detection-fusion' exists already; choose another name",
+        ),
+        (
+            ["new", "application", "x", *OPTIONS, "--input", "camera=sensor_msgs/Image"],
+            2,
+            "write camera=sensor_msgs/msg/Image",
+        ),
         (
             ["new", "node", "edge", "--type", "edge", "--cluster", "c-its"],
             1,

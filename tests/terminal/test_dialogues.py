@@ -12,11 +12,20 @@ from tests.kit.repo import GitRepo
 
 def test_what_is_not_given_is_asked_for(checkout: Path) -> None:
     with Dialogue("new", "application", "tracking", folder=checkout) as talk:
-        talk.read_until("Inputs (role=type, separated by spaces): ")
+        talk.read_until("such as camera=sensor_msgs/msg/Image; several with spaces: ")
+        talk.type("camera\n")
+        talk.read_until("Error: 'camera' is not ROLE=TYPE; write it like")
+        talk.read_until("several with spaces: ")
+        talk.type("camera=sensor_msgs/Image\n")
+        talk.read_until("write camera=sensor_msgs/msg/Image")
+        talk.read_until("several with spaces: ")
+        talk.type("\n")
+        talk.read_until("Error: an answer is needed; Ctrl-C ends, and nothing is written")
+        talk.read_until("several with spaces: ")
         talk.type("camera=sensor_msgs/msg/Image\n")
-        talk.read_until("Services (name=package/file, separated by spaces): ")
+        talk.read_until("such as detector=my_package/detector.launch.py; several with spaces: ")
         talk.type("tracker=tracking/tracker.launch.py\n")
-        talk.read_until("Image, with a tag or digest: ")
+        talk.read_until("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0: ")
         talk.type("ghcr.io/me/tracking:1.0\n")
         assert talk.end() == 0, talk.text
     assert "to check it: demandops check" in talk.text

@@ -27,6 +27,7 @@ Command = Callable[..., Any]
 _VARIABLE = "DEMANDOPS_STATE_REPO"
 _NAME = "demandops.context-name"
 _CONTEXT = "demandops.context"
+_BEHIND = "demandops.checkout-behind"
 _NO_STATE_REPO = (
     "Which state repo? Give --state-repo, run the command in a checkout of one, or name it once: "
     "demandops config set NAME --state-repo URL_OR_DIR"
@@ -76,7 +77,17 @@ def _writable() -> str | None:
         raise click.UsageError(
             f"the checkout {around} has no remote 'origin' to write to; give --state-repo"
         )
+    click.get_current_context().meta[_BEHIND] = True
     return origin
+
+
+def hint_to_pull() -> list[str]:
+    """Return a line for a command that wrote to the remote of the checkout it was run in.
+
+    The checkout does not have the commit, and commands that read show what is checked out.
+    """
+    behind = click.get_current_context().meta.get(_BEHIND)
+    return ["to see it in this checkout: git pull"] if behind else []
 
 
 def _from_context(field: str) -> Callable[[], str | None]:

@@ -75,7 +75,10 @@ def web_address(repo: str) -> str:
         parts = urlsplit(repo)
         host, path = parts.hostname or "", parts.path.removeprefix("/")
     if not host:
-        raise NoAccess("the state repo's URL names no host")
+        raise NoAccess(
+            "the state repo's URL names no host, by which Argo CD knows it; write "
+            "https://HOST/PATH or ssh://USER@HOST/PATH in demandops.yaml: argocd.url"
+        )
     return f"https://{host}/{path.removesuffix('.git')}"
 
 

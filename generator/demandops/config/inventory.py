@@ -267,7 +267,8 @@ class Node(CamelModel):
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
                 "the id is not a valid label value, so no cluster node can have the label node_id "
-                "with it; add a selector"
+                "with it; choose an id of up to 63 letters, digits, '-', '_' and '.', or add a "
+                "selector"
             )
         return self
 

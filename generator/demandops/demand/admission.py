@@ -202,13 +202,18 @@ def _instance(
 
 def _unknown_application(name: str, config: Config) -> Fault:
     if name.startswith("#"):  # the number of a DeploymentRequest
-        known = "; known: " + ", ".join(
+        types = [
             f"{appdef.deployment_request.type} ({appdef.name})"
             for appdef in config.appdefs.values()
             if appdef.deployment_request
-        )
+        ]
+        none = "; no appdef.yaml has a deploymentRequest.type: add one, commit and push it"
+        known = f"; known: {', '.join(types)}" if types else none
     else:
-        known = suggestion(name, config.appdefs)
+        none = (
+            "; appdefs/ on main has none: add one (demandops new application), commit and push it"
+        )
+        known = suggestion(name, config.appdefs) or none
     shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
     message = f"{shown} is not a known application type{known}"
     return fault("appdef", message, code="unknown-application")

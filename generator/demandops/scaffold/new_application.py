@@ -14,13 +14,16 @@ from typing import Any
 
 from demandops.charts import chart_schema, values_table
 from demandops.config.config import Config
-from demandops.config.policy import matches
+from demandops.config.policy import AccessDomain, Rule, matches
 from demandops.config.registry import Image
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.errors import InvalidInput
+from demandops.identifiers import PATTERN_WORDS
+from demandops.quoting import quoted
 from demandops.scaffold.written import document
 
 LIBRARY_FOLDER = f"appdefs/charts/{chart_schema.LIBRARY}"
+_NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 _RESULT = "result"
 _REQUESTER = "operator"
 _VERSION = "0.1.0"
@@ -50,6 +53,21 @@ class ApplicationPlan:
     node: str
 
 
+def refuse_name(name: str, config: Config) -> None:
+    """Refuse a name that cannot be used, or that an application, a chart or an image has.
+
+    Raises:
+        InvalidInput: the name is one of these.
+    """
+    if not _NAME.fullmatch(name):
+        raise InvalidInput.at(
+            "NAME",
+            f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}",
+        )
+    if name in config.appdefs or name in config.charts or name in config.images:
+        raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
+
+
 def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> dict[str, str]:
     """Return path → text of a new application.
 
@@ -61,8 +79,7 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
     Raises:
         InvalidInput: the configuration has an application or a chart of this name.
     """
-    if plan.name in config.appdefs or plan.name in config.charts or plan.name in config.images:
-        raise InvalidInput.at("NAME", f"'{plan.name}' exists already; choose another name")
+    refuse_name(plan.name, config)
     known = config.files if f"{LIBRARY_FOLDER}/Chart.yaml" in config.files else library
     root = f"appdefs/{plan.name}"
     found = {f"{root}/appdef.yaml": _appdef(plan, _prefixes(plan, config))}
@@ -261,13 +278,34 @@ A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas
 
 
 def _requester(plan: ApplicationPlan, config: Config) -> str:
-    """Return who may demand the example, by the rules of its node's access domain."""
+    """Return who may demand the example, by the rules of its node's access domain.
+
+    If no rule is for it, the first one is meant to be widened (``closed_domain``).
+    """
     domain = config.domain_of.get(plan.node)
-    for rule in domain.rules if domain else ():
-        if matches(plan.name, rule.applications) and matches(plan.node, rule.nodes):
-            name = rule.requesters[0].replace("?", "1").replace("*", "")
-            return name or _REQUESTER
-    return _REQUESTER
+    rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
+    if not rules:
+        return _REQUESTER
+    pattern = rules[0].requesters[0]
+    node = next((id for id in sorted(config.nodes) if matches(id, (pattern,))), "")
+    everybody = pattern.strip("*") == ""
+    return _REQUESTER if everybody else node or pattern.replace("?", "1").replace("*", "")
+
+
+def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
+    """Return the rules of the example's access domain that allow the application on its node."""
+    domain = config.domain_of.get(plan.node)
+    return tuple(
+        rule
+        for rule in (domain.rules if domain else ())
+        if matches(plan.name, rule.applications) and matches(plan.node, rule.nodes)
+    )
+
+
+def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
+    """Return the access domain of the example's node if it has rules, but none that allows it."""
+    domain = config.domain_of.get(plan.node)
+    return domain if domain and domain.rules and not _rules_for(plan, config) else None
 
 
 def _demand(plan: ApplicationPlan, config: Config) -> str:

@@ -18,8 +18,8 @@ def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
     path = f"inventory/nodes/{object_name('', id)}.yaml"
     entry = {"id": id, "type": type, "cluster": cluster}
     note = (
-        "docs/inventory.md of DemandOps explains each field, as do the comments of\n"
-        "inventory/nodes.yaml. `topics` names the usual topic for each input of applications."
+        "The comments of inventory/nodes.yaml explain each field. `topics` names the usual topic\n"
+        "for each input of applications."
     )
     found = {path: document(path, "nodes", "Nodes", {"nodes": [entry]}, note)}
     if cluster not in config.clusters:

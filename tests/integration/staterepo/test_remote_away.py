@@ -196,7 +196,8 @@ def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
     with pytest.raises(StateRepoError) as error:
         Generator("ssh://git@edge/state.git")
     assert str(error.value) == (
-        "ssh://edge/state.git cannot be fetched: git@edge: Permission denied (publickey)."
+        "ssh://edge/state.git cannot be fetched: git@edge: Permission denied (publickey); give git "
+        "credentials for it: a credential helper, ~/.netrc or an SSH key"
     )
 
 

@@ -53,7 +53,7 @@ def with_health(follower: Follower, **named: Health) -> Situation:
 
 def test_without_clusters_the_page_says_what_it_cannot_know(look: Look) -> None:
     page = look("/")
-    assert page.texts("h1") == ["Nothing in the state repo stands in the way"]
+    assert page.texts("h1") == ["Nothing in the state repo keeps an application from being ready"]
     assert "does not watch the clusters" in page.text
 
 

@@ -52,6 +52,7 @@ def test_a_folder_that_exists_wins_over_what_its_name_looks_like(
     assert not is_url("host:path")
 
 
+NO_HOST = "the state repo's address names no host after"
 HIDDEN = (
     "the state repo's address holds a password or token, which process lists would show; "
     "remove it and use a credential helper, ~/.netrc or an SSH key"
@@ -83,6 +84,12 @@ SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or 
         ("ext::sh -c touch% evil", "a state repo's address cannot start with"),
         ("ext::sh -c touch% evil% ://", "a state repo's address cannot start with"),
         ("testgit::x:y", "a state repo's address cannot start with"),
+        # without a host, which git would take from the path
+        ("https://", f"{NO_HOST} 'https://'; write https://HOST/PATH, or"),
+        ("https:///x", f"{NO_HOST} 'https://'; write https://HOST/PATH, or"),
+        ("ssh:///x", f"{NO_HOST} 'ssh://'; write ssh://HOST/PATH, or"),
+        ("ssh://git@/x", f"{NO_HOST} 'ssh://'; write ssh://HOST/PATH, or"),
+        ("http://:80/x", f"{NO_HOST} 'http://'; write http://HOST/PATH, or"),
         # what looks like an option, or is mistyped
         ("-oProxyCommand=touch@x:y", ""),
         ("--upload-pack=touch@x:y", ""),

@@ -23,7 +23,7 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.names import names_of
 from demandops.cli.output import errors
-from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.target import hint_to_pull, signing_option, writable_repo_option
 from demandops.config.base_model import parse_file
 from demandops.config.override import Override, OverrideFile
 from demandops.config.repo_settings import Proposals
@@ -213,6 +213,7 @@ def _lines(edit: Edit, data: Json) -> Iterator[str]:
     if data["outcome"] == "committed":
         yield f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}"
         yield "a running generator carries it out; so does the next one that starts"
+        yield from hint_to_pull()
     elif data["outcome"] == "proposed":
         yield f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()
     else:
@@ -225,7 +226,7 @@ def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
     found += [f"  {verb} {claim.subject} of {claim.demand}" for claim in entry.claims]
-    return found or [f"  {verb} nothing now"]
+    return found or ["  affects nothing now"]
 
 
 def warn_of_idle(entry: Entry) -> None:

@@ -19,7 +19,7 @@ from demandops.cli.actions.ledger_change import (
 )
 from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
-from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.target import hint_to_pull, signing_option, writable_repo_option
 from demandops.decision import admit, decide, form_faults
 from demandops.demand.demand_goal import is_demand_goal
 from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
@@ -320,3 +320,6 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:
             errors.print(f"  not held: {item}")
+    if not dry_run and any(row["outcome"] in ("booked", "released") for row in rows):
+        for line in hint_to_pull():
+            errors.print(line)

@@ -87,11 +87,6 @@ def init(
     )
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
-    if example == "none":
-        lines += [
-            "to fill it: demandops new node, inventory/brokers.yaml, policy/access-domains.yaml,",
-            "            demandops new application (--help has examples)",
-        ]
     if not url:
         lines.append(
             "no cluster can follow it yet: write the url that clusters fetch to demandops.yaml"
@@ -103,10 +98,15 @@ def init(
             "kubectl apply -f -"
         )
     if bare:
+        lines.append(f"to see or edit its files: git clone {directory}")
+    if example == "none":
+        where = ", in the clone" if bare else ""
         lines += [
-            f"next: demandops serve --state-repo {directory}",
-            f"to see or edit its files: git clone {directory}",
+            f"to fill it{where}: demandops new node, inventory/brokers.yaml, demandops new",
+            "            application (--help has examples); then demandops check, commit and push",
         ]
+    if bare:
+        lines.append(f"next: demandops serve --state-repo {directory}")
     else:
         lines += [
             "next: edit inventory/ and policy/, commit, push it to your Git server, and run",

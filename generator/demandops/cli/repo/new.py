@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.config.load import load
 from demandops.config.registry import Image
 from demandops.decision import State, try_configuration
@@ -24,6 +24,8 @@ from demandops.staterepo import skeleton
 from demandops.staterepo.pull_request import worktree
 
 _IMAGE = re.compile(r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:.*))?")
+_INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
+_SHORT_TYPE = re.compile(r"(?P<package>\w+)/(?P<name>\w+)")
 _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
 Files = Mapping[str, str]
 
@@ -93,19 +95,27 @@ def application(  # noqa: PLR0913 - as many as options
       demandops new application tracking
       demandops new application tracking --input camera=sensor_msgs/msg/Image
     """
-    inputs = inputs or _prompted("input", "Inputs (role=type, separated by spaces)")
-    services = services or _prompted("service", "Services (name=package/file, separated by spaces)")
-    (image,) = (image,) if image else _prompted("image", "Image, with a tag or digest")
+    given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
 
     def made(config: Config) -> Files:
+        new_application.refuse_name(name, config)
+        values = _completed(given)
+        made_services = tuple(_service(one) for one in values["--service"])
         plan = ApplicationPlan(
             name,
-            description or f"Runs {', '.join(one.partition('=')[0] for one in services)}",
-            dict(_pair(one, "--input", "ROLE=TYPE") for one in inputs),
-            tuple(_service(one) for one in services),
-            _image(image),
+            description or f"Runs {', '.join(one.name for one in made_services)}",
+            dict(_input(one) for one in values["--input"]),
+            made_services,
+            _image(values["--image"][0]),
             node or _example_node(config),
         )
+        if domain := new_application.closed_domain(plan, config):
+            then.insert(
+                0,
+                f"to let it be demanded: no rule of access domain '{domain.name}' allows it on "
+                f"{plan.node}; widen one, such as '{domain.rules[0].name}', in "
+                f"{config.file_of(DOMAINS_FILE, domain.name)}",
+            )
         return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
 
     then = [
@@ -154,6 +164,9 @@ def policy(
     output: str,
 ) -> None:
     """Write a new access domain: who may demand what on which nodes.
+
+    A node may be in one access domain by patterns. So first narrow those that match it in
+    policy/access-domains.yaml; a new state repo has one domain for every node ("*").
 
     \b
     Examples:
@@ -247,24 +260,58 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     _write(directory, new_image.files(name, repository, url, texts), output, then)
 
 
-def _prompted(option: str, question: str) -> tuple[str, ...]:
-    """Ask for an option's values on the terminal; elsewhere raise that the option is missing."""
-    if not sys.stdin.isatty():
-        raise click.UsageError(f"Missing option '--{option}'.")
-    return tuple(str(click.prompt(question)).split())
+def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Ask for the options that are missing on the terminal; elsewhere raise which are missing."""
+    missing = [option for option, values in given.items() if not values]
+    if missing and not sys.stdin.isatty():
+        options = ", ".join(f"'{option}'" for option in missing)
+        raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
+    return {option: values or _asked(*_QUESTIONS[option]) for option, values in given.items()}
 
 
-def _pair(text: str, option: str, form: str) -> tuple[str, str]:
-    name, mark, value = text.partition("=")
-    if not (name and mark and value):
-        raise click.BadParameter(f"'{text}' is not {form}", param_hint=option)
-    return name, value
+def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
+    """Ask until every word of the answer is valid."""
+
+    def valid(answer: str) -> tuple[str, ...]:
+        words = tuple(answer.split())
+        if not words:
+            raise click.UsageError("an answer is needed; Ctrl-C ends, and nothing is written")
+        if most is not None and len(words) > most:
+            raise click.UsageError(f"'{answer}' has {len(words)} words; give {most}")
+        for word in words:
+            check(word)
+        return words
+
+    found: tuple[str, ...] = click.prompt(
+        question, default="", show_default=False, value_proc=valid
+    )
+    return found
+
+
+def _input(text: str) -> tuple[str, str]:
+    found = _INPUT.fullmatch(text)
+    if not found:
+        raise click.BadParameter(
+            f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
+            param_hint="--input",
+        )
+    if short := _SHORT_TYPE.fullmatch(found["type"]):
+        raise click.BadParameter(
+            f"'{text}' has no message type of ROS 2; write "
+            f"{found['role']}={short['package']}/msg/{short['name']}",
+            param_hint="--input",
+        )
+    return found["role"], found["type"]
 
 
 def _service(text: str) -> ServicePlan:
     found = _SERVICE.fullmatch(text)
     if not found:
-        raise click.BadParameter(f"'{text}' is not NAME=PACKAGE/FILE", param_hint="--service")
+        raise click.BadParameter(
+            f"'{text}' is not NAME=PACKAGE/FILE; write it like "
+            "detector=my_package/detector.launch.py",
+            param_hint="--service",
+        )
     return ServicePlan(found["name"], found["package"], found["file"])
 
 
@@ -277,6 +324,23 @@ def _image(text: str) -> Image:
     return Image.model_construct(
         repository=found["repository"], tag=found["tag"], digest=found["digest"]
     )
+
+
+_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
+    "--input": (
+        "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; several with spaces",
+        _input,
+        None,
+    ),
+    "--service": (
+        "Services, as name=package/file, such as detector=my_package/detector.launch.py; several "
+        "with spaces",
+        _service,
+        None,
+    ),
+    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
+}
+"""The option that is asked for → the question, what refuses a bad word, and how many there are."""
 
 
 def _example_node(config: Config) -> str:

@@ -44,8 +44,10 @@ _COLORS = {
 }
 
 
-def _kind(ctx: click.Context, param: click.Parameter, value: str) -> str:
+def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     """Return the name of a kind, which may be given in the singular."""
+    if value is None:
+        raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
     for name in (value, f"{value}s"):
         if name in KINDS:
             return name
@@ -75,7 +77,7 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.command()
-@click.argument("kind", callback=_kind, shell_complete=_kinds, metavar="KIND")
+@click.argument("kind", required=False, callback=_kind, shell_complete=_kinds, metavar="KIND")
 @click.argument("names", nargs=-1, metavar="[NAME…]", shell_complete=_item_names)
 @state_repo_option
 @_filters

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from demandops.config.config import NODES_FILE
-from demandops.errors import StateRepoError, suggestion
+from demandops.errors import StateRepoError, closest, suggestion
 from demandops.ledger import claim_file
 from demandops.ledger.world import World
 from demandops.plan.release import Release
@@ -62,13 +62,17 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         raise StateRepoError(f"{quoted(name)} can mean several: {kinds}; choose one with --kind")
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
+    running_names = {release.name for release in release_causes.releases(world)}
     known = {
-        *(release.name for release in release_causes.releases(world)),
+        *running_names,
         *repo.stopped_release_names(str(snapshot.commit)),
     }
     known |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
     known |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
     known |= {id for kind in ("demand", "requester") for id in world.ledger.indexed_names(kind)}
+    parts = {part for running_name in running_names for part in running_name.split("-")}
+    close = closest(name, known | parts)  # a part of a release's name will do
+    known = {close} if close else known
     raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran{suggestion(name, known)}")
 
 

@@ -93,7 +93,7 @@ def status(
             f"{suggestion(name, found.clusters)}"
         )
     if not clusters and output == "text":
-        errors.print("the state of the clusters is unknown: give --clusters FILE")
+        errors.print("the state of the clusters is unknown: give --clusters FILE (docs/status.md)")
     if amiss := found.amiss(clusters):
         errors.print(f"not well: {amiss}")
         raise click.exceptions.Exit(1)

@@ -40,7 +40,8 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
                 for claim in ledger.claims_of_requester(requester)
             }
         )
-        known = f"; demands in this name: {', '.join(demands[:5])}" if demands else ""
+        never = "; it has ended, or was never booked: see demandops log"
+        known = f"; demands in this name: {', '.join(demands[:5])}" if demands else never
         message = f"'{request.demand}' holds nothing{known}"
         raise Refused([fault("demand", message, code="not-held")])
     refuse_other_owners(held, request)

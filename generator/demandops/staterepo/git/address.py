@@ -19,6 +19,7 @@ from demandops.staterepo.git.repository import StateRepository
 
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
 _SCP = re.compile(r"^([^/\s:]+:(?!:)|[^/\s:]+@\[[^\]/]+\]:)")
+_NO_HOST = re.compile(r"^(https?|ssh|git|git\+ssh)://([^/@]*@)?(:\d*)?(/|$)")
 _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 
 
@@ -80,4 +81,9 @@ def _check_url(url: str) -> None:
         raise StateRepoError(
             "the state repo's address holds a password or token, which process lists would show; "
             "remove it and use a credential helper, ~/.netrc or an SSH key"
+        )
+    if no_host := _NO_HOST.match(url):
+        raise StateRepoError(
+            f"the state repo's address names no host after '{no_host[1]}://'; write "
+            f"{no_host[1]}://HOST/PATH, or the folder of a bare repository"
         )

@@ -49,6 +49,29 @@ _WITHOUT_REASON = re.compile(
     r"and the repository exists|send-pack: unexpected disconnect"
 )
 """Matches git's last lines that tell no reason."""
+_REMEDIES = (
+    (
+        re.compile(r"resolve host|Name or service not known", re.IGNORECASE),
+        "check the host in the address, and the network",
+    ),
+    (
+        re.compile(
+            r"returned error: 40[13]|permission denied|access denied|authentication failed|"
+            r"could not read (username|password)|host key verification failed",
+            re.IGNORECASE,
+        ),
+        "give git credentials for it: a credential helper, ~/.netrc or an SSH key",
+    ),
+    (
+        re.compile(r"not found|returned error: 404|does not appear to be a git", re.IGNORECASE),
+        "check the path in the address, and whether you may read it",
+    ),
+    (
+        re.compile(r"refused|timed out|unreachable|couldn't connect", re.IGNORECASE),
+        "check the host and the port in the address, and the network",
+    ),
+)
+"""Matches git's reason → what to do about it."""
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
@@ -257,7 +280,9 @@ class RemoteRepository(StateRepository):
         if _NO_CLONE.search(text):
             raise self._unreadable()
         failed = "read" if command[0] == "ls-remote" else "fetched"
-        raise RemoteAway(f"{self.address} cannot be {failed}: {_reason(text)}")
+        reason = _reason(text)
+        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(reason)), "")
+        raise RemoteAway(f"{self.address} cannot be {failed}: {reason}{remedy}")
 
     def _unreadable(self) -> Unavailable:
         return Unavailable(
@@ -348,4 +373,4 @@ def _reason(text: str) -> str:
     lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
     telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines
     fatal = [line for line in telling if line.startswith(("fatal:", "error:", "remote:", "!"))]
-    return (fatal or telling or ["git gave no reason"])[-1]
+    return (fatal or telling or ["git gave no reason"])[-1].rstrip(".")

@@ -51,9 +51,14 @@ class Base:
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
     """Return path → text of the state repo's files, and a fault for each symbolic link."""
     if not (folder / "demandops.yaml").is_file():
+        if (folder / "HEAD").is_file():
+            raise StateRepoError(
+                f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
+                f"clone: git clone {folder}"
+            )
         raise StateRepoError(
-            f"{folder} is not a state repo, because it has no demandops.yaml; `demandops init` "
-            "makes one"
+            f"{folder} is not a state repo, because it has no demandops.yaml; name a checkout of "
+            "one, or make one with `demandops init`"
         )
     files, faults = dict[str, str](), list[Fault]()
     for root in _ROOTS:
