@@ -19,9 +19,9 @@ def read_input(file: str | Path) -> tuple[str, str]:
         data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
         return name, data.decode("utf-8")
     except OSError as error:
-        problem = f"cannot be read: {error.strerror or error}"
+        problem = f"cannot be read: {error.strerror or error}; check the path"
     except UnicodeDecodeError:
-        problem = "is not UTF-8 text"
+        problem = "is not UTF-8 text; save it as UTF-8"
     raise InvalidInput.at("", problem, file=name)
 
 

@@ -172,9 +172,12 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
         "error: {file}: line 1: anchors and aliases (& and *) are not allowed; write the value "
         "out\n",
     ),
-    "binary": (bytes(range(256)), "error: {file}: is not UTF-8 text\n"),
-    "UTF-16": ("id: a\n".encode("utf-16"), "error: {file}: is not UTF-8 text\n"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "error: {file}: is not UTF-8 text\n"),
+    "binary": (bytes(range(256)), "error: {file}: is not UTF-8 text; save it as UTF-8\n"),
+    "UTF-16": ("id: a\n".encode("utf-16"), "error: {file}: is not UTF-8 text; save it as UTF-8\n"),
+    "a picture": (
+        b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
+        "error: {file}: is not UTF-8 text; save it as UTF-8\n",
+    ),
     "a tab": (
         "id: a\n\tapps: []\n",
         "error: {file}: line 2, column 1: not valid YAML: ",
@@ -338,9 +341,12 @@ class TestYamlAttacks:
         self, demandops: Send, state: Any, tmp_path: Path
     ) -> None:
         for file, told in (
-            (tmp_path / "none", f"{tmp_path}/none: cannot be read: No such file or directory"),
-            (tmp_path, f"{tmp_path}: cannot be read: Is a directory"),
-            ("-", "standard input: is not UTF-8 text"),
+            (
+                tmp_path / "none",
+                f"{tmp_path}/none: cannot be read: No such file or directory; check the path",
+            ),
+            (tmp_path, f"{tmp_path}: cannot be read: Is a directory; check the path"),
+            ("-", "standard input: is not UTF-8 text; save it as UTF-8"),
         ):
             ran = demandops("request", file, "--state-repo", state.path, stdin=bytes(range(256)))
             assert ran == (1, "", f"error: {told}\n")
