@@ -130,7 +130,7 @@ def test_an_access_domain_and_an_override(checkout: Path, demandops: Run) -> Non
     assert demandops("new", "policy", "cloud", *options).code == 0
     select = ["--service", "object-detection", "--node", "edge"]
     why = ["--reason", "a test", "--owner", "petra", "-C", checkout]
-    assert demandops("new", "override", "quiet", *select, "--effect", "deny", *why).code == 0
+    assert demandops("new", "override", "quiet", *select, "--deny", *why).code == 0
     assert demandops("new", "override", "none", *select, "--replicas", "0", *why).code == 0
     found = yaml.safe_load((checkout / "overrides" / "quiet.yaml").read_text())
     assert found["select"] == [{"services": ["object-detection"], "nodes": ["edge"]}]
@@ -181,8 +181,7 @@ def test_an_access_domain_and_an_override(checkout: Path, demandops: Run) -> Non
                 "o",
                 "--node",
                 "edge",
-                "--effect",
-                "hold",
+                "--hold",
             ],
             1,
             "error: ",

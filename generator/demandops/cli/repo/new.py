@@ -6,7 +6,6 @@ import re
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -181,17 +180,15 @@ def policy(
 
 @new.command()
 @click.argument("name")
-@click.option("--reason", required=True, metavar="TEXT", help="Why it is needed.")
+@click.option("-m", "--reason", required=True, metavar="TEXT", help="Why it is needed.")
 @click.option("--owner", required=True, metavar="NAME", help="Who is responsible for it.")
 @click.option("--service", "services", multiple=True, metavar="PATTERN", help="Selects services.")
 @click.option("--application", "apps", multiple=True, metavar="PATTERN", help="Selects by id.")
 @click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Selects by node.")
-@click.option(
-    "--effect",
-    type=click.Choice(["hold", "deny", "keep"]),
-    help="Keep the files as they are, stop and refuse, or keep running without a demand.",
-)
-@click.option("--replicas", type=click.IntRange(min=0), metavar="N", help="How many pods run.")
+@click.option("--hold", is_flag=True, help="Keep the files as they are.")
+@click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
+@click.option("--keep", is_flag=True, help="Keep services running without a demand.")
+@click.option("--replicas", type=click.IntRange(min=0), metavar="N", help="Set the replicas.")
 @directory_option
 @output_option
 def override(  # noqa: PLR0913 - as many as options
@@ -202,7 +199,9 @@ def override(  # noqa: PLR0913 - as many as options
     services: tuple[str, ...],
     apps: tuple[str, ...],
     nodes: tuple[str, ...],
-    effect: str | None,
+    hold: bool,
+    deny: bool,
+    keep: bool,
     replicas: int | None,
     directory: Path,
     output: str,
@@ -211,15 +210,20 @@ def override(  # noqa: PLR0913 - as many as options
 
     \b
     Examples:
-      demandops new override calm --node edge --effect deny --reason why --owner petra
+      demandops new override calm --node edge --deny -m "Demonstration" --owner petra
     """
     given = {"services": services, "applications": apps, "nodes": nodes}
     select = {field: [*values] for field, values in given.items() if values}
     if not select:
         raise click.UsageError("say what it selects: --service, --application or --node")
-    if (effect is None) == (replicas is None):
-        raise click.UsageError("give one effect: --effect or --replicas")
-    does: dict[str, Any] = {"replicas": replicas} if effect is None else {effect: True}
+    effects = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
+    does = {
+        effect: value
+        for effect, value in {**effects, "replicas": replicas}.items()
+        if value is not None
+    }
+    if len(does) != 1:
+        raise click.UsageError("give one effect: --hold, --deny, --keep or --replicas")
     _lay_down(
         directory,
         lambda config: new_entry.override(name, reason, owner, select, does, config),
