@@ -1,6 +1,6 @@
 """Pull requests of proposals at a forge: GitHub, and Gitea or Forgejo.
 
-Knows pull requests and HTTP, but not demands or Git: the branch has already been pushed. GitLab
+It knows pull requests and HTTP, but not demands or Git: the branch is already pushed. GitLab
 needs no call: it opens a merge request because of the push's options
 (:mod:`demandops.staterepo.write.proposal_branch`).
 """

@@ -60,7 +60,7 @@ def quoted(value: str, most: int = 80) -> str:
 
 
 def json_escaped(text: str) -> str:
-    """Return JSON text with JSON's own escape for what is not visible: the same data."""
+    """Return JSON text of the same data, with JSON's own escapes for what is not visible."""
     if is_visible(text.replace("\n", "")):
         return text
     return "".join(

@@ -33,7 +33,7 @@ _LONGEST_REASON = 300
 class Runtime:
     """The runtime of this machine; a subclass overrides the methods that it replaces.
 
-    ``unsound`` is why the process must end, if it must; ``when_unsound`` is called then.
+    ``unsound`` says why the process must end, if it must; it then calls ``when_unsound``.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class Runtime:
             log.info("%s works again", name)
 
     def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
-        """Start a thread that is started again if it fails, after a pause that grows.
+        """Start a thread and return it; if it fails, start it again after a pause that grows.
 
         After :class:`Unsound` it is not started again: the process must end.
         """

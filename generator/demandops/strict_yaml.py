@@ -29,10 +29,10 @@ _WORDS = frozenset(
 )  # some parsers do not read these words as text
 
 MAX_LENGTH = 4_000_000
-"""The most characters of a file; an inventory of 20,000 nodes has fewer."""
+"""How many characters a file may have; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""The most bits of a whole number; Python prints at most 4,300 digits."""
+"""How many bits a whole number may have; Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
@@ -75,7 +75,7 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a stand-in is not the value of a field, but part of a text, say."""
+    """Raised if a stand-in is not the value of a field, but, for example, part of a text."""
 
 
 class _Parser:
@@ -176,7 +176,7 @@ def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
 
 
 def _number(value: object) -> str:
-    """Return what is written for a number, a truth value or nothing."""
+    """Return the text of a number, a truth value or null."""
     return str(_REPRESENTER.represent_data(value).value)
 
 
@@ -244,13 +244,13 @@ _LISTED = re.compile(
 )
 """Matches a field with a list of plain texts, as :func:`to_json` writes it."""
 _LONG = 200
-"""From how many characters on the json module reads such a list: PyYAML takes 20 times as long."""
+"""The json module reads a list of this many characters: PyYAML takes 20 times as long."""
 _STAND_IN = "demandops-list"
 """Stands for a long list while PyYAML reads what is around it."""
 
 
 def _load_around_lists(text: str) -> list[Any]:
-    """Return the document of a text with long lists; nothing if it has none or is not so simple."""
+    """Return the document of a text with long lists; an empty list if that fails."""
     lists: dict[str, list[str]] = {}
 
     def stand_in(match: re.Match[str]) -> str:

@@ -50,13 +50,13 @@ EMPTY = ContextsFile(apiVersion=API_VERSION, kind="Contexts")
 
 
 def path() -> Path:
-    """Return the path of the file."""
+    """Return the path of the file with the contexts."""
     root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(root) / "demandops" / "contexts.yaml"
 
 
 def read() -> ContextsFile:
-    """Read the file; without one there are no contexts.
+    """Return the contexts in the file; without a file there are none.
 
     Raises:
         InvalidInput: with all faults.
@@ -77,7 +77,7 @@ def parsed(data: dict[str, Any]) -> ContextsFile:
 
 
 def write(content: ContextsFile) -> None:
-    """Replace the file, which only its owner may read."""
+    """Replace the file with the contexts; only its owner may read it."""
     file = path()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)

@@ -45,7 +45,7 @@ class Table:
     styles: dict[str, str] = field(default_factory=dict)
     """Colors of cells, by their text; used on a terminal with colors."""
     whole: bool = False
-    """Whether nothing wraps or is left out, however wide that is."""
+    """Whether to keep every column and wrap nothing, however wide the table gets."""
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
         """Return the table as lines.

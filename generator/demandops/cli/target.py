@@ -34,7 +34,10 @@ _NO_STATE_REPO = (
 
 
 def _chosen(around: Path | None) -> Context | None:
-    """Return the context of --context, of the checkout ``around``, or the current one; keep it."""
+    """Return the context of --context, of the checkout ``around``, or the current one.
+
+    The command keeps it for :func:`_from_context`.
+    """
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
     ctx = click.get_current_context()
@@ -90,7 +93,7 @@ def _from_context(field: str) -> Callable[[], str | None]:
 
 
 def _required(default: Callable[[], str | None]) -> Callable[..., str]:
-    """Return a callback: the address that is given, else the default; without one, the remedy."""
+    """Return a callback that returns the given address, else the default, else raises."""
 
     def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT

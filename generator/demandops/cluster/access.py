@@ -72,7 +72,7 @@ class ClusterAccess(FrozenModel):
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
     """Return the API of the cluster in which this process is a pod, as its service account.
 
-    A call that fails is not tried again.
+    The API does not retry a call that fails.
 
     Args:
         wanted_by: the option or command that needs it, for the message.

@@ -32,7 +32,7 @@ class ReleaseStatus:
 
     @property
     def state(self) -> State | Literal["unknown"]:
-        """Its state; ``unknown`` if the cluster tells nothing."""
+        """The state of the release; ``unknown`` if the cluster tells nothing."""
         return self.health.state if self.seen or self.health.object else "unknown"
 
 

@@ -154,7 +154,7 @@ class RolloutWatcher:
                 self._in_background(rollout, partial(self._time_out, health=health))
 
     def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
-        """Run work that queries a cluster in its own thread, because it may not answer."""
+        """Run work in a thread of its own, because the cluster that it queries may not answer."""
         rollout.busy = True
 
         def run() -> None:

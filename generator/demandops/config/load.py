@@ -131,7 +131,7 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services; those with one instance for a cluster know it for each node."""
+    """Return the services; fill in ``runs_at`` of those that run once for each cluster."""
     found = dict(services)
     for name, service in services.items():
         if service.nodes:
@@ -169,7 +169,7 @@ def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]
 
 
 def _refuse_unread(reader: ConfigReader) -> None:
-    """Add a fault for each file that looks like configuration and is none."""
+    """Add a fault for each file that looks like configuration but is none."""
     folders = {collection.partition("/")[0] for collection in COLLECTIONS}
     for path in sorted(reader.files):
         folder, *rest = path.split("/")

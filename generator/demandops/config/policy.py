@@ -90,7 +90,7 @@ class LeasePolicy(CamelModel):
     Demands that request no lease get ``default``; without it their claims last forever. With
     ``deployment_requests`` that includes the reference's ``DeploymentRequest``, whose clients must
     then repeat their demands in time. The recorded end of a lease may lag behind the last renewal
-    by ``slack``, so a claim may be released that much late.
+    by ``slack``, so the generator may release a claim late by that much.
     """
 
     default: Duration | None = None
@@ -209,8 +209,8 @@ class AccessDomain(CamelModel):
     def allowed_kinds(self) -> tuple[Kind, ...]:
         """The kinds of objects that its charts may have, which the cluster enforces.
 
-        By default those of ordinary charts. ``network: namespace`` leaves out NetworkPolicy, with
-        which a chart could open what is closed.
+        The default is the kinds of ordinary charts. ``network: namespace`` leaves out
+        NetworkPolicy, with which a chart could open what is closed.
         """
         if self.kinds is not None:
             return self.kinds

@@ -238,7 +238,7 @@ class ApplicationVersion:
 
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
-        """Its place among the versions of the definition; two of one rank are the same."""
+        """The place among the versions of the definition; two of one rank are the same."""
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 

@@ -48,7 +48,7 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """Its type; fails if none is chosen yet."""
+        """The type of the connection; fails if none is chosen yet."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
@@ -102,7 +102,7 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return the connection without a node: ``None`` for an end; a broker is chosen again."""
+        """Return the connection without a node, with no broker; ``None`` if the node is an end."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:

@@ -61,7 +61,7 @@ class Client(ABC):
     @property
     @abstractmethod
     def description(self) -> str:
-        """Its description in commit messages."""
+        """The client's description in commit messages."""
 
     @abstractmethod
     def facts(self) -> list[str]:
@@ -154,9 +154,9 @@ class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
     name: ClassVar[str]
-    """Its name in messages; files, templates and clients use ``word`` instead."""
+    """The type's name in messages; files, templates and clients use ``word`` instead."""
     number: ClassVar[int]
-    """Its number in ``DeploymentRequest``."""
+    """The type's number in ``DeploymentRequest``."""
     image: ClassVar[str]
     """The registry's name of its clients' image."""
     options: ClassVar[frozenset[str]]
@@ -169,12 +169,12 @@ class ConnectionType(ABC):
     """Whether its clients speak DDS themselves, so that both nodes must run a DDS middleware."""
 
     def __repr__(self) -> str:
-        """Return its name."""
+        """Return the type's name."""
         return self.name
 
     @property
     def word(self) -> str:
-        """Its name in small letters."""
+        """The type's name in small letters."""
         return self.name.lower()
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
@@ -187,9 +187,9 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield why the inventory does not let it link two ends.
+        """Yield why the inventory does not let the type link two ends.
 
-        Unknown nodes are skipped, :mod:`demandops.demand.admission` reports them.
+        It skips unknown nodes; :mod:`demandops.demand.admission` reports them.
         """
 
     def route_faults(

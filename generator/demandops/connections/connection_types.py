@@ -83,7 +83,7 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
     """Yield why ``kind`` cannot carry a connection, by fields of :class:`Connection`.
 
-    Nodes that are not in the inventory are skipped; :mod:`demandops.demand.admission` reports them.
+    It skips nodes that are not in the inventory; :mod:`demandops.demand.admission` reports them.
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:

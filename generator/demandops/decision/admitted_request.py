@@ -32,10 +32,10 @@ Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 
 
 def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> DemandRequest:
-    """Return the request of a goal; if only room is lacking, the request to wait for it.
+    """Return the request of a goal; if only room is lacking, the request to wait for room.
 
     Raises:
-        Refused: if it can neither be booked nor wait. A demand that holds something does not wait.
+        Refused: if the demand can neither be booked nor wait. One that holds claims never waits.
     """
     try:
         return admit(state, goal, throttle)

@@ -170,8 +170,8 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
             yield fault(
                 "node",
                 f"'{app.node}' is in cluster '{cluster}', where {service.name}, which it needs, "
-                f"has no node; choose a node in {' or '.join(service.nodes)}, or have nodes in "
-                f"{service.file} changed",
+                f"has no node; choose a node in {' or '.join(service.nodes)}, or ask for a change "
+                f"of nodes in {service.file}",
                 code="no-node",
             )
     versions = config.versions_of(appdef.name)
@@ -222,7 +222,7 @@ def _connection(connection: Connection, config: Config, claiming: bool) -> Itera
     if connection.broker:
         yield from _id("broker", connection.broker)
     if claiming and not connection.topics:
-        yield fault("topics", "is empty; a connection carries at least one topic, list it")
+        yield fault("topics", "is empty; list at least one topic")
     yield from routes.faults("topics", connection.topics)
     same_place = connection.source and connection.source == connection.target
     for index, route in enumerate(connection.topics):

@@ -48,7 +48,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Entry:
-    """One event. ``held`` is the goal that the node has booked; ``is_sure`` unless it timed out."""
+    """One event. ``held`` is the goal that the node has booked, for sure only if ``is_sure``."""
 
     wanted: Goal | None = None
     held: Goal | None = None

@@ -32,7 +32,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only a later version writes: for the nodes of services."""
+"""Folders that only a later version writes; it keeps the nodes of services there."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
@@ -177,7 +177,7 @@ class _Claim(FrozenModel):
         return claim.with_holders(held, holders)
 
     def _is_old_join(self) -> bool:
-        """Return whether a join booked it when claim files had no field ``action`` yet."""
+        """Return whether a join booked the claim before claim files had the field ``action``."""
         return self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))
 
 
@@ -297,7 +297,7 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
 
 
 def place_data(place: Requirement) -> dict[str, Any]:
-    """Return the requirement on a node in the form that a claim's file has it in."""
+    """Return the requirement on a node as a claim's file has it."""
     listed = {"labels": dict(place.labels), "capabilities": list(place.capabilities)}
     return {name: value for name, value in ({"role": place.role} | listed).items() if value}
 

@@ -81,7 +81,7 @@ class KeptReplicas:
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        """Return the records with these steps of an instance; without steps, with no record."""
+        """Return the records with these steps for an instance; empty steps remove its record."""
         known = self.steps.get(instance) or ()
         if known == steps:
             return self

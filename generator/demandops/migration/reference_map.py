@@ -1,6 +1,6 @@
 """The map from the reference's resources to the applications and connections of demands.
 
-The names of its resources are made of ids, but not the other way round: ``/``, ``_`` and ``-`` all
+Ids give the names of its resources, but a name does not give the ids: ``/``, ``_`` and ``-`` all
 become ``-``. So :func:`propose` only proposes a map, and a person checks it.
 """
 

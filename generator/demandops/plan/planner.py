@@ -300,7 +300,7 @@ def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     """Return whether the initial deployment already carries a topic between two ends.
 
-    It keeps topic names, so it does not carry a route that renames the topic.
+    The initial deployment keeps topic names, so it carries no route that renames the topic.
     """
     sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)

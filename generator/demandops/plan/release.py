@@ -49,7 +49,7 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """Its key among the replicas that the ledger keeps."""
+        """The key of the service instance in the ledger's kept replicas."""
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
@@ -93,7 +93,7 @@ class ServiceRelease:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The registry's names of its images."""
+        """The registry's names of the service's images."""
         return self.service.images
 
     def image(self, name: str, config: Config) -> Image:
@@ -102,7 +102,7 @@ class ServiceRelease:
 
     @property
     def description(self) -> str:
-        """Its description in commit messages."""
+        """The service's description in commit messages."""
         for_whom = self.key.source or self.key.application
         what = f"{self.key.service} {self.key.version}".rstrip()
         return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")

@@ -2,8 +2,8 @@
 
 A claim on an application asks for a version, or else for the default. The application runs the
 newest of them. A service that applications share runs the newest version of these applications. So
-the order of the claims does not matter. Whether a demand may ask for a version is decided before,
-in :mod:`demandops.plan.checks.version_difference`.
+the order of the claims does not matter. Before that,
+:mod:`demandops.plan.checks.version_difference` decides whether a demand may ask for a version.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ _TEMPLATE_FAULTS = (
 )  # errors that a template can cause, so that its author must fix them
 
 _MAX_LENGTH = 100_000
-"""The most characters of a values template."""
+"""How many characters a values template may have."""
 
 
 class _Verbatim(str):
@@ -57,7 +57,7 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the template's text, its path for tracebacks, and that it never changes."""
+        """Return the template's text, its path, and a function that says that it is up to date."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]

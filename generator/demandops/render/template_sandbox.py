@@ -33,11 +33,11 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
 MAX_STEPS = 1_000_000
-"""The most steps of one rendering, a few seconds of work; 100 topics take some thousand."""
+"""How many steps a rendering may take, a few seconds of work; 100 topics take some thousand."""
 MAX_LENGTH = 1_000_000
-"""The most characters of a text. Kubernetes takes no object above 1.5 MB."""
+"""How many characters a text may have. Kubernetes takes no object above 1.5 MB."""
 MAX_SIZE = 100_000
-"""The most parts of a value. Each item, each key and every 16 characters of text are a part."""
+"""How many parts a value may have: each item, each key and every 16 characters are one."""
 _MAX_BITS = 1024
 
 _DIGITS = re.compile(r"\d{1,9}")

@@ -29,7 +29,7 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     """Return appdef → its services for a trial demand on the first node, without overrides.
 
     Raises:
-        Refused: if one cannot be planned.
+        Refused: if a service cannot be planned.
     """
     if not config.domain_of:
         return {}

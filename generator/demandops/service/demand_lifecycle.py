@@ -133,7 +133,7 @@ class Demands:
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Return the demands that are new since the last call or :meth:`take`; wait for one.
 
-        None are returned after ``timeout`` seconds, a withdrawal or :meth:`wake`.
+        After ``timeout`` seconds, a withdrawal or :meth:`wake` the list is empty.
 
         Raises:
             Unsound: nobody knows what is in the journal.
@@ -252,7 +252,7 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Return demands that no longer need approval to the state waiting.
+        """Put demands that no longer need approval back into the state waiting.
 
         A person may have merged one of them meanwhile.
         """

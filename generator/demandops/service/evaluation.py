@@ -98,7 +98,7 @@ class Evaluator:
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of demands that are already published at ``tip``, in that order.
+        """Return the results of demands that are already published at ``tip``, oldest first.
 
         Such a demand was not answered because the connection or the process ended after the remote
         accepted the push, or because a sync failed. So the commits since its base are written

@@ -182,7 +182,8 @@ class Generator:
         try:
             ticket.goal = json.loads(json.dumps(goal))
         except (TypeError, ValueError, RecursionError):
-            ticket.refuse(Refused([fault("", "the goal is not plain data")]))
+            message = "the goal is not plain data; give text, numbers, lists and mappings"
+            ticket.refuse(Refused([fault("", message)]))
             return ticket
         ticket.base = str(self.snapshot.commit)
         self._demands.arrive(ticket)

@@ -175,7 +175,7 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, with the demands that arrive during retries, and end leases.
 
-        The batch is empty then.
+        Afterwards the batch is empty.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -206,7 +206,7 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
 
     def _require_time(self) -> None:
-        """Raise after :meth:`end_soon`.
+        """Raise an error if :meth:`end_soon` was called.
 
         Raises:
             ShuttingDown: says that the demand is resumed.
@@ -315,10 +315,10 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out the commits of others, and do what time makes due.
+        """Fetch if a fetch is due, carry out the commits of others, and do what is due.
 
-        That is ending overrides, draining nodes, scaling down, and booking demands that wait. A
-        repository on this disk is read each time, because that is cheap.
+        Ends of overrides, drains, scale-downs and waiting demands can be due. The worker reads a
+        repository on this disk each time, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
@@ -356,7 +356,7 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's changes up to the fetched tip; return if there were any.
+        """Publish the effects of people's changes up to the fetched tip; return whether any.
 
         It does not fetch first.
         """

@@ -167,7 +167,7 @@ class Reader:
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``.
 
-        If a file or folder is given, only the commits that changed it.
+        With ``path``, yield only the commits that changed this file or folder.
         """
         since, until = self._sides(spec or "")
         if path is not None:

@@ -47,7 +47,8 @@ class Planned:
 class KnownRows:
     """The rows of a list by their ids, each with what it was made of.
 
-    ``made_for`` are the statuses that they were made for, or None if the books were others.
+    ``made_for`` are the statuses that they were made for, or None if an earlier moment made
+    them.
     """
 
     made_for: object
@@ -55,10 +56,10 @@ class KnownRows:
 
 
 class Moment:
-    """The books at one commit: what runs, and for whom. Derived once, when it is asked for.
+    """What runs at one commit, and for whom. Each part is derived once, when it is asked for.
 
-    What later books have in common with them, :meth:`take_over` keeps: then a commit costs what it
-    changes.
+    :meth:`take_over` keeps the parts that are the same at an earlier moment. So a commit costs
+    only what it changes.
     """
 
     def __init__(
@@ -217,7 +218,7 @@ def _held_by(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
 def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
     """Return the subjects whose claims differ.
 
-    What did not change is the same object in both, and a look-up by subject takes longer.
+    It compares objects: unchanged claims are the same object, and look-ups would take longer.
     """
     before = {id(claims): subject for subject, claims in old.claims.items()}
     after = {id(claims): subject for subject, claims in new.claims.items()}

@@ -60,8 +60,8 @@ _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 _EARLIER_AT_ONCE = 4
-"""How many views of earlier moments are made at once. One may take seconds, and must not keep those
-of now waiting."""
+"""How many views of earlier moments are made at once. One may take seconds, and must not
+delay views of the present."""
 
 
 class Site:

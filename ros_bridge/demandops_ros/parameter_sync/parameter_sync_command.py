@@ -76,7 +76,7 @@ def _watch(node: Node, kubeconfig: Path | None) -> ConfigMapWatch:
     def take(data: Mapping[str, str]) -> None:
         try:
             if key not in data:
-                raise InvalidInput.at("", "is missing", file=file)
+                raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
             setter.want(parameters_of(target, data[key], file))
         except (DemandOpsError, TypeError, ValueError) as error:
             node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))

@@ -75,7 +75,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{entity}/{x}")),
-            "rules.yaml:18: rules[0].demand.demand: '{x}' changes; an id must stay the same",
+            "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but an id must stay "
+            "the same; leave it out",
         ),
         (
             rule("a", near=NEAR, demand=demand(operation="release")),

@@ -117,7 +117,7 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override: path, new text (None: removed), and the commit's words."""
+    """A person's edit of one override: its new text (None: removed), and the commit message."""
 
     name: str
     text: str | None

@@ -65,7 +65,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
     Claims that were released since then are booked again, with the current configuration. A lease
     starts again with its full term. REV is a commit; TIME means the newest commit at or before it.
-    At a terminal, the consequences are shown and confirmed first.
+    At a terminal, the command shows the consequences first and asks.
 
     \b
     Examples:

@@ -41,8 +41,8 @@ directory_option = click.option(
 def new() -> None:
     """Write a new application, node, access domain or override.
 
-    The files are valid as they are: `demandops check` passes. No existing file is changed, and
-    nothing is committed.
+    The files are valid as they are: `demandops check` passes. The command changes no
+    existing file and commits nothing.
 
     \b
     Examples:
@@ -307,7 +307,7 @@ def _lay_down(
 
 def _write(directory: Path, found: Files, output: str, then: list[str]) -> None:
     if there := [path for path in found if (directory / path).exists()]:
-        raise StateRepoError(f"{directory / there[0]} exists; nothing was changed")
+        raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
     for path, text in found.items():
         (directory / path).parent.mkdir(parents=True, exist_ok=True)
         (directory / path).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a name means that a person gives to ``demandops why``."""
+"""The meaning of a name that a person gives to ``demandops why``."""
 
 from __future__ import annotations
 
@@ -118,13 +118,13 @@ def _named(world: World, name: str) -> Iterator[Match]:
 
 
 def _release_with(part: str, world: World) -> Release | None:
-    """Return the only release with a part in its name, or None; raise if there are several."""
+    """Return the only release whose name contains ``part``, or None; raise if several do."""
     found = {one.name: one for one in release_causes.releases(world) if part in one.name}
     return found[_only(part, [*found])] if found else None
 
 
 def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator[Match]:
-    """Yield the only release with a part in its name that no longer runs; raise if several."""
+    """Yield the only ended release whose name contains ``part``; raise if several do."""
     commit = str(snapshot.commit)
     found = sorted(name for name in repo.stopped_release_names(commit) if part in name)
     if found:

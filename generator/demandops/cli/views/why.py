@@ -116,7 +116,7 @@ def _answer(
 
 
 def _missing(world: World, answer: dict[str, Any]) -> list[str]:
-    """Return why topics do not arrive that the answer's claims need."""
+    """Return why topics that the answer's claims need do not arrive."""
     files = {one["file"] for one in answer.get("claims", ())}
     found = (one for one in missing_inputs(world) if one.file in files)
     return list(dict.fromkeys(f"application '{one.application}': {one.reason}" for one in found))
@@ -262,7 +262,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped it."""
+    """Return the commits that started, changed and stopped what the name means."""
     if match.kind in ("node", "requester"):  # demandops log --node and --requester have them
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":

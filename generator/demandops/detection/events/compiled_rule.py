@@ -106,7 +106,7 @@ class AreaRule(CompiledRule):
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the position and the distance, or how many there are."""
+        """Return the position and the distance, or the number of entities."""
         named = self._named(subjects)
         if self.count is not None:
             return Facts({**named, "count": count}, f"{count} are there")

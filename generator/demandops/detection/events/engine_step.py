@@ -62,7 +62,7 @@ class EngineStep:
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Do what is due until then: end dwell times, lose silent entities, follow schedules."""
+        """Do what time makes due: end dwell times, lose silent entities, follow schedules."""
         while until >= self._due:
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
                 if at > until:

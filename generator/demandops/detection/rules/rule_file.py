@@ -33,7 +33,7 @@ POSITIONS: Mapping[str, tuple[str, str]] = {
     "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
     "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
 }
-"""Where the messages of a type have x and y, unless the source says it."""
+"""The fields with x and y in messages of a type, unless the source names them."""
 
 
 class Source(CamelModel):
@@ -110,7 +110,7 @@ class Rule(CamelModel):
 
     @property
     def condition(self) -> Near | Together | Count | Threshold | Hours:
-        """Its only condition."""
+        """The only condition of the rule."""
         found = self.near or self.together or self.count or self.threshold or self.schedule
         assert found is not None  # noqa: S101 - validated above
         return found

@@ -23,7 +23,7 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
     """Release all claims of a node or a requester, and the demands that wait for it alone.
 
     Raises:
-        Refused: if it holds nothing.
+        Refused: if the node or requester holds nothing.
     """
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)

@@ -14,7 +14,7 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class Drain(DemandRequest):
-    """The generator moves applications that it placed off the drained node ``id``.
+    """The generator's request to move applications that it placed off the drained node ``id``.
 
     ``moves`` are the changes of claims, ``moved`` says what is placed where, ``stays`` what is not
     moved and why.

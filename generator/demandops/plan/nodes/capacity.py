@@ -50,7 +50,7 @@ class Usage:
 
 
 def whole_usage(world: World) -> Usage:
-    """Return what all services request; empty without planning if no node has a capacity."""
+    """Return what all services request; empty if no node has a capacity."""
     if not world.config.limits_capacity:
         return Usage()
     keys: dict[ReleaseKey, None] = {}

@@ -38,7 +38,7 @@ class Chosen:
 
 
 Positions = Mapping[str, Position]
-"""Where nodes are that have no position in the inventory."""
+"""The positions of nodes that have none in the inventory."""
 
 
 def requirement_of(service: Service) -> Requirement:

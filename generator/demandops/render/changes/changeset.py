@@ -46,7 +46,7 @@ class ReleaseChange:
 
     @property
     def order(self) -> tuple[int, str]:
-        """Its place in a list of changes."""
+        """The key by which a list of changes is sorted."""
         return CHANGE_ORDER.index(self.change), self.name
 
 
@@ -61,7 +61,7 @@ class Changeset:
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """The releases that may differ, as they are now."""
+    """The releases that may differ, as they are after the change."""
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
     """The same releases as they were before."""
 

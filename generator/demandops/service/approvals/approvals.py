@@ -1,8 +1,8 @@
 """The proposals that await approval, and how each one ends.
 
-Runs in the worker thread. A proposal is complete once main has its claims, by any kind of merge.
-Until then the branch is kept up to date, so that merging it gives what main would render. A
-:class:`Proposal` decides its verdict; this module carries it out.
+It runs in the worker thread. A proposal is complete once main has its claims, by any kind of merge.
+Until then this module keeps the branch up to date, so that merging it gives what main would render.
+A :class:`Proposal` decides its verdict; this module carries it out.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Remove the proposals that demands of a batch release; call it before it is evaluated.
+        """Remove the proposals that demands of a batch release; call this before the evaluation.
 
         Nobody can merge a proposal without its branch. If it was merged earlier, the demands are
         evaluated on a tip that has the merge.

@@ -30,7 +30,7 @@ _SHORTEST_S = 1.0
 LONGEST_WAIT_S = 60.0
 """The longest time between two checks of the leases, because the clock may be set meanwhile."""
 _RETRY = timedelta(seconds=LONGEST_WAIT_S)
-"""The pause before a failed release of claims, or a failed end of an override, is tried again."""
+"""The pause before a retry of a failed release of claims, or of a failed end of an override."""
 
 
 class LeaseExpiry:

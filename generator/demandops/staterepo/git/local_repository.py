@@ -56,7 +56,7 @@ class LocalRepository(StateRepository):
         )
 
     def renew_if_damaged(self) -> bool:
-        """Raise StateRepoError if git finds it damaged; a repository on this disk has no copy."""
+        """Raise StateRepoError if git finds the repository damaged, because it has no copy."""
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
@@ -140,7 +140,7 @@ class LocalRepository(StateRepository):
     def _break_stale_lock(self) -> None:
         """Remove the branch's lock if a killed process left it.
 
-        Its age is measured by a clock that nobody sets, from when it was first seen here.
+        The lock's age counts from when this process first saw it, by a clock that nobody sets.
         """
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:

@@ -205,7 +205,7 @@ class RemoteRepository(StateRepository):
 
         Args:
             spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
-            lease: ``<reference>:<commit>``, which commit the remote must have; empty for none.
+            lease: ``<reference>:<commit>``: the commit that the remote must have; empty for none.
             options: options for the server (``git push --push-option``).
         """
         push_options = [f"--push-option={option}" for option in options]
@@ -216,7 +216,7 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return ``PushDenied`` if the remote rejected a push, else why it failed."""
+        """Return ``PushDenied`` if the remote rejected a push, else the error that says why."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()

@@ -124,7 +124,7 @@ def differences(
 ) -> Iterator[tuple[str, Oid | None]]:
     """Yield (path, new blob id or None) of each file that differs; skip equal subtrees.
 
-    Compares what is at or below the paths ``roots``, by default everything.
+    It compares what is at or below the paths ``roots``, by default everything.
     """
     if not roots:
         yield from _differences_below(before, after, "")

@@ -100,7 +100,7 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit: it is the committer, and signed if it must."""
+    """Return whether the generator made a commit: it is the committer, and signed if required."""
     return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
 
 
@@ -167,7 +167,7 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     """Return operation id → outcome of every demand that commits after ``base`` record.
 
     A person who merges a proposal may keep its trailers; any other commit by a person records no
-    demand. Reads the whole history if ``base`` is unknown, because the remote was made anew.
+    demand. It reads the whole history if ``base`` is unknown, because the remote was made anew.
     """
     if str(tip) == base:
         return {}

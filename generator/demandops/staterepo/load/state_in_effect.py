@@ -42,7 +42,7 @@ _TO_CHECK = Fault("invalid", "", "must be checked again")
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
-    """Return the trailers; none if all files of the commit are in effect."""
+    """Return the trailers that record the state; none if all files are in effect."""
     if not snapshot.problems:
         return []
     source = snapshot.config_source
@@ -96,7 +96,7 @@ def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest state that is recorded up to a commit, or of a commit that is fully valid.
+    """Return the newest recorded state up to a commit, or that of the newest fully valid commit.
 
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """

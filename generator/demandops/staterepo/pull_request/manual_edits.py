@@ -1,7 +1,8 @@
 """Manual edits to generated files, and overrides that would have the same effect.
 
-They are refused because the generator's next commit would silently undo them, but an override in
-``overrides/`` stays. A person can use a suggested override unchanged, except for its reason.
+The check refuses manual edits, because the generator's next commit would silently undo them. An
+override in ``overrides/`` stays. A person can use a suggested override unchanged, except for its
+reason.
 """
 
 from __future__ import annotations

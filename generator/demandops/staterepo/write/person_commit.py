@@ -102,7 +102,10 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
     def make(tip: Commit) -> tuple[Files, list[Oid]]:
         base = objects.merge_base(tip.id, head.id)
         if base is None:
-            raise StateRepoError(f"{proposal.branch} and {MAIN_BRANCH} have no commit in common")
+            raise StateRepoError(
+                f"{proposal.branch} and {MAIN_BRANCH} have no commit in common; reject it with "
+                "`demandops reject`, and send the demand again"
+            )
         start = trees.commit_of(objects, base).tree
         proposed = [path for path, _ in trees.differences(start, head.tree)]
         if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):

@@ -1,7 +1,7 @@
 """Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
 
 The generator rebuilds a branch on a newer main and deletes it in the end, but only if the branch
-is at the commit that the generator put there. Knows no forge except GitLab's push options.
+is at the commit that the generator put there. It knows no forge except GitLab's push options.
 """
 
 from __future__ import annotations

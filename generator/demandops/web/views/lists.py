@@ -25,8 +25,8 @@ Parts: TypeAlias = "tuple[Any, ...]"
 class ListKind:
     """A kind of list: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields each entry's id and the parts that ``row`` makes its row of. The row is made
-    anew only if a part differs.
+    ``entries`` yields each entry's id and the parts from which ``row`` makes its row. It makes the
+    row anew only if a part differs.
     """
 
     name: str
@@ -193,7 +193,7 @@ def _columns(*named: str) -> tuple[Column, ...]:
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; those of other books are taken where they are the same."""
+    """Return the rows of a list; reuse those of an earlier moment that are the same."""
     moment, kind = now.moment, LISTS[name]
     known = moment.rows.get(name, KnownRows(None, {}))
     if known.made_for is not now.statuses:
