@@ -26,7 +26,7 @@ Thread = threading.Thread
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STEADY_S = 2 * _LONGEST_PAUSE_S
-"""A thread that runs for so long has recovered from its last failure."""
+"""A thread that runs for this many seconds has recovered from its last failure."""
 _LONGEST_REASON = 300
 
 

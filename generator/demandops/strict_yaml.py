@@ -244,7 +244,7 @@ _LISTED = re.compile(
 )
 """Matches a field with a list of plain texts, as :func:`to_json` writes it."""
 _LONG = 200
-"""The json module reads a list of this many characters: PyYAML takes 20 times as long."""
+"""From this length on, the json module reads a list, because PyYAML takes 20 times as long."""
 _STAND_IN = "demandops-list"
 """Stands for a long list while PyYAML reads what is around it."""
 

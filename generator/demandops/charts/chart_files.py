@@ -53,7 +53,7 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
-    """Return the default values of a chart, over those that it imports, as Helm merges them.
+    """Return a chart's default values, merged over those that it imports by Helm's rules.
 
     Raises:
         InvalidInput: a ``values.yaml`` cannot be read.

@@ -64,7 +64,7 @@ def painted(text: str, style: str) -> str:
 
 
 def print_lines(found: list[str]) -> None:
-    """Print lines; on a terminal that is too low for them, through the pager ``$PAGER``."""
+    """Print lines; if the terminal has too few rows, through the pager ``$PAGER``."""
     text = "".join(f"{line}\n" for line in found)
     high = len(found) >= shutil.get_terminal_size().lines
     pager = os.environ.get("PAGER")

@@ -63,7 +63,7 @@ def _around() -> Path | None:
 
 
 def readable_repo() -> str | None:
-    """Return the state repo for a command that only reads, if no option gives it; or None."""
+    """Return the default state repo of a command that only reads, or None."""
     around = _around()
     context = _chosen(around)
     return str(around) if around else context.state_repo if context else None
@@ -113,7 +113,7 @@ def _required(default: Callable[[], str | None]) -> Callable[..., str]:
 
 
 def _is_elsewhere(address: str) -> bool:
-    """Return whether this is a relative folder that does not exist from here."""
+    """Return whether an address is a relative folder that the current folder does not have."""
     path = Path(address)
     return not (is_url(address) or path.is_absolute() or path.expanduser().exists())
 

@@ -70,7 +70,7 @@ class ClusterAccess(FrozenModel):
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
-    """Return the API of the cluster in which this process is a pod, as its service account.
+    """Return the API of the cluster in which this process is a pod, by its service account.
 
     The API does not retry a call that fails.
 

@@ -175,7 +175,7 @@ class RolloutWatcher:
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
         """Resolve a rollout after its timeout; say also why its pods do not run.
 
-        If the controller is just retrying, say also why the attempt before failed.
+        If the controller is just retrying, say also why its last attempt failed.
         """
         failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:

@@ -239,7 +239,7 @@ class Node(CamelModel):
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
     message types of topics for which a request gives none. ``bridged`` lists topics that the
     initial deployment already carries to another node under the same name; connections skip them.
-    ``access_domains`` are further ones. In each of them the node is another node of the
+    ``access_domains`` are the node's further domains. In each, it is another node of the
     configuration, called ``<id>@<domain>`` (:func:`in_domain`).
     """
 

@@ -207,7 +207,7 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:
-        """The kinds of objects that its charts may have, which the cluster enforces.
+        """The kinds of objects that the domain's charts may have; the cluster enforces them.
 
         The default is the kinds of ordinary charts. ``network: namespace`` leaves out
         NetworkPolicy, with which a chart could open what is closed.
@@ -236,8 +236,8 @@ class AccessDomain(CamelModel):
             )
         if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
             raise ValueError(
-                "kinds: with NetworkPolicy a chart could open what network: namespace closes; "
-                "remove one of them"
+                "kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; remove "
+                "one of them"
             )
         return self
 

@@ -72,7 +72,7 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, from a shutdown, means this one; empty fields fit any."""
+        """Return whether ``listed``, from a shutdown, means it; empty fields fit any value."""
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -106,7 +106,7 @@ class Connection:
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the entries by which the ledger's index finds it."""
+        """Yield the connection's entries in the ledger's index."""
         for end in self.nodes:
             yield ("link", str(self.type), end)
         if self.broker:

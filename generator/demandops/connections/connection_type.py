@@ -50,12 +50,12 @@ class Client(ABC):
     node: Node
     domain: AccessDomain
     connections: tuple[str, ...]
-    """The connections that it carries."""
+    """The connections that the client carries."""
     shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The registry's names of its images."""
+        """The names of the client's images in the registry."""
         return (self.type.image,)
 
     @property
@@ -158,15 +158,15 @@ class ConnectionType(ABC):
     number: ClassVar[int]
     """The type's number in ``DeploymentRequest``."""
     image: ClassVar[str]
-    """The registry's name of its clients' image."""
+    """The name of the clients' image in the registry."""
     options: ClassVar[frozenset[str]]
-    """The options of a route that it supports; each supports message type and direction."""
+    """The options of a route that the type supports; each type supports type and direction."""
     renames: ClassVar[bool] = False
     """Whether a topic may have another name at the target."""
     takes_broker: ClassVar[bool] = False
     """Whether a demand may name a broker."""
     speaks_dds: ClassVar[bool] = True
-    """Whether its clients speak DDS themselves, so that both nodes must run a DDS middleware."""
+    """Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware."""
 
     def __repr__(self) -> str:
         """Return the type's name."""

@@ -65,7 +65,8 @@ class Ros(ConnectionType):
         if route.durability and not route.reliability:
             yield fault(
                 f"{where}.reliability",
-                f"is not given, but durability of '{route.source}' is set; ROS needs both, add it",
+                f"is not given, but durability of '{route.source}' is set; ROS needs both, so "
+                "add it",
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:

@@ -282,7 +282,7 @@ def with_chosen_types(
     """Return ``request`` with the type and the broker that each connection gets.
 
     A claimed connection keeps its current type. A new one gets the first type that can carry it
-    (:func:`connection_types.type_faults`); if no type can, it still has none.
+    (:func:`connection_types.type_faults`); if no type can, it gets none.
     """
 
     def chosen(one: Demanded) -> Demanded:

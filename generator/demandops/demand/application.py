@@ -36,7 +36,7 @@ class InputTopic(NamedTuple):
         return naming.topic_part(self.source, self.told_apart_by(self.further, version))
 
     def told_apart_by(self, further: bool, version: str) -> str:
-        """Return what a name has beside the source; empty for a usual topic without a version."""
+        """Return what tells names for one source apart: a further topic, and a version, if any."""
         if not further:
             return version
         return f"{self.topic} {version}" if version else self.topic
@@ -181,7 +181,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return one == two
 
     def placed_as(self, first: Application) -> Application:
-        """Return the application on the nodes of ``first``, its state in the first claim on it."""
+        """Return the application on the nodes of ``first``, the application in the first claim."""
         if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
             return self
         return replace(self, node=first.node, services=first.services, moved=first.moved)
@@ -209,7 +209,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, from a shutdown, means this one; an empty node fits any."""
+        """Return whether ``listed``, from a shutdown, means it; an empty node fits any node."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -261,7 +261,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, deliver=deliver).with_inputs(left) if any(left.values()) else None
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the entries by which the ledger's index finds it."""
+        """Yield the application's entries in the ledger's index."""
         yield ("node", self.node)
         yield ("definition", self.appdef)
         for node in (*self.services.values(), *self.moved.values()):

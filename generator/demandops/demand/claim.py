@@ -76,7 +76,7 @@ class Claim:
         return None if name == self.demand else name
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the entries by which the ledger's index finds it, except the end of its lease."""
+        """Yield the claim's entries in the ledger's index, except the end of its lease."""
         yield ("demand", self.demand)
         for requester in self.requesters:
             yield ("requester", requester)

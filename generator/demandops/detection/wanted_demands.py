@@ -20,7 +20,7 @@ from demandops.detection.rules.rule_demand import Goal
 Purpose = Literal["start", "renew", "end"]
 
 _RENEW_AFTER = 1 / 3
-"""The part of a lease after which it is renewed; two more attempts fit before its end."""
+"""The part of a lease after which to renew it; two more attempts fit before its end."""
 _RETRY_S = 5.0
 _NOT_SENT = frozenset({"no-server", "rejected"})
 """The codes of goals that the node did not accept."""

@@ -122,7 +122,7 @@ class ObjectDetection(_Part):
 
     @property
     def source(self) -> str:
-        """The node that publishes its point cloud."""
+        """The node that publishes the detection's point cloud."""
         return self.ros_name.removeprefix("pcod_")
 
     @property

@@ -46,7 +46,7 @@ def instance_of(config: Config, role: str, topic: InputTopic, version: str = "")
 
 
 def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return what the names of a service's topics have beside the source of its input."""
+    """Return what tells names of a service's topics apart if the source is the same."""
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return topic.told_apart_by(further, version)

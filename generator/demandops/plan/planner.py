@@ -249,8 +249,8 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             for claim in claims[:3]
         )
         message = (
-            f"demands contradict each other: {shown}; agree, or have the application definition "
-            "say how to merge them"
+            f"demands contradict each other: {shown}; agree, or ask that the application "
+            "definition say how to merge them"
         )
         raise Refused.at(f"parameters.{name}", message, code="conflict")
     return given[0]

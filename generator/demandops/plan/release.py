@@ -93,11 +93,11 @@ class ServiceRelease:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The registry's names of the service's images."""
+        """The names of the service's images in the registry."""
         return self.service.images
 
     def image(self, name: str, config: Config) -> Image:
-        """Return one of its images, as its version and overrides pin it."""
+        """Return one of the service's images, as its version and overrides pin it."""
         return self.shaping.image(name, self.version.image(name, config.images[name]))
 
     @property
@@ -127,7 +127,7 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what it decides) for each configuration entry that shapes it."""
+        """Yield (file, entry, what it decides) for each configuration entry behind the release."""
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "its definition"

@@ -89,7 +89,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
-            faults.append(fault("", "is not in a folder that the generator writes").within(path))
+            faults.append(
+                fault("", "is in no folder that the generator writes; report it").within(path)
+            )
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
@@ -114,7 +116,9 @@ def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, 
         if isinstance(document, dict):
             yield document
         else:
-            faults.append(fault("", "has a document that is not a mapping").within(path))
+            faults.append(
+                fault("", "has a document that is not a mapping; fix its template").within(path)
+            )
 
 
 def _check_object(

@@ -86,7 +86,7 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return how many schemas at most a schema applies to values of this depth.
+        """Return the highest number of schemas that a schema applies to values of this depth.
 
         Raises:
             RecursionError: if a schema applies itself to the same value, or applies too many.

@@ -43,7 +43,7 @@ class Evaluator:
         """Decide a demand, commit it on the commit batch and return its result.
 
         Returns:
-            Its receipt or error; if it needs approval, the decision, which is not committed.
+            The demand's receipt or error; if it needs approval, the decision, not committed.
 
         Raises:
             Unavailable, PushDenied, Unsound: nothing can be written now.

@@ -45,8 +45,8 @@ _NAME = "writer"
 class Worker:
     """Follows the state repo and turns batches of demands into published commits.
 
-    Any thread may read ``snapshot``, the newest published state, and ``remote``. The ``listeners``
-    are called with the configuration in effect after every publication.
+    Any thread may read ``snapshot``, the newest published state, and ``remote``. It calls the
+    ``listeners`` with the configuration in effect after every publication.
     """
 
     def __init__(

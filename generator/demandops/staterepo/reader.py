@@ -64,7 +64,7 @@ class Reader:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch, read from the newest commit from now on, and return it.
+        """Fetch, read from the newest commit from now on, and return that commit.
 
         Raises:
             StateRepoError: if the state repo cannot be reached or read.

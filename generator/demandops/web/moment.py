@@ -1,4 +1,4 @@
-"""The state at one commit, and the situation: this state with what clusters and forge tell."""
+"""The state at one commit, and the situation: that state with reports of clusters and forge."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class KnownRows:
-    """The rows of a list by their ids, each with what it was made of.
+    """The rows of a list by their ids, each with the parts from which it was made.
 
     ``made_for`` are the statuses that they were made for, or None if an earlier moment made
     them.

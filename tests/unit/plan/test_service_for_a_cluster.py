@@ -139,8 +139,16 @@ def test_its_node_counts_it_and_its_rules_hold() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "fault"),
     [
-        ("nodes: {c-its: cloud}\n", "", "scope 'cluster' needs nodes, which has the node of each cluster"),
-        ("scope: cluster", "scope: node", "scope 'cluster' needs nodes, which has the node of each cluster"),
+        (
+            "nodes: {c-its: cloud}\n",
+            "",
+            "scope 'cluster' needs 'nodes', the node of each cluster",
+        ),
+        (
+            "scope: cluster",
+            "scope: node",
+            "scope 'cluster' needs 'nodes', the node of each cluster",
+        ),
         (
             "nodes: {c-its: cloud}",
             "nodes: {c-its: cloud}\nplacement: source",

@@ -89,7 +89,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 
 
 def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Iterator[Match]:
-    """Yield what is meant if no release, application or connection has exactly this name."""
+    """Yield what a name may mean that no release, application or connection has."""
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
     if found is not None:
@@ -103,7 +103,7 @@ def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> I
 
 
 def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield what has exactly this name beside releases, applications and connections."""
+    """Yield what has this name, other than releases, applications and connections."""
     config = world.config
     if ("demand", name) in world.ledger.index:
         yield Match("demand", name)
@@ -159,7 +159,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     if release is not None and path_of(release) == path:
         return Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
-        raise StateRepoError(f"{quoted(path)} is not in the state repo and never was")
+        raise StateRepoError(f"{quoted(path)} is not in the state repo and never was; correct it")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return Match("file", path, path)
     return Match("claim" if claim_file.kind_of(path) else "release", name, path)

@@ -275,7 +275,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 
 
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
-    """Return commits as JSON data, with people's commits that they carry out."""
+    """Return commits as JSON data, each with the people's commits that it renders."""
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:
         if entry is None:

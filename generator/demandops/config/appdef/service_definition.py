@@ -115,8 +115,8 @@ class ServiceDefinition(Deployed, FileModel):
     def _consistent(self) -> ServiceDefinition:
         if bool(self.nodes) is not (self.scope == "cluster"):
             raise ValueError(
-                "scope 'cluster' needs nodes, which has the node of each cluster; no other scope "
-                "may have nodes"
+                "scope 'cluster' needs 'nodes', the node of each cluster, and no other scope may "
+                "have it"
             )
         if self.placement == "source" and self.scope == "cluster":
             raise ValueError("scope 'cluster' runs at its nodes; leave out placement")

@@ -38,7 +38,7 @@ class CompiledRule:
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:
-        """Return whether the rule is for an entity, which one of its sources reports."""
+        """Return whether the rule is for an entity of one of its sources."""
         return self.is_for(who[1])
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
@@ -96,7 +96,7 @@ class ThresholdRule(CompiledRule):
 
 
 class AreaRule(CompiledRule):
-    """A rule on the distance to an area: an entity is near it, or is counted there."""
+    """A rule on the distance to an area, either of one entity or of a number of them."""
 
     def __init__(self, rule: Rule, condition: Near | Count) -> None:
         super().__init__(rule)

@@ -66,7 +66,7 @@ class Source(CamelModel):
 
     @property
     def position(self) -> tuple[str, str] | None:
-        """The fields with x and y, or ``None`` if its entities have no position."""
+        """The fields with x and y, or ``None`` if the entities have no position."""
         return (self.x, self.y) if self.x and self.y else POSITIONS.get(self.type)
 
 
@@ -117,7 +117,7 @@ class Rule(CamelModel):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The sources that its condition reads: none, one, or two for ``together``."""
+        """The sources that the rule's condition reads: none, one, or two for ``together``."""
         named = (getattr(self.condition, name, None) for name in ("source", "other"))
         return tuple(name for name in named if name)
 
@@ -137,7 +137,7 @@ class Rule(CamelModel):
 
     @property
     def template(self) -> RuleDemand:
-        """The template of its demand or deploymentRequest."""
+        """The template of the rule's demand or deploymentRequest."""
         if self.demand is not None:
             return RuleDemand("demand", self.demand)
         return RuleDemand("deployment_request", self.deployment_request or {})

@@ -128,8 +128,8 @@ def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[
     """Yield a fault for each capacity that would be exceeded; see :func:`excesses`."""
     for node, excess in excesses(usage, grown, config):
         message = (
-            f"'{node}' {excess}; choose another node, release something first, or have "
-            f"{config.place_of(NODES_FILE)} changed"
+            f"'{node}' {excess}; choose another node, release something first, or ask "
+            f"for a change of {config.place_of(NODES_FILE)}"
         )
         yield fault("", message, code="capacity")
 

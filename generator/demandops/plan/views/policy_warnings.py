@@ -43,7 +43,7 @@ def warnings(world: World) -> Iterator[Fault]:
 
 
 def _drained(world: World) -> Iterator[Fault]:
-    """Yield for each drained node which of its applications will move, and which will stay."""
+    """Yield a warning for each drained node: which applications will move, and which stay."""
     for node in world.config.drained_nodes:
         if world.ledger.applications_on.get(node):
             drain = with_moves(Drain(node), world, whole_usage(world))

@@ -139,8 +139,8 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
         if size > max(most, len((read(path) or "").encode()) if size > most else 0):
             message = (
-                f"would have {size} bytes; at most {most} are allowed; demand less of it, or have "
-                f"a platform engineer raise limits.fileBytes in {ROOT_FILE}"
+                f"would have {size} bytes; at most {most} are allowed; demand less of it, or ask "
+                f"a platform engineer to raise limits.fileBytes in {ROOT_FILE}"
             )
             faults.append(fault("", message, code="too-large").within(path))
     if faults:

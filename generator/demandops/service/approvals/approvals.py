@@ -147,7 +147,7 @@ class Approvals:
         if proposal is None and (full := self._requester_with_most(request)):
             message = (
                 f"{PROPOSAL_LIMIT} demands of {quoted(full)} await approval already; release some, "
-                "or have them decided"
+                "or ask a person to decide about them"
             )
             self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
             return

@@ -21,7 +21,7 @@ class CheckTimer:
         self._began = self._rest_until = self._next = 0.0
 
     def is_due(self, tip: str, *, has_news: bool) -> bool:
-        """Return whether to check now, with main at ``tip``; ``has_news``: a proposal changed."""
+        """Return whether to check now, with main at ``tip``; always if a proposal ``has_news``."""
         if has_news and self._checked_at is not None:
             return True
         return self.seconds_until_due(tip) <= 0

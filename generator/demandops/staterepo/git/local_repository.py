@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import (
 )
 
 _STALE_LOCK_S = 5.0
-"""Git holds a branch's lock for milliseconds. One this old was left by a killed process."""
+"""Git holds a branch's lock for milliseconds. A killed process left one this old."""
 
 log = logging.getLogger("demandops")
 

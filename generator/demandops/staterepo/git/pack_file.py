@@ -22,7 +22,7 @@ _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 _LEVEL = 1
 """The level of compression. A pack is short-lived, so speed counts more than size."""
 _SHORT_OFFSETS = 1 << 31
-"""Offsets from here on are in a table of their own."""
+"""An index keeps offsets from here on in a table of their own."""
 
 
 class Packed(NamedTuple):

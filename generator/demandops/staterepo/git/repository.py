@@ -50,7 +50,7 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """Raised when a hook, a protected branch or missing rights forbid to write the state repo."""
+    """Raised when a hook, a protected branch or missing rights prevent a write."""
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -107,7 +107,7 @@ class StateRepository(ABC):
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
     runtime: Runtime = REAL
-    """The clock, chance and threads of the code that writes to it."""
+    """The clock, chance and threads of the code that writes to the state repo."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
     _tidying: subprocess.Popen[bytes] | None = None

@@ -141,7 +141,7 @@ def _told_apart(
 
 
 def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
-    """Yield a commit, its first parent, that one's first parent and so on."""
+    """Yield a commit, then its first parent, and so on along the first parents."""
     walker = repo.walk(commit_of(repo, tip).id)
     walker.simplify_first_parent()
     return iter(walker)

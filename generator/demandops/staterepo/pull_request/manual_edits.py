@@ -135,7 +135,7 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return effects of an override that replace an edit, and the parts of it that they miss."""
+    """Return effects of an override that replace an edit, and the parts that they miss."""
     if after is None:
         return {"deny": True}, []
     try:

@@ -249,7 +249,7 @@ class CommitBatch:
     def drain(self, node: str, operation: str, now: datetime) -> Decision:
         """Move placed applications off a drained node, in one commit; return the decision.
 
-        Its author is the person who last changed the node's file.
+        The commit's author is the person who last changed the node's file.
         """
         decision = decide(self.head.state, Drain(node), now, self.read)
         if decision.files:

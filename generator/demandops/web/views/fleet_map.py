@@ -53,7 +53,7 @@ class Mass:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The whole map; ``is_dimmed`` if a filter lights a part of it.
+    """The whole map; ``is_dimmed`` says that a filter lights only a part of it.
 
     ``nodes`` and ``lines`` are drawn one by one, ``many_nodes`` and ``many_lines`` together.
     ``only_lit`` says whether nodes that the filter does not light are left out.

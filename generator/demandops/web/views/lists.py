@@ -38,12 +38,12 @@ class ListKind:
 
 
 def release_part(name: str) -> Part:
-    """Return a release's name, which leads to its view."""
+    """Return a release's name with a link to its view."""
     return Part(name, Link("release", {"name": name}))
 
 
 def demand_part(id: str) -> Part:
-    """Return a demand's id, which leads to its view."""
+    """Return a demand's id with a link to its view."""
     return Part(id, Link("demand", {"id": id}))
 
 
@@ -53,7 +53,7 @@ def health_cell(word: str) -> Cell:
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return values that lead to a view, filtered by them."""
+    """Return values, each with a link to the view that is filtered by it."""
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 

@@ -111,7 +111,7 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
 
 
 def _others_stopped(moment: Moment, release: Release) -> Iterable[str]:
-    """Yield what stops with a release if its service is denied on its node, or its connections."""
+    """Yield what else stops if a release's service on the node, or its connections, are denied."""
     for name, other in moment.releases.items():
         if name == release.name:
             continue
