@@ -168,7 +168,7 @@ def _page(
     settings: dict[str, Any],
     clusters: Mapping[str, access.ClusterAccess],
 ) -> WebServer:
-    """Start the web page, which fetches the state repo itself, at the node's interval."""
+    """Start and return the web page, which fetches the state repo itself, as often as the node."""
     interval = parse_interval(settings["fetch_interval"])
     follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
     generator.on_publish(lambda config: follower.wake())

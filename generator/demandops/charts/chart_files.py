@@ -69,7 +69,7 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge values by Helm's rules: mappings merge, null removes, others replace."""
+    """Return values merged by Helm's rules: mappings merge, null removes, others replace."""
     result = dict(below)
     for key, value in above.items():
         if value is None:

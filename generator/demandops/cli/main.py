@@ -76,7 +76,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import a command; raise a ClickException if a package that it needs is not installed."""
+    """Import and return a command; raise ClickException if it needs a missing package."""
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = f"{name}_" if iskeyword(name) else name.replace("-", "_")

@@ -72,7 +72,7 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, from a shutdown, means it; empty fields fit any value."""
+        """Return whether ``listed`` of a shutdown means this connection; empty fields fit any."""
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)

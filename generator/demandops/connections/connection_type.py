@@ -201,7 +201,7 @@ class ConnectionType(ABC):
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         """Return the connection as clients will carry it, and what differs from the request.
 
-        Called only for a demand that the inventory can fulfill.
+        The caller ensures that the inventory can fulfill the demand.
         """
         return connection, ""
 

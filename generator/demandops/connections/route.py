@@ -104,7 +104,7 @@ class RouteOptions(FrozenModel):
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
-    """Yield the faults of one connection's routes that do not depend on its type."""
+    """Yield the faults of one connection's routes, except those that depend on its type."""
     targets: dict[str, Route] = {}
     carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):

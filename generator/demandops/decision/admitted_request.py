@@ -62,7 +62,7 @@ def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> D
 def admit(
     state: State, goal: object, throttle: Throttle = lambda request, config: ()
 ) -> DemandRequest:
-    """Parse a goal and check it against the configuration, its access domains and the throttle.
+    """Return the request of a goal, checked against the configuration and the throttle.
 
     Raises:
         Refused: with every fault, of form and of content.

@@ -209,7 +209,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, from a shutdown, means it; an empty node fits any node."""
+        """Return whether ``listed`` of a shutdown means this application; no node fits any."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -287,7 +287,7 @@ def _exact(values: Mapping[str, object]) -> str:
 
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Merge topics by (topic, source); a later type replaces a missing one."""
+    """Return topics merged by (topic, source); a later type replaces a missing one."""
     merged: dict[tuple[str, str], InputTopic] = {}
     for topic in topics:
         known = merged.setdefault((topic.topic, topic.source), topic)

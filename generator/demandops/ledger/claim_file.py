@@ -119,7 +119,7 @@ class _Route(RouteOptions):
 
 
 def _plain_route(value: object) -> object:
-    """Read ``/a: /b`` as a route without options."""
+    """Return ``/a: /b`` as a route without options."""
     return {"target": value} if isinstance(value, str) else value
 
 
@@ -337,7 +337,7 @@ def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
 
 
 def read(text: str, path: str) -> Claim:
-    """Parse a claim's file.
+    """Return the claim in a file.
 
     Raises:
         InvalidInput: with every fault, also if the path does not match the ids in the file.

@@ -153,11 +153,11 @@ class Engine:
         self._config = Sandbox(_FILTERS, loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
 
     def text(self, template: str, **context: object) -> str:
-        """Render a template of the program (``flux/release.yaml.j2``)."""
+        """Return a rendered template of the program (``flux/release.yaml.j2``)."""
         return self._own.get_template(template).render(**context)
 
     def data(self, template: str, **context: object) -> dict[str, Any]:
-        """Render a values template of the configuration and parse it.
+        """Return the data that a values template of the configuration renders to.
 
         Raises:
             InvalidInput: if the template fails; it names the template and, if known, the line.

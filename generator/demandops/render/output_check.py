@@ -148,7 +148,7 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
 
 @lru_cache(maxsize=64)
 def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
-    """Compile the schema of a built-in kind."""
+    """Return the compiled schema of a built-in kind."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
     package = find_spec("kubernetes_validate")  # its import is slow, and only its files are used

@@ -341,7 +341,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return "".join(pieces)
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        """Evaluate an operator; refuse a result that is too large."""
+        """Return the result of an operator; refuse one that is too large."""
         if isinstance(left, int) and isinstance(right, int):
             bits = left.bit_length() * right if operator == "**" else left.bit_length()
             _refuse_large(
@@ -364,7 +364,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return super().getitem(obj, argument)
 
     def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        """Call a macro, a function or a method; refuse methods that are not listed."""
+        """Return the result of a macro, function or method; refuse methods that are not listed."""
         steps = _budget.get()
         for value in (*args, *kwargs.values()):
             steps.take(_size(value, data=False))
@@ -379,7 +379,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _kept(super().call(__context, __obj, *args, **kwargs))
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        """Wrap ``str.format``; refuse a result that is too large."""
+        """Return ``str.format`` wrapped, so that it refuses a result that is too large."""
         wrapped = super().wrap_str_format(value)
         if wrapped is None:
             return None

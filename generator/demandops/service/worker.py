@@ -264,7 +264,7 @@ class Worker:
         )
 
     def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
-        """Evaluate a demand; if it frees room, book demands that wait for room next."""
+        """Return the result of a demand; if it frees room, book demands that wait for that."""
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         self._own_work.follow(commits, before)
@@ -356,7 +356,7 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's changes up to the fetched tip; return whether any.
+        """Publish the effects of people's fetched changes; return whether there were any.
 
         It does not fetch first.
         """

@@ -104,7 +104,7 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again and publish it as one commit, if any file differs.
+    """Render everything again, publish the differences as one commit, and return them.
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.

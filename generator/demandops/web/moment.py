@@ -96,7 +96,7 @@ class Moment:
     def take_over(self, before: Moment) -> None:
         """Keep what an earlier moment has derived, and derive only what may differ.
 
-        Does nothing if the configuration or the overrides differ, because then all may differ.
+        It does nothing if the configuration or the overrides differ, because then all may differ.
         """
         old, new = before.state, self.state
         if (old.config, old.overrides) != (new.config, new.overrides):

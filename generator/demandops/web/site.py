@@ -77,8 +77,8 @@ class Site:
 
         Args:
             follower: the state repo.
-            hosts: the names that a browser may call it by, so that no other site can have its
-                visitors' browsers read this page; ``*`` for any.
+            hosts: the host names under which browsers may ask for the page; ``*`` for any. They
+                keep another site from reading the page through its visitors' browsers.
             documentation: the folder of the documentation's site; None: it was not built.
         """
         self._follower, self._has_docs = follower, documentation is not None

@@ -50,7 +50,7 @@ def override() -> None:
 
 
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    """Refuse a name that no override may have."""
+    """Return the name, or raise if no override may have it."""
     if not is_override_name(name):
         raise click.BadParameter(
             f"{quoted(name)} cannot name an override; use lower-case letters, digits and '-'"

@@ -94,7 +94,7 @@ def request(
     if release:
         documents = [replace(one, goal=_release_of(one.goal)) for one in documents]
     if not documents:
-        raise InvalidInput([fault("", "no request in " + ", ".join(files))])
+        raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     book_or_show(documents, state_repo, dry_run, wait, signing_key, output)
 
 
@@ -258,7 +258,7 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Decide the requests one after the other, in memory only."""
+    """Return the row of each request, decided one after the other, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()

@@ -248,7 +248,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _prompted(option: str, question: str) -> tuple[str, ...]:
-    """Ask for an option's values on the terminal; elsewhere raise that the option is missing."""
+    """Return an option's values, asked for on the terminal; elsewhere raise that it is missing."""
     if not sys.stdin.isatty():
         raise click.UsageError(f"Missing option '--{option}'.")
     return tuple(str(click.prompt(question)).split())

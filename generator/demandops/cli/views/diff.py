@@ -63,7 +63,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    """Load a commit; warn about invalid files whose last valid version is in effect."""
+    """Load and return a commit; warn about files whose last valid version is in effect."""
     with progress("reading the ledger") as report:
         snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))

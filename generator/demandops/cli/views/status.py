@@ -188,7 +188,7 @@ class Status:
 def _read(
     clusters: Mapping[str, access.ClusterAccess], domains: Iterable[ClusterDomain]
 ) -> dict[str, ObjectCache]:
-    """Read all clusters at the same time, so that an unreachable one does not delay the others."""
+    """Return the objects of each cluster; read all at once, so that none delays the others."""
     wanted: dict[str, dict[ObjectSelector, None]] = {}
     for domain in domains:
         watched = health_reader(domain).objects_to_watch(domain)

@@ -30,7 +30,7 @@ Move = Callable[[Application], Application]
 def with_moved(
     world: World, claims: Iterable[Claim], move: Move
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with an application and its connections moved, and what changes."""
+    """Return the world with an application and its connections moved, and the changed claims."""
     ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))

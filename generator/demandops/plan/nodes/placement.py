@@ -40,9 +40,9 @@ def with_chosen_nodes(
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
-    What is booked stays where it is, if the node has what is required. Otherwise it gets one of the
-    nodes that fit and have room, the first by ``placement`` of the settings. Last, overrides move
-    services.
+    What is booked stays where it is, if the node has what is required. Otherwise it gets the
+    first of the nodes that fit and have room, in the order of ``placement`` in the settings. Last,
+    overrides move services.
 
     Args:
         request: the request.

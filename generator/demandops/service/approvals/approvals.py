@@ -195,7 +195,7 @@ class Approvals:
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Fetch the commits of the branches, and plan the next check even if this one fails.
+        """Fetch and return the commits of the branches; plan the next check even if this fails.
 
         Raises:
             RemoteAway: if the remote cannot be reached.
@@ -325,7 +325,7 @@ class Approvals:
     def _bring_up_to_date(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
-        """Commit the demands on main and push the branch, unless it is up to date."""
+        """Commit the demands on main and push the branch; return False if one was withdrawn."""
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(verdict.waiting, snapshot.state, commits.read)
         verdict.failed.extend(failed)

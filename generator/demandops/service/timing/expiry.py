@@ -81,8 +81,8 @@ class LeaseExpiry:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        Never zero, because an ended lease stays in the ledger if its release failed or if it was
-        granted more time.
+        It is never zero, because an ended lease stays in the ledger if its release failed or if
+        it was granted more time.
         """
         first = ledger.first_to_end()
         if first is not self._first:  # many leases may end in one minute

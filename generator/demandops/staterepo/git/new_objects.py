@@ -156,7 +156,7 @@ class NewObjects(pygit2.OdbBackend):
                     keep.unlink()
 
     def _copy_to_pack(self, folder: str, revisions: str) -> Path:
-        """Have git read and write objects; it checks their content, and syncs the pack."""
+        """Have git write checked objects to a synced pack, and return the pack's path."""
         done = subprocess.run(
             ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
              "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],

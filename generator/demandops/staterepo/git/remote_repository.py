@@ -124,7 +124,7 @@ class RemoteRepository(StateRepository):
             return False
 
     def renew_if_damaged(self) -> bool:
-        """Make the clone anew if git finds it damaged."""
+        """Make the clone anew if git finds it damaged; return whether it was."""
         try:
             with git.Repo(self._folder) as repo:
                 self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
@@ -165,12 +165,12 @@ class RemoteRepository(StateRepository):
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch, but stop if something is urgent: a demand must not wait for a slow remote."""
+        """Fetch and return the tip; stop if ``urgent``: a demand must not wait for the remote."""
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit``; the remote accepts it only on top of its own tip."""
+        """Push ``commit``; return whether the remote took it, which it does only on its own tip."""
         try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
@@ -333,7 +333,7 @@ def _wait_for(
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its child processes; SIGTERM first, so that git removes its locks."""
+    """End git and its children and return the output; SIGTERM first, so that git unlocks."""
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)

@@ -219,7 +219,7 @@ class Judgement:
         return self._without(replace(accepted, snapshot=snapshot), self.with_old)
 
     def _without(self, accepted: Advance, faults: Faults) -> Advance:
-        """Put the last valid claims of faulty subjects in effect."""
+        """Return the advance with the last valid claims of faulty subjects in effect."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)

@@ -71,7 +71,7 @@ def check(
     *,
     require_helm: bool = False,
 ) -> CheckResult:
-    """Check the files of a folder, render them, and preview the effect of a merge.
+    """Return what a check of a folder finds: faults, rendered files, the effect of a merge.
 
     Args:
         folder: a checked-out state repo, or its files without Git.

@@ -49,7 +49,7 @@ class RenderedCharts:
 def render_charts(
     folder: Path, state: State, changed: Collection[str] | None, wanted: Collection[str]
 ) -> RenderedCharts:
-    """Lint and render the charts of a checkout.
+    """Lint and render the charts of a checkout, and return the result.
 
     Args:
         folder: the checkout; its configuration is valid.

@@ -198,9 +198,9 @@ class CommitBatch:
         keys: Iterable[ClaimKey],
         now: datetime,
     ) -> _Followed:
-        """Return the effect with the leases started of claims that a person approved.
+        """Return the effect with started leases for the claims that a person approved.
 
-        They start at approval because a lease could otherwise end before the demand is approved.
+        A lease that started earlier could end before the approval.
         """
         ledger, files = state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():

@@ -106,7 +106,7 @@ class ProposalBranches:
     def _move(
         self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Move or delete a branch; if the push fails, check whether it took effect anyway."""
+        """Move or delete a branch; return the link that the server printed, or an empty text."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             self._set_here(reference, commit, expected)

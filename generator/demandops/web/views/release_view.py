@@ -76,7 +76,7 @@ class Explained:
 
 
 def explained(now: Situation, reader: Reader, name: str) -> Explained:
-    """Explain the release with a name.
+    """Return why the release with a name runs, and its history.
 
     Raises:
         StateRepoError: if there is no such release and never was.
