@@ -149,7 +149,7 @@ NOT_BY_DEFAULT = ("DaemonSet",)
 """Kinds that a policy must name: a DaemonSet runs on all nodes, not on the demanded one alone."""
 
 NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
-"""The kinds of connections' clients, and Secrets, in which Helm keeps its releases."""
+"""The kinds that connections' clients need, and Secret, in which Helm keeps its releases."""
 
 _NETWORK_POLICY = "NetworkPolicy"
 

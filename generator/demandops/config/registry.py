@@ -175,7 +175,8 @@ class ImagePin(FrozenModel):
 class VersionContents(CamelModel):
     """What one version of an application runs.
 
-    A chart that is not listed has its default version, an image that of ``registry/images.yaml``.
+    A chart that is not listed has its default version. An image that is not listed is that of
+    ``registry/images.yaml``.
     """
 
     charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
@@ -260,7 +261,7 @@ def _free(env: dict[str, str]) -> dict[str, str]:
     for name in _OF_NODES:
         if name in env:
             raise ValueError(
-                f"{name} follows from ros of the node; set it at the node in the inventory"
+                f"{name} follows from 'ros' of the node; set that in the inventory, and remove this"
             )
     return env
 

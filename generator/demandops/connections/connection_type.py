@@ -2,9 +2,9 @@
 
 Each type has one module with a subclass of :class:`ConnectionType` and its clients. The subclass
 defines what the type supports and needs, and plans the clients of each connection as data.
-:mod:`demandops.render.connection_client` makes a client's file from this and from
-``templates/connections/<type>/``: ``client.yaml.j2``, a Deployment with the client's name, and
-``schema.json``, the fields that the program reads.
+:mod:`demandops.render.connection_client` makes a client's file from that data and from
+``templates/connections/<type>/``. There ``client.yaml.j2`` is a Deployment with the client's name,
+and ``schema.json`` lists the fields that the program reads.
 """
 
 from __future__ import annotations

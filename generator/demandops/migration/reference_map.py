@@ -1,7 +1,7 @@
 """The map from the reference's resources to the applications and connections of demands.
 
-Ids give the names of its resources, but a name does not give the ids: ``/``, ``_`` and ``-`` all
-become ``-``. So :func:`propose` only proposes a map, and a person checks it.
+Ids give the names of resources, but a name does not give the ids: ``/``, ``_`` and ``-`` all become
+``-``. So :func:`propose` only proposes a map, and a person checks it.
 """
 
 from __future__ import annotations

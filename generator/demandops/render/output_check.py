@@ -48,7 +48,7 @@ def check_values(
 ) -> None:
     """Check Helm values against the chart's schema, if the chart is in the state repo.
 
-    Like Helm, this merges the values into the chart's defaults first: a schema may require a value
+    Like Helm, it merges the values into the chart's defaults first: a schema may require a value
     that has a default.
 
     Args:

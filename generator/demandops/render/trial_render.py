@@ -1,4 +1,4 @@
-"""A check of new configuration: renders it for invented demands before a real one arrives."""
+"""A check of new configuration: it is rendered for invented demands before a real one arrives."""
 
 from __future__ import annotations
 

@@ -364,7 +364,7 @@ class Demands:
             self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand of a batch with an error."""
+        """Answer every demand of a batch with an error; ``keep`` leaves them in the journal."""
         self.answer([(ticket, error) for ticket in batch], keep)
 
     def end(self, error: Unsound) -> None:

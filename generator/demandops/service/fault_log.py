@@ -1,4 +1,4 @@
-"""What the log tells of the state repo, each thing once."""
+"""What the log says about the state repo; it says each thing once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The site: how its views become pages, its events, and the headers that keep it closed.
+"""The site: how its views become pages, its events, and the headers that keep other sites out.
 
 Every address is read only, and no page loads anything from another host. Templates escape every
 value that they print, and show what is not visible.
@@ -194,7 +194,7 @@ class _Events:
 
 
 class _ClosedHeaders:
-    """Adds the headers that keep a page closed to every answer."""
+    """Adds to every answer the headers that keep other sites out of the page."""
 
     def __init__(self, application: ASGIApp) -> None:
         self._application = application

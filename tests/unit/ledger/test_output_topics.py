@@ -124,9 +124,9 @@ def test_a_source_whose_topic_another_publishes_is_refused() -> None:
     repo = with_nodes({"id": "robo-1"}, {"id": "robo/1", "selector": {"a": "b"}})
     repo.send(join(("/a", "robo-1")))
     assert repo.faults(join(("/b", "robo/1"), id="edge/other")) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output object_list is "
-        "/robo_1_local_objectlist, which object-detection for /a of 'robo-1' publishes on 'edge' "
-        "already; give 'robo/1' another id in inventory/nodes.yaml"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
+        "object_list is /robo_1_local_objectlist, which object-detection for /a of 'robo-1' "
+        "publishes on 'edge' already; give 'robo/1' another id in inventory/nodes.yaml"
     ]
 
 
@@ -138,10 +138,10 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
     repo.state = replace(repo.state, ledger=rebuilt(claims))
     repo.send(goal([application("cloud/x", node="cloud", clouds=[FRONT])]))
     assert repo.faults(goal([application("cloud/y", node="cloud", clouds=[REAR])])) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output object_list is "
-        "/vehicle01_local_objectlist, which object-detection for /front/points of 'vehicle01' "
-        "publishes on 'cloud' already; name the usual one of the two as topics.point_cloud of "
-        "'vehicle01' in inventory/nodes.yaml"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
+        "object_list is /vehicle01_local_objectlist, which object-detection for /front/points of "
+        "'vehicle01' publishes on 'cloud' already; name the usual one of the two as "
+        "topics.point_cloud of 'vehicle01' in inventory/nodes.yaml"
     ]
 
 
@@ -167,9 +167,9 @@ def test_a_source_whose_topic_a_connection_brings_is_refused() -> None:
     repo = MemoryRepo()
     repo.send(bringing(PLAIN))
     assert repo.faults(join(FRONT)) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output object_list is "
-        f"{PLAIN}, which connection 'link' brings to 'edge' already; let the connection give it "
-        "another name there"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
+        f"object_list is {PLAIN}, which connection 'link' brings to 'edge' already; let the "
+        "connection give it another name there"
     ]
     repo.send(join(REAR, FRONT, shutdown=False) | {"apps": [application(node="cloud")]})
 

@@ -123,7 +123,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 def end(name: str, way: Way) -> None:
     """End an override: remove its file.
 
-    The releases that the override changed become again what the demands ask for.
+    The releases that the override changed return to what the demands ask for.
 
     \b
     Examples:

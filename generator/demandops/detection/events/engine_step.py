@@ -1,4 +1,4 @@
-"""One step of the engine: takes a copy of a state, applies observations and time, collects events.
+"""One step of the engine: it applies observations and time to a copy of a state, for events.
 
 Copies are cheap: the values in the mappings are immutable, and a step takes many observations.
 """

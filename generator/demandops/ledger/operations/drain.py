@@ -1,4 +1,4 @@
-"""A drain: moves placed applications, with their connections, off a node that is drained.
+"""A drain moves placed applications, with their connections, off a node that is drained.
 
 The generator requests it. :mod:`demandops.plan.nodes.relocation` works out the claims that change.
 """

@@ -1,4 +1,4 @@
-"""An expiry: releases the claims whose lease has ended. The generator requests it."""
+"""An expiry releases the claims whose lease has ended. The generator requests it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Moved connections: when an application moves, its demands' connections follow it.
 
-The topics that they brought to the old node, or took from it, they bring to the new node, or take
-from that, with the same type and options. A topic that no connection carried still has none. The
-reference's requests list their connections themselves, so a move does not change those.
+They bring the same topics to the new node, or take them from it, with the same type and options. A
+topic that no connection carried still has none. The reference's requests list their connections
+themselves, so a move does not change those.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Placement: the nodes of a demand's applications and services, where it does not name them.
 
 The configuration and the claims at a commit alone decide them, before the booking. The
-claim holds the nodes as if the demand had named them, so nothing after this knows the difference.
+claim holds the nodes as if the demand had named them, so no later stage knows the difference.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ A suspended claim stays booked but is not planned. The planner reads a view of t
 checks each claim when it is read. So there is no second ledger to keep up to date.
 
 When the last claim on a subject is released, ``keep`` books a claim with the same content for the
-override's owner. It goes when a demand asks for the subject again. Because it is a claim,
-bookkeeping and history show it like any other.
+override's owner. A later demand for the subject replaces it. Because it is a claim, bookkeeping and
+history show it like any other.
 """
 
 from __future__ import annotations

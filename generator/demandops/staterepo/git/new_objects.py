@@ -2,7 +2,7 @@
 
 A pack costs a few syncs, however many commits a batch has; loose objects cost some syncs each.
 The pack holds every object that its commits need and their parent lacks, also those that the repo
-has already: a loose object may not be on the disk yet, or about to be pruned.
+has already: a loose object may not be on the disk yet, or may be about to be pruned.
 """
 
 from __future__ import annotations

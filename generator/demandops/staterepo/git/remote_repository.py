@@ -1,4 +1,4 @@
-"""The state repo behind a URL: a bare clone that git fetches and pushes; git's errors explained."""
+"""The state repo behind a URL: a bare clone, git's fetches and pushes, and its errors."""
 
 from __future__ import annotations
 

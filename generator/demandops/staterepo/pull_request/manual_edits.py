@@ -231,7 +231,7 @@ def _move_images(
     config: Config,
     moved: dict[str, dict[str, str]],
 ) -> None:
-    """Move changes of images that the registry lists from a patch of values to ``moved``."""
+    """Move the changes of registered images out of a patch of values, into ``moved``."""
     names: dict[str, list[str]] = {}
     for name in release.service.images:
         names.setdefault(config.images[name].repository, []).append(name)
