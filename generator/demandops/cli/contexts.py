@@ -66,7 +66,9 @@ def read() -> ContextsFile:
     except FileNotFoundError:
         return EMPTY
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput.at("", f"cannot be read: {error}", file=str(path())) from None
+        raise InvalidInput.at(
+            "", f"cannot be read: {error}; replace it", file=str(path())
+        ) from None
     with located_in(text):
         return parse_file(ContextsFile, text, str(path()))
 

@@ -53,7 +53,7 @@ class Connection:
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic, or ``None``; works only in a claim."""
+        """Return the route of a source topic, or ``None``; the connection must be a claim's."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
         return found[0] if found and found[0].source == source else None

@@ -74,7 +74,7 @@ def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
     """Yield (path, object) of each file, link or submodule at or below the paths ``roots``.
 
     The order is Git's. A folder that is deeper than :data:`MAX_DEPTH` is yielded like a file. In a
-    name that is not UTF-8, ``\\xff`` stands for such a byte.
+    name that is not UTF-8, ``\\xff`` stands for a byte that is not.
     """
     for root in roots:
         found = entry(tree, root)
