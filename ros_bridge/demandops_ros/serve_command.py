@@ -275,7 +275,7 @@ class _Signals:
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly end could still answer goals
 
     def wake(self) -> None:
-        """Make :meth:`wait` look again; from any thread."""
+        """Make :meth:`wait` look again; any thread may call it."""
         os.write(self._write, b"\0")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

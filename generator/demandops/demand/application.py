@@ -144,7 +144,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the inputs of a role that topic names call ``part``, except usual topics.
+        """Return the inputs of a role for which topic names contain ``part``, except usual topics.
 
         In a separate instance, usual topics are among them too. The parts are computed once,
         because each service for a further topic asks for one.

@@ -140,7 +140,7 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield the further inputs in ``role`` that names of topics call ``part``.
+        """Yield the further inputs in ``role`` for which names of topics contain ``part``.
 
         With each comes the version of its application if that is a separate instance, else "".
         """

@@ -119,7 +119,7 @@ class Demands:
         self._arrival.set()
 
     def wake(self) -> None:
-        """End the worker's wait without a demand; from any thread."""
+        """End the worker's wait without a demand; any thread may call it."""
         with self._changed:
             self._woken = True
             self._changed.notify()

@@ -136,8 +136,8 @@ class Reader:
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
         """Return the generated files that a generator has yet to write or remove.
 
-        That may be so only after a commit by a person. Files that cannot be rendered do not count:
-        they are problems.
+        There can be such files only after a commit by a person. Files that cannot be rendered do
+        not count: they are problems.
         """
         commit = trees.commit_of(self._objects, snapshot.commit)
         if commit_log.is_by_generator(self._objects, commit):

@@ -37,7 +37,7 @@ class ParameterSetter:
         node.create_timer(_LOOK_S, self._look)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
-        """Replace the parameters that the target must have; from any thread.
+        """Replace the parameters that the target must have; any thread may call it.
 
         Raises:
             TypeError, ValueError: if ROS has no type for a value; the message names the parameter.

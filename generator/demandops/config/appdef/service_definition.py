@@ -129,7 +129,7 @@ class ServiceDefinition(Deployed, FileModel):
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
         if self.place and self.scope != "application":
             raise ValueError(
-                "place needs the scope 'application': of any other scope, one instance serves "
+                "place needs the scope 'application': with any other, one instance serves "
                 "applications that would choose different nodes"
             )
         if problems := [*size_problems(self.scaling, self.parameters)]:

@@ -122,9 +122,9 @@ class Threshold(CamelModel):
         if (self.above is None) == (self.below is None):
             raise ValueError("needs either above or below")
         if self.above is not None and self.stop > self.above:
-            raise ValueError(f"stop {self.stop:g} must not exceed above, {self.above:g}")
+            raise ValueError(f"stop {self.stop:g} is higher than above {self.above:g}; lower it")
         if self.below is not None and self.stop < self.below:
-            raise ValueError(f"stop {self.stop:g} must not be less than below, {self.below:g}")
+            raise ValueError(f"stop {self.stop:g} is lower than below {self.below:g}; raise it")
         return self
 
 

@@ -55,8 +55,8 @@ class Source(CamelModel):
     def _names_entities(self) -> Source:
         if ("{entity}" in self.topic) == bool(self.entity):
             raise ValueError(
-                "needs the name of the entity once: {entity} as a part of topic, or the field with "
-                "it in entity"
+                "needs the name of the entity once: write {entity} as a part of topic, or name in "
+                "entity the field that has it"
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
@@ -177,7 +177,7 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in seen:
-            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule a name")
+            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule its own")
         seen.add(rule.name)
         kind = next(name for name in CONDITIONS if getattr(rule, name) is not None)
         for part in ("source", "other"):

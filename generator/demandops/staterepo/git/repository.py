@@ -150,7 +150,7 @@ class StateRepository(ABC):
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant; false if one is not here.
 
-        May be called from any thread.
+        Any thread may call it.
         """
         if commit == other:
             return True
