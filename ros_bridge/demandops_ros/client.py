@@ -141,7 +141,7 @@ class DemandClient:
         return self.send({"operation": "release", "demand": demand})
 
     def demand(self, demand: str, *args: Any, **options: Any) -> HeldDemand:  # noqa: ANN401
-        """Return a demand for a ``with`` block; takes the arguments of :meth:`put`."""
+        """Return a demand for a ``with`` block, from the arguments of :meth:`put`."""
         return HeldDemand(self, demand, lambda: self.put(demand, *args, **options))
 
     def send(

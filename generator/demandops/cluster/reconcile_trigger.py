@@ -55,7 +55,7 @@ class ReconcileTrigger:
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
-        """Request a wake after a push; returns at once."""
+        """Request a wake after a push; return at once."""
         self._config = config
         self._due.set()
 

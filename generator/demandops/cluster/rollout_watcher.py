@@ -93,7 +93,7 @@ class RolloutWatcher:
         timeout: float,
         on_progress: OnProgress = lambda state, text: None,
     ) -> Future[Health]:
-        """Follow releases of a published commit; returns at once.
+        """Follow releases of a published commit; return at once.
 
         Args:
             commit: the published commit.

@@ -48,7 +48,7 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """The type of the connection; fails if none is chosen yet."""
+        """The type of the connection, which must be chosen already."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 

@@ -111,7 +111,7 @@ class End(Client):
 
     @property
     def description(self) -> str:
-        """Name type, side, connection and node."""
+        """The end's description: type, side, connection and node."""
         (connection,) = self.connections
         return f"{self.type.name} {self.side} of connection {connection} on {self.node.id}"
 

@@ -28,7 +28,7 @@ def type_numbered(number: int) -> ConnectionType | None:
 
 
 def type_named(word: str) -> ConnectionType:
-    """Return the type that files call ``word``; raises :class:`KeyError`."""
+    """Return the type that files call ``word``, or raise :class:`KeyError`."""
     return {known.word: known for known in CONNECTION_TYPES}[word]
 
 

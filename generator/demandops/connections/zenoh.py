@@ -165,7 +165,7 @@ class Bridge(Client):
 
     @property
     def description(self) -> str:
-        """Name the node."""
+        """The bridge's description, which names the node."""
         return f"Zenoh bridge on {self.node.id}"
 
     def facts(self) -> list[str]:

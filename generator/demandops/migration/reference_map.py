@@ -40,8 +40,8 @@ class PointCloud(CamelModel):
 class MappedApplication(CamelModel):
     """An application of the reference's only type.
 
-    ``egoData`` maps each topic to the node that it comes from, ``pointClouds`` each topic with an
-    object list to the point cloud behind it.
+    ``egoData`` maps each topic to the node that it comes from, ``pointClouds`` maps each topic
+    with an object list to the point cloud behind it.
     """
 
     id: _Filled

@@ -116,7 +116,7 @@ class Generator:
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time; does not fetch.
+        """Return the state in effect at a commit or a time, without a fetch.
 
         Any thread may call it; it may take seconds.
 
@@ -146,7 +146,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Name of each failed thread that has not recovered → the reason; any thread may read it."""
+        """Name of each failed thread that has not recovered → the reason; for any thread."""
         return self._runtime.failures
 
     def fetch_now(self) -> None:
@@ -217,7 +217,7 @@ class Generator:
         self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
-        """Refuse further demands, finish the queued ones and stop; returns at once.
+        """Refuse further demands, finish the queued ones and stop; return at once.
 
         Args:
             timeout: seconds for the queued demands. The demands that are not published then stay in

@@ -117,7 +117,7 @@ class StateRepository(ABC):
     """The prefix of the references of branches in this repository."""
 
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here; does not ask the remote."""
+        """Return the newest published commit that is known here, without asking the remote."""
         target = self.objects.references[self.main_reference].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target

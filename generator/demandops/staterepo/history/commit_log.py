@@ -252,7 +252,7 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that ever stopped; reads the whole history."""
+    """Return the names of all releases that ever stopped, from the whole history."""
     removed = _removed(repo, tip, "*.yaml")
     return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
 
