@@ -33,7 +33,7 @@ _LONGEST_REASON = 300
 class Runtime:
     """The runtime of this machine; a subclass overrides the methods that it replaces.
 
-    ``unsound`` says why the process must end, if it must; it then calls ``when_unsound``.
+    ``unsound`` says why the process must end, if it must; then ``when_unsound`` is called.
     """
 
     def __init__(self) -> None:

@@ -56,7 +56,7 @@ def _tag_of(text: str) -> str:
 def _integer(node: yaml.ScalarNode) -> int:
     number: int = _CONSTRUCTOR.construct_yaml_int(node)
     if number.bit_length() > _MAX_BITS:
-        raise _problem(f"a whole number has more than {_MAX_BITS} bits", node)
+        raise _problem(f"a whole number has more than {_MAX_BITS} bits; shorten it", node)
     return number
 
 

@@ -15,7 +15,7 @@ from demandops.quoting import one_line
 
 _GAP = "  "
 _COMFORT = 12
-"""The width that a column of text gets, if it needs it, before a column is left out."""
+"""The width that every column of text may have before one column is left out."""
 
 Cell = str | Sequence[str]
 """The text of a cell, or its lines."""

@@ -93,7 +93,7 @@ def _from_context(field: str) -> Callable[[], str | None]:
 
 
 def _required(default: Callable[[], str | None]) -> Callable[..., str]:
-    """Return a callback that returns the given address, else the default, else raises."""
+    """Return a callback that returns the given address or the default, or raises."""
 
     def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT

@@ -293,7 +293,7 @@ class MqttClientSettings(ClientSettings):
     """The settings of MQTT clients, which are ROS nodes.
 
     ``rmw`` is that of the node if not given. ``messages`` are the packages whose messages the image
-    can carry; if empty, that is not known.
+    can carry; an empty list means that they are not known.
     """
 
     launch_file: _LaunchFile = "standalone.launch.xml"

@@ -105,7 +105,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
     """Return the ledger of an earlier format with further topics marked as such.
 
-    The topic of a source that was booked first is its usual one.
+    The usual topic of a source is the one that was booked first.
     """
     first: dict[tuple[str, str], str] = {}
 

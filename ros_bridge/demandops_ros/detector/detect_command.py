@@ -55,7 +55,7 @@ def detect(
         return
     for option, given in (("--plot", plot is not None), ("--output", output != "text")):
         if given:
-            raise click.UsageError(f"{option} is for --replay")
+            raise click.UsageError(f"{option} is for --replay; add that, or leave it out")
     _run(rules, ros_args)
 
 

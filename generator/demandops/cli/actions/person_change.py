@@ -183,7 +183,7 @@ def _opened(repo: Reader, edit: Edit, branch: str) -> str:
             return ""
         return forge.open(branch, MAIN_BRANCH, one_line(edit.summary), one_line(edit.reason)).link
     except ForgeError as error:
-        errors.print(f"warning: no merge request was opened: {error}; open it for {branch}")
+        errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
         return ""
 
 

@@ -79,9 +79,9 @@ def request(
     """Book demand requests from files.
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
-    documents of the kind Demand (docs/demand.md). Write - for standard input. If a document cannot
-    be parsed, nothing is booked. Otherwise they are booked in order; if one is refused, the others
-    are still booked.
+    documents of the kind Demand (docs/demand.md). Write - for standard input. If it cannot parse a
+    document, the command books nothing. Otherwise it books the documents in order. If one is
+    refused, it still books the others.
 
     \b
     Examples:

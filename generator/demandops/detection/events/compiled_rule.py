@@ -117,7 +117,7 @@ class AreaRule(CompiledRule):
 
 
 class PairRule(CompiledRule):
-    """A rule on the distance of two entities. Squares as wide as its stop distance find them."""
+    """A rule on the distance of two entities. It looks for them in squares of the stop distance."""
 
     def __init__(self, rule: Rule, condition: Together) -> None:
         super().__init__(rule)

@@ -52,7 +52,7 @@ _WITHOUT_REASON = re.compile(
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
-"""The limit of a first clone; git ends a connection that carries nothing much earlier."""
+"""The limit of a first clone. Git ends an idle connection much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 _NO_CLONE = re.compile(r"^(?!remote:).*fatal: not a git repository", re.MULTILINE)
 """Matches what git says if it cannot read the repository in which it runs."""

@@ -92,7 +92,7 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     Args:
         now: the situation.
         wanted: lights the services, connections and nodes that match.
-        layout: ``place`` or ``cluster``; any other value means ``place``, if most nodes have one.
+        layout: ``place`` or ``cluster``; any other means ``place``, if most nodes have a position.
     """
     config = now.moment.config
     nodes = list(config.nodes.values())
