@@ -312,7 +312,7 @@ def _block(value: Any, indent: str) -> str:  # noqa: ANN401
 
 
 def _item(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return an item of a list; the first line of one with several follows the dash."""
+    """Return an item of a list, whose first line follows the dash."""
     if isinstance(value, str):
         return f" {_scalar(value)}"
     inner = f"{indent}  "

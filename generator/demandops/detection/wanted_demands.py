@@ -104,7 +104,7 @@ class WantedDemands:
     def hold(self, key: Key, goal: Goal) -> None:
         """Record that a demand was booked before the start; call :meth:`want` for it next.
 
-        It is renewed at once, to learn its lease.
+        The next goal renews the demand, because its lease is not known.
         """
         entry = self._entries.setdefault(key, _Entry())
         entry.held, entry.renew_at = goal, -inf

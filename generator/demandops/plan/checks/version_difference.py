@@ -141,7 +141,7 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim that asks for a version, and its name for that."""
+    """Return the requesters of the first claim on a version, and the claim's name for that."""
     for claim in ledger.claims_on(subject):
         word = claim.application.version
         if same_version(known.get(word, known[""]), version):
