@@ -183,7 +183,7 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Add a fault if two appdefs name different origins for what a shared service runs for."""
+    """Add a fault if two appdefs give the ``each`` of a shared service different origins."""
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
         file = f"appdefs/{name}/service.yaml"

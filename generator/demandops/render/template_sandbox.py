@@ -102,7 +102,7 @@ def budget() -> Iterator[None]:
 def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts; a part that occurs twice counts twice.
 
-    With ``data``, any other object is refused, because its text would hold an address in memory.
+    With ``data``, it refuses an object of another kind, whose text holds an address in memory.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)

@@ -317,8 +317,8 @@ class Worker:
     def _follow(self) -> None:
         """Fetch if a fetch is due, carry out the commits of others, and do what is due.
 
-        Ends of overrides, drains, scale-downs and waiting demands can be due. The worker reads a
-        repository on this disk each time, because that is cheap.
+        The end of an override, a drain, a scale-down or a waiting demand can be due. The worker
+        reads a repository on this disk each time, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
         try:

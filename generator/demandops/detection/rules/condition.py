@@ -122,9 +122,13 @@ class Threshold(CamelModel):
         if (self.above is None) == (self.below is None):
             raise ValueError("needs either above or below")
         if self.above is not None and self.stop > self.above:
-            raise ValueError(f"stop {self.stop:g} is higher than above {self.above:g}; lower it")
+            raise ValueError(
+                f"stop {self.stop:g} must be at most {self.above:g}, the value of above"
+            )
         if self.below is not None and self.stop < self.below:
-            raise ValueError(f"stop {self.stop:g} is lower than below {self.below:g}; raise it")
+            raise ValueError(
+                f"stop {self.stop:g} must be at least {self.below:g}, the value of below"
+            )
         return self
 
 

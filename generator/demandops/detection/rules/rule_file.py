@@ -103,7 +103,9 @@ class Rule(CamelModel):
         if (self.demand is None) == (self.deployment_request is None):
             raise ValueError("needs either demand or deploymentRequest")
         if self.renew and self.demand is not None:
-            raise ValueError("renew is for a deploymentRequest; a demand is renewed by its lease")
+            raise ValueError(
+                "renew is for a deploymentRequest; leave it out, because a demand has its lease"
+            )
         if seconds_of(self.retry) < 1 or (self.renew and seconds_of(self.renew) < 1):
             raise ValueError("retry and renew must be one second or more")
         return self

@@ -185,8 +185,8 @@ class Room:
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
         """Return what an application's own services request, which is the same on each node.
 
-        It shows that a node is full without planning all services there. It is empty if there are
-        overrides whose effects may differ by node.
+        A caller compares it with a node's room before it plans all services there. It is empty if
+        there are overrides whose effects may differ by node.
         """
         subject, world = claims[0].subject, self._world
         if any(one.node or one.deny or one.replicas is not None for one in world.overrides):

@@ -170,7 +170,7 @@ class RemoteRepository(StateRepository):
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit``; return whether the remote took it, which it does only on its own tip."""
+        """Push ``commit`` and return True, if it is on top of the remote's own tip."""
         try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")

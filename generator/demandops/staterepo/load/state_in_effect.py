@@ -171,8 +171,8 @@ def _source(record: LogEntry) -> ConfigSource:
         return ConfigSource(Oid(hex=commit), replacements)
     except ValueError:
         raise StateRepoError(
-            f"commit {record.commit} has trailers about invalid files that cannot be read; revert "
-            "it, or merge valid files"
+            f"commit {record.commit} has unreadable trailers about invalid files; revert it, or "
+            "merge valid files"
         ) from None
 
 
