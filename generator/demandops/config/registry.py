@@ -311,7 +311,7 @@ class ClientsFile(FileModel):
 
     @property
     def connection_types(self) -> tuple[str, ...]:
-        """The words of the connection types that the file has settings of."""
+        """The words of the connection types for which the file has settings."""
         return tuple(sorted(self.model_fields_set - {"apiVersion", "kind"}))
 
     def of(self, connection_type: str) -> ClientSettings:

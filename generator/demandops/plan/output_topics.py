@@ -70,7 +70,7 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request with every input marked that is a further topic of its source."""
+    """Return the request, in which a mark says which inputs are further topics of a source."""
     if not request.adds_claims:
         return request
     own = request.demand if isinstance(request, Put) else None  # a put may release what it holds

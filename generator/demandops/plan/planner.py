@@ -156,7 +156,7 @@ def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> In
 def _inputs(
     config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
 ) -> tuple[InputTopic, ...]:
-    """Return the topics that an instance reads in a role, sorted; a known type fills a gap."""
+    """Return the topics that an instance reads in a role, sorted, with their types if known."""
     found: set[InputTopic] = set()
     for part in parts:
         origin = _origin(config, key, role, part)

@@ -27,7 +27,7 @@ from demandops.staterepo.reader import Reader
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
     """Show the differences between two commits.
 
-    They are shown in bookkeeping, releases and other files. A and B are commits, or times like
+    The command compares bookkeeping, releases and other files. A and B are commits, or times like
     2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h.
 
     \b

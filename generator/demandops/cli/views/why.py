@@ -73,10 +73,11 @@ def why(
 ) -> None:
     """Explain why something runs or ran.
 
-    Shown are the requesters, the configuration and overrides that apply, and the commits. NAME is
-    that of a release or a part that no other release has, the id of an application, connection,
-    demand, node or requester, or the name of an application definition or override. PATH is one
-    below clusters/ or ledger/. If it no longer runs, the commit that stopped it is shown.
+    The command shows the requesters, the configuration and overrides that apply, and the commits.
+    NAME is a release, or a part of its name that no other release has; the id of an application,
+    connection, demand, node or requester; or the name of an application definition or override.
+    PATH is a file below clusters/ or ledger/. For what no longer runs, the command shows the commit
+    that stopped it.
 
     \b
     Examples:

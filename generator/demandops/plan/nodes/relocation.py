@@ -147,7 +147,7 @@ class Followed:
 
 
 def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> Followed:
-    """Return the ledger with services, and their connections, where overrides move them to.
+    """Return the ledger with services and their connections where overrides move them.
 
     Args:
         world: the claims and the configuration.

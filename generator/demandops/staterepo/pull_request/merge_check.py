@@ -47,10 +47,10 @@ from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, 
 class CheckResult:
     """The result of a check.
 
-    ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if no valid commit
-    can be compared with. ``base`` is the commit compared with, if any; if its files are not valid
-    (``base_valid``), their last valid versions are used. ``newer`` are the commits that the merge
-    target has and the checkout lacks. ``warnings`` are likely mistakes.
+    ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if there is no
+    valid commit for a comparison. ``base`` is the commit of the comparison, if any; if its
+    files are not valid (``base_valid``), their last valid versions are used. ``newer`` are the
+    commits that the merge target has and the checkout lacks. ``warnings`` are likely mistakes.
     """
 
     faults: tuple[Fault, ...]
