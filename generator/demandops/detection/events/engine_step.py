@@ -1,6 +1,7 @@
-"""One step of the engine: it applies observations and time to a copy of a state, for events.
+"""One step of the engine, which collects the events of observations and of passing time.
 
-Copies are cheap: the values in the mappings are immutable, and a step takes many observations.
+It changes a copy of the state. Copies are cheap: the values in the mappings are immutable, and a
+step takes many observations.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     if found is None:
         raise StateRepoError(
             f"'{text}' is neither a commit of the state repo nor a time; `demandops log` lists the "
-            f"commits, a time is written like {TIMES}"
+            f"commits; write a time like {TIMES}"
         )
     return found
 

@@ -135,7 +135,7 @@ def _publish(
         repository.new.forget()
         REAL.sleep(_PAUSE_S * attempt)
     raise StateRepoError(
-        f"{repository.address} moved {_ATTEMPTS} times; nothing was changed, try again"
+        f"{repository.address} moved {_ATTEMPTS} times, so nothing was changed; try again"
     )
 
 
