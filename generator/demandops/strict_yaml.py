@@ -49,7 +49,7 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes; cached, because the same words come often."""
+    """Return the tag of a scalar without quotes, from a cache, because words come often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -288,7 +288,7 @@ def dump(data: Mapping[str, Any]) -> str:
 
 
 class _NotSimple(Exception):
-    """Raised by a text that only PyYAML writes, with escapes or over several lines."""
+    """Raised for a text with escapes or several lines, which only PyYAML writes."""
 
 
 _SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")

@@ -267,7 +267,7 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return nodes, the domain of each, and hosts, with ``<id>@<domain>`` for further domains."""
+    """Return nodes, the domain of each, and the host of each ``<id>@<domain>`` that it adds."""
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
     for node in [one for one in nodes.values() if one.access_domains]:
         file, place = reader.place_of(NODES_FILE, node.id)

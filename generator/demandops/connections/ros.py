@@ -120,7 +120,7 @@ def _port(connection: str, wan: Wan) -> int:
 
 @lru_cache(maxsize=65_536)
 def _number(connection: str) -> int:
-    """Return a number for a connection id; cached, because all ids of a node are compared."""
+    """Return a number for a connection id, from a cache, because ids are compared often."""
     return int(naming.digest("port", connection), 16)
 
 

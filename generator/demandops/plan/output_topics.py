@@ -54,7 +54,7 @@ def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) ->
 
 @lru_cache(maxsize=65_536)
 def published(pattern: str, source: str, told: str) -> InputTopic:
-    """Return a topic that a service publishes for a source; cached: a fusion reads hundreds."""
+    """Return a topic that a service publishes for a source, from a cache: a fusion has hundreds."""
     return InputTopic(named(pattern, naming.topic_part(source, told)), source)
 
 

@@ -84,7 +84,7 @@ class ParameterSetter:
         self._changed.trigger()  # other parameters may be wanted by now
 
     def _endpoints(self) -> frozenset[tuple[int, ...]]:
-        """Return the target's endpoints for parameter events, also those that a killed node left."""
+        """Return the target's endpoints for parameter events, also those of a killed node."""
         return frozenset(
             tuple(info.endpoint_gid)
             for info in self._node.get_publishers_info_by_topic(_EVENTS)
