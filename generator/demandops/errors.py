@@ -137,7 +137,8 @@ class ShuttingDown(DemandOpsError):
 class Unsound(DemandOpsError):
     """Raised when a demand could be lost or booked twice, or another process might answer it too.
 
-    Nobody is answered, and the process ends with exit code 3. The next start reads the journal.
+    No requester gets an answer, and the process ends with exit code 3. The next start reads the
+    journal.
     """
 
 

@@ -1,4 +1,4 @@
-"""On which lines of a file its fields are, so that a fault can name its line."""
+"""The lines of a file's fields, so that a fault can name its line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demandops.strict_yaml import LOADER, load_all
 def lines(text: str, document: int = 0) -> dict[str, int]:
     """Return the line of each field of a document, by its path: ``nodes[3].cluster``.
 
-    Without any, if :func:`load_all` does not take the text: the fault has its line.
+    The result is empty if :func:`load_all` refuses the text; that fault already has its line.
     """
     found: dict[str, int] = {}
     with suppress(InvalidInput, yaml.YAMLError):
@@ -43,7 +43,7 @@ class FieldLines:
     """The lines of the fields of files, each of which is read once."""
 
     def __init__(self, text_of: Callable[[str], str | None]) -> None:
-        """Look into the texts that ``text_of`` returns by file, None if there is none."""
+        """Read files with ``text_of``, which returns a file's text, or None if there is none."""
         self._text_of = text_of
         self._known: dict[str, Mapping[str, int]] = {}
 
@@ -69,7 +69,7 @@ def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) ->
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """Give the faults of a block, which are all of one text, their lines."""
+    """Add the lines to the faults that the block raises, which are all of one text."""
     try:
         yield
     except InvalidInput as error:

@@ -1,6 +1,6 @@
 """Pull requests of proposals at a forge: GitHub, and Gitea or Forgejo.
 
-Knows pull requests and HTTP, but not demands or Git: the branch has already been pushed. GitLab
+It knows pull requests and HTTP, but not demands or Git: the branch is already pushed. GitLab
 needs no call: it opens a merge request because of the push's options
 (:mod:`demandops.staterepo.write.proposal_branch`).
 """
@@ -69,7 +69,7 @@ class Forge(ABC):
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Return whether a pull request was merged; raises a lookup error for other data."""
+        """Return whether a pull request was merged; raise a lookup error for other data."""
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
         """Return the pull request for a branch; open one if there is none.

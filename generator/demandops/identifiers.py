@@ -116,4 +116,4 @@ PATTERN_WORDS = {
         "a topic that begins with '/', such as /{instance}_objects"
     ),
 }
-"""What to write, by the pattern of a field."""
+"""What a person may write in a field, by the field's pattern."""

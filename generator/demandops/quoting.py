@@ -1,8 +1,8 @@
 """Text from outside as text that people and programs read line by line.
 
-A value of a goal, a file, a commit, a remote or an exception may hold anything. Whoever prints it
-asks this module, so that it cannot begin a line, control a terminal, reorder or hide text, or fill
-a screen. Visible text stays as it is.
+A value of a goal, a file, a commit, a remote or an exception may hold anything. Code that prints it
+asks this module, so that the value cannot begin a line, control a terminal, reorder or hide text,
+or fill a screen. Visible text stays as it is.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def quoted(value: str, most: int = 80) -> str:
 
 
 def json_escaped(text: str) -> str:
-    """Return JSON text with JSON's own escape for what is not visible: the same data."""
+    """Return JSON text of the same data, with JSON's own escapes for what is not visible."""
     if is_visible(text.replace("\n", "")):
         return text
     return "".join(

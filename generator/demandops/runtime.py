@@ -26,14 +26,14 @@ Thread = threading.Thread
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STEADY_S = 2 * _LONGEST_PAUSE_S
-"""A thread that runs for so long has recovered from its last failure."""
+"""A thread that runs for this many seconds has recovered from its last failure."""
 _LONGEST_REASON = 300
 
 
 class Runtime:
     """The runtime of this machine; a subclass overrides the methods that it replaces.
 
-    ``unsound`` is why the process must end, if it must; ``when_unsound`` is called then.
+    ``unsound`` says why the process must end, if it must; then ``when_unsound`` is called.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class Runtime:
             log.info("%s works again", name)
 
     def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
-        """Start a thread that is started again if it fails, after a pause that grows.
+        """Start a thread and return it; if it fails, start it again after a pause that grows.
 
         After :class:`Unsound` it is not started again: the process must end.
         """

@@ -29,10 +29,10 @@ _WORDS = frozenset(
 )  # some parsers do not read these words as text
 
 MAX_LENGTH = 4_000_000
-"""The most characters of a file; an inventory of 20,000 nodes has fewer."""
+"""How many characters a file may have; an inventory of 20,000 nodes has fewer."""
 _MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""The most bits of a whole number; Python prints at most 4,300 digits."""
+"""How many bits a whole number may have; Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
@@ -49,14 +49,14 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes; cached, because the same words come often."""
+    """Return the tag of a scalar without quotes, from a cache, because words come often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
 def _integer(node: yaml.ScalarNode) -> int:
     number: int = _CONSTRUCTOR.construct_yaml_int(node)
     if number.bit_length() > _MAX_BITS:
-        raise _problem(f"a whole number has more than {_MAX_BITS} bits", node)
+        raise _problem(f"a whole number has more than {_MAX_BITS} bits; shorten it", node)
     return number
 
 
@@ -75,7 +75,7 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a stand-in is not the value of a field, but part of a text, say."""
+    """Raised if a stand-in is not the value of a field, but, for example, part of a text."""
 
 
 class _Parser:
@@ -176,7 +176,7 @@ def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
 
 
 def _number(value: object) -> str:
-    """Return what is written for a number, a truth value or nothing."""
+    """Return the text of a number, a truth value or null."""
     return str(_REPRESENTER.represent_data(value).value)
 
 
@@ -244,13 +244,13 @@ _LISTED = re.compile(
 )
 """Matches a field with a list of plain texts, as :func:`to_json` writes it."""
 _LONG = 200
-"""From how many characters on the json module reads such a list: PyYAML takes 20 times as long."""
+"""From this length on, the json module reads a list, because PyYAML takes 20 times as long."""
 _STAND_IN = "demandops-list"
 """Stands for a long list while PyYAML reads what is around it."""
 
 
 def _load_around_lists(text: str) -> list[Any]:
-    """Return the document of a text with long lists; nothing if it has none or is not so simple."""
+    """Return the document of a text with long lists; an empty list if that fails."""
     lists: dict[str, list[str]] = {}
 
     def stand_in(match: re.Match[str]) -> str:
@@ -288,7 +288,7 @@ def dump(data: Mapping[str, Any]) -> str:
 
 
 class _NotSimple(Exception):
-    """Raised by a text that only PyYAML writes, with escapes or over several lines."""
+    """Raised for a text with escapes or several lines, which only PyYAML writes."""
 
 
 _SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")
@@ -312,7 +312,7 @@ def _block(value: Any, indent: str) -> str:  # noqa: ANN401
 
 
 def _item(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return an item of a list; the first line of one with several follows the dash."""
+    """Return an item of a list, whose first line follows the dash."""
     if isinstance(value, str):
         return f" {_scalar(value)}"
     inner = f"{indent}  "

@@ -98,8 +98,8 @@ class GoalSender:
         """Send a goal and wait for its result.
 
         Returns:
-            Whether it succeeded, its result, and whether an earlier attempt was lost, which may
-            have succeeded as well.
+            Whether the goal succeeded, its result, and whether an earlier attempt was lost, which
+            may have succeeded as well.
 
         Raises:
             DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
@@ -119,7 +119,7 @@ class GoalSender:
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
 
     def _wait_until_discovered(self, deadline: float) -> None:
-        """Wait until a node answers; if none does in time, the goal says so."""
+        """Wait until a node answers; if none does in time, the goal will fail with the reason."""
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
                 self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)

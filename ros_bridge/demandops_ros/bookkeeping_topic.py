@@ -19,7 +19,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    """Fill and return the response: the bookkeeping at ``request.at``, or at the tip if empty."""
+    """Fill and return the response: the bookkeeping at ``request.at``, by default at the tip."""
     try:
         snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
         response.commit, response.bookkeeping_json = _commit_and_json(snapshot)

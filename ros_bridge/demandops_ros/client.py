@@ -125,7 +125,7 @@ class DemandClient:
         return self.send(data, on_stage)
 
     def renew(self, demand: str) -> Answer:
-        """Renew a demand's leases.
+        """Renew a demand's leases, and return the answer.
 
         Raises:
             DemandError: as :meth:`put`; ``not-held`` if it has ended.
@@ -133,7 +133,7 @@ class DemandClient:
         return self.send({"operation": "renew", "demand": demand})
 
     def release(self, demand: str) -> Answer:
-        """Release all that a demand holds.
+        """Release all that a demand holds, and return the answer.
 
         Raises:
             DemandError: as :meth:`put`; ``not-held`` if it holds nothing.
@@ -141,13 +141,13 @@ class DemandClient:
         return self.send({"operation": "release", "demand": demand})
 
     def demand(self, demand: str, *args: Any, **options: Any) -> HeldDemand:  # noqa: ANN401
-        """Return a demand for a ``with`` block; takes the arguments of :meth:`put`."""
+        """Return a demand for a ``with`` block, from the arguments of :meth:`put`."""
         return HeldDemand(self, demand, lambda: self.put(demand, *args, **options))
 
     def send(
         self, data: Mapping[str, Any], on_stage: StageListener = lambda stage, text: None
     ) -> Answer:
-        """Send a document of the kind ``Demand`` and wait for the answer; see :meth:`put`."""
+        """Send a document of the kind ``Demand`` and return the answer; see :meth:`put`."""
         goal = demand_goal_from_data({"requesters": list(self.requesters), **data})
         succeeded, result, lost = self._sender.send(
             goal, lambda feedback: on_stage(feedback.stage, feedback.message)

@@ -44,7 +44,7 @@ def demand(
     """Send a demand to a running node.
 
     FILE is a YAML document of the kind Demand (docs/demand.md), or - for standard input. If the
-    demand fails, prints the node's reason and exits with 1.
+    demand fails, the command prints the node's reason and exits with 1.
 
     \b
     Examples:

@@ -1,6 +1,6 @@
 """The node's status on ``/diagnostics``, for ROS 2's own tools.
 
-Publishes four statuses once a second: whether the state repo can be reached and written, whether
+It publishes four statuses once a second: whether the state repo can be reached and written, whether
 its configuration is valid, whether all parts of the generator work, and whether this node alone
 serves its actions.
 """

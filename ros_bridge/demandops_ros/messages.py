@@ -1,4 +1,4 @@
-"""Converts ROS messages to plain data and back; needs the messages only, not rclpy."""
+"""Converts ROS messages to plain data and back; it needs the messages only, not rclpy."""
 
 from __future__ import annotations
 

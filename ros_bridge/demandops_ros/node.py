@@ -204,7 +204,7 @@ class DemandNode(Node):  # type: ignore[misc]
             self.get_logger().warning(f"{goal}: nobody gets the answer of {goal.ticket.operation}")
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Withdraw a demand, which is possible until it is committed."""
+        """Withdraw a demand and accept the cancel, unless the demand is committed."""
         goal = self._goals.get(id(handle.request))
         if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT

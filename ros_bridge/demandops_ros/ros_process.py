@@ -40,11 +40,11 @@ class ExecutorThread:
         atexit.register(self.close)  # it may be that nobody else does
 
     def call(self, callback: Callable[[], object]) -> None:
-        """Call something in the thread."""
+        """Call ``callback`` in the thread."""
         self._executor.create_task(callback)
 
     def close(self) -> None:
-        """End the thread; the node may be destroyed then. May be called again."""
+        """End the thread; then the caller may destroy the node. A second call does nothing."""
         atexit.unregister(self.close)
         if not self._over.is_set():
             self._over.set()

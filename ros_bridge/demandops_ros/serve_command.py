@@ -168,7 +168,7 @@ def _page(
     settings: dict[str, Any],
     clusters: Mapping[str, access.ClusterAccess],
 ) -> WebServer:
-    """Start the web page, which fetches the state repo itself, at the node's interval."""
+    """Start and return the web page, which fetches the state repo itself, as often as the node."""
     interval = parse_interval(settings["fetch_interval"])
     follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
     generator.on_publish(lambda config: follower.wake())
@@ -275,7 +275,7 @@ class _Signals:
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly end could still answer goals
 
     def wake(self) -> None:
-        """Make :meth:`wait` look again; from any thread."""
+        """Make :meth:`wait` look again; any thread may call it."""
         os.write(self._write, b"\0")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

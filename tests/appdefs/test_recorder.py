@@ -278,7 +278,7 @@ class TestParameters:
         (found,) = books.faults(self.demand("vehicle01", format="bag"))
         assert found == (
             'parameters.format: demands contradict each other: "mcap" for vehicle00 and "bag" for '
-            "vehicle01; agree, or have the application definition say how to merge them"
+            "vehicle01; agree, or ask that the application definition say how to merge them"
         )
 
     @pytest.mark.parametrize(

@@ -132,9 +132,9 @@ def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
 
 # the file, and how the message starts: the words of libyaml and pydantic are left out
 ATTACKS: dict[str, tuple[str | bytes, str]] = {
-    "empty": ("", "error: no request in {file}\n"),
-    "only a comment": ("# nothing\n", "error: no request in {file}\n"),
-    "empty documents": ("---\n---\n...\n", "error: no request in {file}\n"),
+    "empty": ("", "error: no request in {file}; write one\n"),
+    "only a comment": ("# nothing\n", "error: no request in {file}; write one\n"),
+    "empty documents": ("---\n---\n...\n", "error: no request in {file}; write one\n"),
     "a list": (
         "- id: a\n",
         "{file}: request 0 '' refused\n"

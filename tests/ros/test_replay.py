@@ -84,7 +84,7 @@ def test_a_bag_gives_the_demands_of_a_plain_script(
     )
     assert ran.code == 0
     assert ran.err == (
-        "warning: /vehicles/tram/pose has the type std_msgs/msg/String, and is not read\n"
+        "warning: /vehicles/tram/pose is not read, because its type is std_msgs/msg/String\n"
     )
     data = ran.json()
     told = [(one["second"], one["entities"][0], one["change"]) for one in data["events"]]

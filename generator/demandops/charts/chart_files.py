@@ -53,7 +53,7 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
-    """Return the default values of a chart, over those that it imports, as Helm merges them.
+    """Return a chart's default values, merged over those that it imports by Helm's rules.
 
     Raises:
         InvalidInput: a ``values.yaml`` cannot be read.
@@ -69,7 +69,7 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge values by Helm's rules: mappings merge, null removes, others replace."""
+    """Return values merged by Helm's rules: mappings merge, null removes, others replace."""
     result = dict(below)
     for key, value in above.items():
         if value is None:

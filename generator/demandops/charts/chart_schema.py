@@ -1,7 +1,7 @@
 """The ``values.schema.json`` of a chart: its own values, and those of the library that it imports.
 
-Helm and the generator follow no reference out of a schema. So a chart's schema contains what the
-library's says, put there by this module.
+Helm and the generator follow no reference out of a schema. So this module puts what the library's
+schema says into the chart's schema.
 """
 
 from __future__ import annotations

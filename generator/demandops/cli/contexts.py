@@ -50,13 +50,13 @@ EMPTY = ContextsFile(apiVersion=API_VERSION, kind="Contexts")
 
 
 def path() -> Path:
-    """Return the path of the file."""
+    """Return the path of the file with the contexts."""
     root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(root) / "demandops" / "contexts.yaml"
 
 
 def read() -> ContextsFile:
-    """Read the file; without one there are no contexts.
+    """Return the contexts in the file; without a file there are none.
 
     Raises:
         InvalidInput: with all faults.
@@ -66,7 +66,9 @@ def read() -> ContextsFile:
     except FileNotFoundError:
         return EMPTY
     except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput.at("", f"cannot be read: {error}", file=str(path())) from None
+        raise InvalidInput.at(
+            "", f"cannot be read: {error}; replace it", file=str(path())
+        ) from None
     with located_in(text):
         return parse_file(ContextsFile, text, str(path()))
 
@@ -77,7 +79,7 @@ def parsed(data: dict[str, Any]) -> ContextsFile:
 
 
 def write(content: ContextsFile) -> None:
-    """Replace the file, which only its owner may read."""
+    """Replace the file with the contexts; only its owner may read it."""
     file = path()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)

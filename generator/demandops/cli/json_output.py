@@ -32,7 +32,7 @@ Command = Callable[..., Any]
 
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
-    """Return the option ``--output``; with json, a command that fails prints its faults too."""
+    """Return the option ``--output``; with json, a command that fails prints its faults as JSON."""
     description = "The output format."
     if "markdown" in formats:
         description = "The output format; markdown is for a comment on a pull request."

@@ -58,11 +58,11 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Each command, by name: the room of its module, and its short help."""
+"""Each command, by name: the folder of its module, and its short help."""
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""They log, or fill the screen, so they do not show what git does meanwhile."""
+"""The commands that log, or fill the screen; they do not show what git does meanwhile."""
 
 
 class ExitCode(IntEnum):
@@ -76,7 +76,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import a command; raise a ClickException if a package that it needs is not installed."""
+    """Import and return a command; raise ClickException if it needs a missing package."""
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = f"{name}_" if iskeyword(name) else name.replace("-", "_")
@@ -99,7 +99,7 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the command that the arguments name; return its name, it and its arguments."""
+        """Import the command that the arguments name; return name, command and arguments."""
         name, command, rest = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             slow_git.listen(show_slow)

@@ -64,7 +64,7 @@ def painted(text: str, style: str) -> str:
 
 
 def print_lines(found: list[str]) -> None:
-    """Print lines; on a terminal that is too low for them, through the pager ``$PAGER``."""
+    """Print lines; if the terminal has too few rows, through the pager ``$PAGER``."""
     text = "".join(f"{line}\n" for line in found)
     high = len(found) >= shutil.get_terminal_size().lines
     pager = os.environ.get("PAGER")
@@ -131,7 +131,7 @@ def version_lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def show_slow(text: str) -> None:
-    """Show on a terminal what takes long, in place of what was shown before; nothing if empty."""
+    """Show on a terminal what takes long, in place of the last text; an empty text clears that."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[2K{lines(text)}")
         sys.stderr.flush()
@@ -139,7 +139,7 @@ def show_slow(text: str) -> None:
 
 @contextmanager
 def busy(title: str) -> Iterator[None]:
-    """Show on a terminal what goes on, and for how long, once it takes a second."""
+    """Show the title and the elapsed seconds on a terminal, if the block takes a second."""
     if not sys.stderr.isatty():
         yield
         return

@@ -15,7 +15,7 @@ from demandops.quoting import one_line
 
 _GAP = "  "
 _COMFORT = 12
-"""A column of text gets at least this width, if it needs it, before a column is left out."""
+"""The width that every column of text may have before one column is left out."""
 
 Cell = str | Sequence[str]
 """The text of a cell, or its lines."""
@@ -45,7 +45,7 @@ class Table:
     styles: dict[str, str] = field(default_factory=dict)
     """Colors of cells, by their text; used on a terminal with colors."""
     whole: bool = False
-    """Whether nothing wraps or is left out, however wide that is."""
+    """Whether to keep every column and wrap nothing, however wide the table gets."""
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
         """Return the table as lines.

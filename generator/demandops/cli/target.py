@@ -35,7 +35,10 @@ _NO_STATE_REPO = (
 
 
 def _chosen(around: Path | None) -> Context | None:
-    """Return the context of --context, of the checkout ``around``, or the current one; keep it."""
+    """Return the context of --context, of the checkout ``around``, or the current one.
+
+    The command keeps it for :func:`_from_context`.
+    """
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
     ctx = click.get_current_context()
@@ -61,7 +64,7 @@ def _around() -> Path | None:
 
 
 def readable_repo() -> str | None:
-    """Return the state repo for a command that only reads, if no option gives it; or None."""
+    """Return the default state repo of a command that only reads, or None."""
     around = _around()
     context = _chosen(around)
     return str(around) if around else context.state_repo if context else None
@@ -101,7 +104,7 @@ def _from_context(field: str) -> Callable[[], str | None]:
 
 
 def _required(default: Callable[[], str | None]) -> Callable[..., str]:
-    """Return a callback: the address that is given, else the default; without one, the remedy."""
+    """Return a callback that returns the given address or the default, or raises."""
 
     def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
@@ -121,7 +124,7 @@ def _required(default: Callable[[], str | None]) -> Callable[..., str]:
 
 
 def _is_elsewhere(address: str) -> bool:
-    """Return whether this is a relative folder that does not exist from here."""
+    """Return whether an address is a relative folder that the current folder does not have."""
     path = Path(address)
     return not (is_url(address) or path.is_absolute() or path.expanduser().exists())
 

@@ -1,4 +1,4 @@
 """Stage 8: the clusters that follow the state repo.
 
-The only folder that knows the Kubernetes API.
+Only this folder knows the Kubernetes API.
 """

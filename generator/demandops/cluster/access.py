@@ -70,12 +70,12 @@ class ClusterAccess(FrozenModel):
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
-    """Return the API of the cluster in which this process is a pod, as its service account.
+    """Return the API of this process's cluster, with the rights of the pod's service account.
 
-    A call that fails is not tried again.
+    The API does not retry a call that fails.
 
     Args:
-        wanted_by: the option or command that needs it, for the message.
+        wanted_by: the option or command that needs the API, for the message.
 
     Raises:
         InvalidInput: if this process is not a pod, or its pod has no token.
@@ -101,7 +101,7 @@ class AccessFile(FileModel):
 
 
 def read(path: Path) -> AccessFile:
-    """Read the operator's file.
+    """Return the content of the operator's file.
 
     Raises:
         InvalidInput: with all faults.

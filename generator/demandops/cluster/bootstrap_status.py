@@ -14,7 +14,7 @@ from demandops.render.gitops.paths import bootstrap_path
 
 @dataclass(frozen=True, slots=True)
 class OldBootstrap:
-    """A cluster that has not got the state repo's bootstrap file, and how to apply it."""
+    """A cluster without the state repo's current bootstrap file, and how to apply that."""
 
     cluster: str
     file: str
@@ -23,7 +23,7 @@ class OldBootstrap:
     command: str
 
     def __str__(self) -> str:
-        """Return it as a sentence, with the remedy."""
+        """Return a sentence about the cluster, with the remedy."""
         return (
             f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
             f"{', '.join(self.domains)}); an administrator of it applies it: {self.command}"
@@ -35,7 +35,7 @@ def old_bootstraps(
     caches: Mapping[str, ObjectCache],
     read: Callable[[str], str | None],
 ) -> list[OldBootstrap]:
-    """Return the clusters with an older bootstrap file, or none, as far as they can be read.
+    """Return the clusters without the current bootstrap file, as far as they can be read.
 
     Args:
         domains: the access domains on each cluster.

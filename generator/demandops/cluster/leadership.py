@@ -51,7 +51,7 @@ class Leadership:
         Args:
             lease: the Lease's namespace and name, with a slash between. It must exist.
             may_lead: whether this process may become the leader now.
-            on_leader: called when it is the leader.
+            on_leader: called when this process becomes the leader.
             api: the cluster's API; by default that of the cluster in which this process is a pod.
             runtime: provides the time and the threads.
 

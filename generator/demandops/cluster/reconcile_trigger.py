@@ -1,6 +1,6 @@
 """Wakes Flux or Argo CD after a push, so that it fetches at once and not at its next interval.
 
-This is optional and blocks nothing: if a cluster does not answer, that is logged, and its
+Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs that, and the
 controller fetches at its next interval.
 """
 
@@ -55,7 +55,7 @@ class ReconcileTrigger:
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
-        """Request a wake after a push; returns at once."""
+        """Request a wake after a push; return at once."""
         self._config = config
         self._due.set()
 
@@ -86,7 +86,7 @@ class ReconcileTrigger:
                 missed, pause = set(), None
 
     def _wake_all(self, names: Iterable[str], logged: bool) -> set[str]:
-        """Wake clusters and return those that failed; logs a failure unless ``logged``."""
+        """Wake clusters; return those that could not be woken, and log them unless ``logged``."""
         missed = set()
         for name in sorted(names):
             if self._config is None:

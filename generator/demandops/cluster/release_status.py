@@ -32,7 +32,7 @@ class ReleaseStatus:
 
     @property
     def state(self) -> State | Literal["unknown"]:
-        """Its state; ``unknown`` if the cluster tells nothing."""
+        """The state of the release; ``unknown`` if the cluster tells nothing."""
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
@@ -87,7 +87,7 @@ def _is_among(paths: Collection[str], target: Target) -> bool:
 
 
 class _Known:
-    """A history that remembers its answers, because the releases of a domain ask the same."""
+    """A history that remembers its answers, because all releases of a domain ask the same."""
 
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)

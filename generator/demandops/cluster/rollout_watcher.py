@@ -93,7 +93,7 @@ class RolloutWatcher:
         timeout: float,
         on_progress: OnProgress = lambda state, text: None,
     ) -> Future[Health]:
-        """Follow releases of a published commit; returns at once.
+        """Follow releases of a published commit; return at once.
 
         Args:
             commit: the published commit.
@@ -154,7 +154,7 @@ class RolloutWatcher:
                 self._in_background(rollout, partial(self._time_out, health=health))
 
     def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
-        """Run work that queries a cluster in its own thread, because it may not answer."""
+        """Run work in a thread of its own, because the cluster that it queries may not answer."""
         rollout.busy = True
 
         def run() -> None:
@@ -175,7 +175,7 @@ class RolloutWatcher:
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
         """Resolve a rollout after its timeout; say also why its pods do not run.
 
-        If the controller is just retrying, say also why the attempt before failed.
+        If the controller is just retrying, say also why its last attempt failed.
         """
         failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:

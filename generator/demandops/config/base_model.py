@@ -154,7 +154,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
         return f"{value!r} cannot be used here; write {PATTERN_WORDS.get(pattern, pattern)}"
     if kind == "value_error":
         return str(item["ctx"]["error"])
-    if kind == "string_too_short":
+    if kind in ("string_too_short", "too_short") and not value:
         return "is empty; fill it in"
     expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
     return f"{expected}, not {strict_yaml.short_repr(value)}"

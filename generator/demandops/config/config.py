@@ -60,7 +60,7 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return where a message says that entries of a collection are; ``files`` have them."""
+    """Return the place of a collection's entries as a message names it; ``files`` have entries."""
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
@@ -107,7 +107,7 @@ class Config:
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     """Whether a node declares a capacity."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The roles for each of whose topics a service runs, in any appdef; sorted."""
+    """The roles, sorted, for which a service of any appdef runs once for each topic."""
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
     """The names of services that keep replicas for a while, in at least one appdef."""
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
@@ -173,7 +173,7 @@ class Config:
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return where a message says that entries of a collection are."""
+        """Return the place of a collection's entries as a message names it."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:

@@ -92,7 +92,7 @@ class ConfigReader:
     ) -> None:
         """Add the faults of an entry that stands twice, at the places ``first`` and ``second``.
 
-        A place is (file, field). Both files get a fault, so that the one that a person changed is
+        A place is (file, field). Both files get a fault, so that whichever a person changed is
         held back.
         """
         dot_key = f".{key}" if key else ""

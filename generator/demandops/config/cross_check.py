@@ -183,7 +183,7 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Add a fault if two appdefs take the topics that a shared service runs for from elsewhere."""
+    """Add a fault if two appdefs give the ``each`` of a shared service different origins."""
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
         file = f"appdefs/{name}/service.yaml"
@@ -248,7 +248,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault if a shared service runs for the output of a service that each version has."""
+    """Add a fault if a shared service runs for an output that each version makes on its own."""
     services = config.services.get(appdef, {})
     for name, service in services.items():
         origin = service.inputs[service.each] if service.shared and service.each else ""

@@ -229,17 +229,17 @@ class Node(CamelModel):
     """A C-ITS entity that runs services.
 
     ``type`` is its role, any word; ``capabilities`` are words for what it has. A demand may ask for
-    them instead of the node (:mod:`demandops.plan.nodes.placement`), then it gets no ``drained``
-    one.
+    them and name no node (:mod:`demandops.plan.nodes.placement`); it then gets none that is
+    ``drained``.
     Services request no more than ``capacity`` there (:mod:`demandops.plan.nodes.capacity`).
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
-    The access domain's ROS domain replaces that of ``ros``, if it has one.
+    If the access domain has a ROS domain, that replaces the one of ``ros``.
     ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
     contain only the node for a usual topic, and the topic as well for any other.
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
     message types of topics for which a request gives none. ``bridged`` lists topics that the
     initial deployment already carries to another node under the same name; connections skip them.
-    ``access_domains`` are further ones. In each of them the node is another node of the
+    ``access_domains`` are the node's further domains. In each, it is another node of the
     configuration, called ``<id>@<domain>`` (:func:`in_domain`).
     """
 
@@ -290,10 +290,10 @@ class Node(CamelModel):
         )
 
     def most(self, resource: str) -> int | None:
-        """Return its capacity of a resource in thousandths; ``None`` if it is not limited.
+        """Return the node's capacity of a resource in thousandths; ``None`` means no limit.
 
-        A node without ``capacity`` limits nothing. With it, cpu and memory that it does not list
-        are not limited, and of any other resource it has what it lists.
+        A node without ``capacity`` limits nothing. If ``capacity`` leaves out cpu or memory, that
+        is not limited. Of any other resource that it leaves out, the node has none.
         """
         if self.capacity is None:
             return None

@@ -131,7 +131,7 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services; those with one instance for a cluster know it for each node."""
+    """Return the services; fill in ``runs_at`` of those that run once for each cluster."""
     found = dict(services)
     for name, service in services.items():
         if service.nodes:
@@ -169,7 +169,7 @@ def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]
 
 
 def _refuse_unread(reader: ConfigReader) -> None:
-    """Add a fault for each file that looks like configuration and is none."""
+    """Add a fault for each file that looks like configuration but is none."""
     folders = {collection.partition("/")[0] for collection in COLLECTIONS}
     for path in sorted(reader.files):
         folder, *rest = path.split("/")
@@ -267,7 +267,7 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return nodes, the domain of each, and hosts, with ``<id>@<domain>`` for further domains."""
+    """Return nodes, the domain of each, and the host of each ``<id>@<domain>`` that it adds."""
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
     for node in [one for one in nodes.values() if one.access_domains]:
         file, place = reader.place_of(NODES_FILE, node.id)

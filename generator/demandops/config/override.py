@@ -102,7 +102,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Refuse a field without a value: it would select or change less than it seems to."""
+    """Refuse an override in which a field has no value: it would do less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
@@ -235,7 +235,7 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @property
     def rank(self) -> tuple[int, str]:
-        """Its rank among overrides; the higher rank wins."""
+        """The rank among overrides; the higher rank wins."""
         return (self.priority, self.name)
 
 

@@ -90,7 +90,7 @@ class LeasePolicy(CamelModel):
     Demands that request no lease get ``default``; without it their claims last forever. With
     ``deployment_requests`` that includes the reference's ``DeploymentRequest``, whose clients must
     then repeat their demands in time. The recorded end of a lease may lag behind the last renewal
-    by ``slack``, so a claim may be released that much late.
+    by ``slack``, so the generator may release a claim late by that much.
     """
 
     default: Duration | None = None
@@ -149,7 +149,7 @@ NOT_BY_DEFAULT = ("DaemonSet",)
 """Kinds that a policy must name: a DaemonSet runs on all nodes, not on the demanded one alone."""
 
 NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
-"""The kinds of connections' clients, and Secrets, in which Helm keeps its releases."""
+"""The kinds that connections' clients need, and Secret, in which Helm keeps its releases."""
 
 _NETWORK_POLICY = "NetworkPolicy"
 
@@ -207,10 +207,10 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:
-        """The kinds of objects that its charts may have, which the cluster enforces.
+        """The kinds of objects that the domain's charts may have; the cluster enforces them.
 
-        By default those of ordinary charts. ``network: namespace`` leaves out NetworkPolicy, with
-        which a chart could open what is closed.
+        The default is the kinds of ordinary charts. ``network: namespace`` leaves out
+        NetworkPolicy, with which a chart could open what is closed.
         """
         if self.kinds is not None:
             return self.kinds
@@ -236,8 +236,8 @@ class AccessDomain(CamelModel):
             )
         if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
             raise ValueError(
-                "kinds: with NetworkPolicy a chart could open what network: namespace closes; "
-                "remove one of them"
+                "kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; remove "
+                "one of them"
             )
         return self
 

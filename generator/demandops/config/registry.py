@@ -175,7 +175,8 @@ class ImagePin(FrozenModel):
 class VersionContents(CamelModel):
     """What one version of an application runs.
 
-    A chart that is not listed has its default version, an image that of ``registry/images.yaml``.
+    A chart that is not listed has its default version. An image that is not listed is that of
+    ``registry/images.yaml``.
     """
 
     charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
@@ -238,7 +239,7 @@ class ApplicationVersion:
 
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
-        """Its place among the versions of the definition; two of one rank are the same."""
+        """The place among the versions of the definition; two of one rank are the same."""
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 
@@ -260,7 +261,7 @@ def _free(env: dict[str, str]) -> dict[str, str]:
     for name in _OF_NODES:
         if name in env:
             raise ValueError(
-                f"{name} follows from ros of the node; set it at the node in the inventory"
+                f"{name} follows from 'ros' of the node; set that in the inventory, and remove this"
             )
     return env
 
@@ -292,7 +293,7 @@ class MqttClientSettings(ClientSettings):
     """The settings of MQTT clients, which are ROS nodes.
 
     ``rmw`` is that of the node if not given. ``messages`` are the packages whose messages the image
-    can carry; if empty, that is not known.
+    can carry; an empty list means that they are not known.
     """
 
     launch_file: _LaunchFile = "standalone.launch.xml"
@@ -310,7 +311,7 @@ class ClientsFile(FileModel):
 
     @property
     def connection_types(self) -> tuple[str, ...]:
-        """The words of the connection types that the file has settings of."""
+        """The words of the connection types for which the file has settings."""
         return tuple(sorted(self.model_fields_set - {"apiVersion", "kind"}))
 
     def of(self, connection_type: str) -> ClientSettings:

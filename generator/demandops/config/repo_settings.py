@@ -26,7 +26,7 @@ _SCP = re.compile(r"(?P<user>[^\s:@/]+)@(?P<host>[^\s:@/]+):(?!\d+/)(?P<path>[^\
 
 
 def as_git_url(text: str) -> str:
-    """Return the URL for an address as git also writes it, ``git@host:path``; others unchanged."""
+    """Return an address like ``git@host:path`` as a URL; return any other unchanged."""
     scp = _SCP.fullmatch(text)
     return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
 

@@ -48,12 +48,12 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """Its type; fails if none is chosen yet."""
+        """The type of the connection, which must be chosen already."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic, or ``None``; works only in a claim."""
+        """Return the route of a source topic, or ``None``; the connection must be a claim's."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
         return found[0] if found and found[0].source == source else None
@@ -72,7 +72,7 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, from a shutdown, means this one; empty fields fit any."""
+        """Return whether ``listed`` of a shutdown means this connection; empty fields fit any."""
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -102,11 +102,11 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return the connection without a node: ``None`` for an end; a broker is chosen again."""
+        """Return the connection without a node, with no broker; ``None`` if the node is an end."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the entries by which the ledger's index finds it."""
+        """Yield the connection's entries in the ledger's index."""
         for end in self.nodes:
             yield ("link", str(self.type), end)
         if self.broker:

@@ -2,9 +2,9 @@
 
 Each type has one module with a subclass of :class:`ConnectionType` and its clients. The subclass
 defines what the type supports and needs, and plans the clients of each connection as data.
-:mod:`demandops.render.connection_client` makes a client's file from this and from
-``templates/connections/<type>/``: ``client.yaml.j2``, a Deployment with the client's name, and
-``schema.json``, the fields that the program reads.
+:mod:`demandops.render.connection_client` makes a client's file from that data and from
+``templates/connections/<type>/``. There ``client.yaml.j2`` is a Deployment with the client's name,
+and ``schema.json`` lists the fields that the program reads.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ class Client(ABC):
     node: Node
     domain: AccessDomain
     connections: tuple[str, ...]
-    """The connections that it carries."""
+    """The connections that the client carries."""
     shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The registry's names of its images."""
+        """The names of the client's images in the registry."""
         return (self.type.image,)
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """Its description in commit messages."""
+        """The client's description in commit messages."""
 
     @abstractmethod
     def facts(self) -> list[str]:
@@ -111,7 +111,7 @@ class End(Client):
 
     @property
     def description(self) -> str:
-        """Name type, side, connection and node."""
+        """The end's description: type, side, connection and node."""
         (connection,) = self.connections
         return f"{self.type.name} {self.side} of connection {connection} on {self.node.id}"
 
@@ -154,27 +154,27 @@ class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
     name: ClassVar[str]
-    """Its name in messages; files, templates and clients use ``word`` instead."""
+    """The type's name in messages; files, templates and clients use ``word`` instead."""
     number: ClassVar[int]
-    """Its number in ``DeploymentRequest``."""
+    """The type's number in ``DeploymentRequest``."""
     image: ClassVar[str]
-    """The registry's name of its clients' image."""
+    """The name of the clients' image in the registry."""
     options: ClassVar[frozenset[str]]
-    """The options of a route that it supports; each supports message type and direction."""
+    """The options of a route that the type supports; each type supports type and direction."""
     renames: ClassVar[bool] = False
     """Whether a topic may have another name at the target."""
     takes_broker: ClassVar[bool] = False
     """Whether a demand may name a broker."""
     speaks_dds: ClassVar[bool] = True
-    """Whether its clients speak DDS themselves, so that both nodes must run a DDS middleware."""
+    """Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware."""
 
     def __repr__(self) -> str:
-        """Return its name."""
+        """Return the type's name."""
         return self.name
 
     @property
     def word(self) -> str:
-        """Its name in small letters."""
+        """The type's name in small letters."""
         return self.name.lower()
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
@@ -187,9 +187,9 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield why the inventory does not let it link two ends.
+        """Yield why the inventory does not let the type link two ends.
 
-        Unknown nodes are skipped, :mod:`demandops.demand.admission` reports them.
+        It skips unknown nodes; :mod:`demandops.demand.admission` reports them.
         """
 
     def route_faults(
@@ -201,7 +201,7 @@ class ConnectionType(ABC):
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         """Return the connection as clients will carry it, and what differs from the request.
 
-        Called only for a demand that the inventory can fulfill.
+        The caller ensures that the inventory can fulfill the demand.
         """
         return connection, ""
 

@@ -28,7 +28,7 @@ def type_numbered(number: int) -> ConnectionType | None:
 
 
 def type_named(word: str) -> ConnectionType:
-    """Return the type that files call ``word``; raises :class:`KeyError`."""
+    """Return the type that files call ``word``, or raise :class:`KeyError`."""
     return {known.word: known for known in CONNECTION_TYPES}[word]
 
 
@@ -83,7 +83,7 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
     """Yield why ``kind`` cannot carry a connection, by fields of :class:`Connection`.
 
-    Nodes that are not in the inventory are skipped; :mod:`demandops.demand.admission` reports them.
+    It skips nodes that are not in the inventory; :mod:`demandops.demand.admission` reports them.
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:

@@ -124,7 +124,7 @@ MQTT = Mqtt()
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
     """Return a connection's broker as the reference chooses it, or ``None``.
 
-    It is the only one there is, else the named, the target's or the source's.
+    That is the only broker there is; else the named one, the target's or the source's.
     """
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))

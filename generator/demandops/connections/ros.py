@@ -65,7 +65,8 @@ class Ros(ConnectionType):
         if route.durability and not route.reliability:
             yield fault(
                 f"{where}.reliability",
-                f"is not given, but durability of '{route.source}' is set; ROS needs both, add it",
+                f"is not given, but durability of '{route.source}' is set; ROS needs both, so "
+                "add it",
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
@@ -119,7 +120,7 @@ def _port(connection: str, wan: Wan) -> int:
 
 @lru_cache(maxsize=65_536)
 def _number(connection: str) -> int:
-    """Return a number for a connection id; cached, because all ids of a node are compared."""
+    """Return a number for a connection id, from a cache, because ids are compared often."""
     return int(naming.digest("port", connection), 16)
 
 

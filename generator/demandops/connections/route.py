@@ -104,7 +104,7 @@ class RouteOptions(FrozenModel):
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
-    """Yield the faults of one connection's routes that do not depend on its type."""
+    """Yield the faults of one connection's routes, except those that depend on its type."""
     targets: dict[str, Route] = {}
     carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):
@@ -117,7 +117,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.source)} goes to {quoted(first.target)} and to "
-                f"{quoted(route.target)}; one source topic has one target, use a second connection",
+                f"{quoted(route.target)}; one source topic has one target, so use a second "
+                "connection",
             )
         for name, value, other in contradictions(first, route):
             yield fault(
@@ -128,7 +129,7 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.target)} is carried back to {quoted(carried_back[route.target])} "
-                f"and to {quoted(route.source)}; one topic goes to one place, use a second "
+                f"and to {quoted(route.source)}; one topic goes to one place, so use a second "
                 "connection",
             )
 

@@ -165,11 +165,11 @@ class Bridge(Client):
 
     @property
     def description(self) -> str:
-        """Name the node."""
+        """The bridge's description, which names the node."""
         return f"Zenoh bridge on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return its connections, topics, rates and endpoints."""
+        """Return the bridge's connections, topics, rates and endpoints."""
         return [
             *(f"connection {id}" for id in self.connections),
             *(f"reads {topic}" for topic in self.publishers),

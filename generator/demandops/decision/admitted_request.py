@@ -32,10 +32,10 @@ Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 
 
 def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> DemandRequest:
-    """Return the request of a goal; if only room is lacking, the request to wait for it.
+    """Return the request of a goal; if only room is lacking, the request to wait for room.
 
     Raises:
-        Refused: if it can neither be booked nor wait. A demand that holds something does not wait.
+        Refused: if the demand can neither be booked nor wait. One that holds claims never waits.
     """
     try:
         return admit(state, goal, throttle)
@@ -62,7 +62,7 @@ def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> D
 def admit(
     state: State, goal: object, throttle: Throttle = lambda request, config: ()
 ) -> DemandRequest:
-    """Parse a goal and check it against the configuration, its access domains and the throttle.
+    """Return the request of a goal, checked against the configuration and the throttle.
 
     Raises:
         Refused: with every fault, of form and of content.

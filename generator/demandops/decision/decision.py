@@ -187,7 +187,9 @@ def decide(
 
 
 def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Book a request. Its claims replace kept ones; overrides may keep claims that it releases.
+    """Return the ledger with a request booked, and the changes.
+
+    Its claims replace kept ones. Overrides may keep claims that it releases.
 
     Raises:
         Refused: if existing claims, an override or a quota forbid it.

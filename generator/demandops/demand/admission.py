@@ -170,8 +170,8 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
             yield fault(
                 "node",
                 f"'{app.node}' is in cluster '{cluster}', where {service.name}, which it needs, "
-                f"has no node; choose a node in {' or '.join(service.nodes)}, or have nodes in "
-                f"{service.file} changed",
+                f"has no node; choose a node in {' or '.join(service.nodes)}, or ask for a change "
+                f"of nodes in {service.file}",
                 code="no-node",
             )
     versions = config.versions_of(appdef.name)
@@ -227,7 +227,7 @@ def _connection(connection: Connection, config: Config, claiming: bool) -> Itera
     if connection.broker:
         yield from _id("broker", connection.broker)
     if claiming and not connection.topics:
-        yield fault("topics", "is empty; a connection carries at least one topic, list it")
+        yield fault("topics", "is empty; list at least one topic")
     yield from routes.faults("topics", connection.topics)
     same_place = connection.source and connection.source == connection.target
     for index, route in enumerate(connection.topics):
@@ -287,7 +287,7 @@ def with_chosen_types(
     """Return ``request`` with the type and the broker that each connection gets.
 
     A claimed connection keeps its current type. A new one gets the first type that can carry it
-    (:func:`connection_types.type_faults`); if no type can, it still has none.
+    (:func:`connection_types.type_faults`); if no type can, it gets none.
     """
 
     def chosen(one: Demanded) -> Demanded:

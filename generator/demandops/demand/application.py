@@ -28,15 +28,15 @@ class InputTopic(NamedTuple):
 
     @property
     def part(self) -> str:
-        """Its source as part of a topic name, with the topic if it is a further one."""
+        """The source as part of a topic name; for a further topic, with the topic."""
         return self.part_in("")
 
     def part_in(self, version: str) -> str:
-        """Return :attr:`part` for a separate instance of ``version``; empty: not separate."""
+        """Return :attr:`part` in the separate instance of ``version``, if that is not empty."""
         return naming.topic_part(self.source, self.told_apart_by(self.further, version))
 
     def told_apart_by(self, further: bool, version: str) -> str:
-        """Return what a name has beside the source; empty for a usual topic in no own version."""
+        """Return what tells names for one source apart: a further topic, and a version, if any."""
         if not further:
             return version
         return f"{self.topic} {version}" if version else self.topic
@@ -63,7 +63,7 @@ class Requirement:
 
     @property
     def size(self) -> int:
-        """How many labels and capabilities it has."""
+        """How many labels and capabilities the requirement has."""
         return len(self.labels) + len(self.capabilities)
 
     def united(self, other: Requirement) -> Requirement:
@@ -144,10 +144,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the topics of a role that topic names call ``part``, if it is not just a node's.
+        """Return the inputs of a role for which topic names contain ``part``, except usual topics.
 
-        These are further topics, and all topics of a separate instance. Their parts are computed
-        once, because each service for a further topic asks for one.
+        In a separate instance, usual topics are among them too. The parts are computed once,
+        because each service for a further topic asks for one.
         """
         if not self._further:
             for known, topic in self.all_inputs():
@@ -172,7 +172,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def chosen_nodes(self) -> set[str]:
-        """Its node, and those of the services that are placed one by one."""
+        """The application's node, and those of the services that are placed one by one."""
         return {self.node, *self.services.values()}
 
     def decided_like(self, other: Application) -> bool:
@@ -181,7 +181,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return one == two
 
     def placed_as(self, first: Application) -> Application:
-        """Return the application on the nodes of ``first``, which is the same application."""
+        """Return the application on the nodes of ``first``, the application in the first claim."""
         if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
             return self
         return replace(self, node=first.node, services=first.services, moved=first.moved)
@@ -209,7 +209,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, from a shutdown, means this one; an empty node fits any."""
+        """Return whether ``listed`` of a shutdown means this application; no node fits any."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -249,7 +249,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def without_node(self, node: str) -> Application | None:
         """Return the application without inputs from a node and deliveries to it.
 
-        ``None`` if it has no other inputs, or runs there.
+        Return ``None`` if it has no other inputs, or runs there.
         """
         if node in self.chosen_nodes or node in self.moved.values():
             return None
@@ -261,7 +261,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, deliver=deliver).with_inputs(left) if any(left.values()) else None
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the entries by which the ledger's index finds it."""
+        """Yield the application's entries in the ledger's index."""
         yield ("node", self.node)
         yield ("definition", self.appdef)
         for node in (*self.services.values(), *self.moved.values()):
@@ -287,7 +287,7 @@ def _exact(values: Mapping[str, object]) -> str:
 
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Merge topics by (topic, source); a later type replaces a missing one."""
+    """Return topics merged by (topic, source); a later type replaces a missing one."""
     merged: dict[tuple[str, str], InputTopic] = {}
     for topic in topics:
         known = merged.setdefault((topic.topic, topic.source), topic)

@@ -30,7 +30,7 @@ class Claim:
     """One demand's hold on an application or a connection.
 
     ``joined`` is true if a goal of the reference's action booked it: only goals of that action shut
-    it down. ``partial`` has the topics that only some of the ``requesters`` still hold, and those.
+    it down. ``partial`` has the topics that only some of the ``requesters`` hold, each with these.
     """
 
     held: Application | Connection
@@ -56,12 +56,12 @@ class Claim:
 
     @property
     def subject(self) -> Subject:
-        """The subject that it holds."""
+        """The subject that the claim holds."""
         return self.held.subject
 
     @property
     def is_on_application(self) -> bool:
-        """Whether it holds an application."""
+        """Whether the claim holds an application."""
         return self.subject.kind is SubjectKind.APPLICATION
 
     @property
@@ -76,7 +76,7 @@ class Claim:
         return None if name == self.demand else name
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the entries by which the ledger's index finds it, except the end of its lease."""
+        """Yield the claim's entries in the ledger's index, except the end of its lease."""
         yield ("demand", self.demand)
         for requester in self.requesters:
             yield ("requester", requester)
@@ -116,7 +116,7 @@ class Claim:
     ) -> Claim | None:
         """Return the claim without a requester's holds on ``topics``, or on all of them.
 
-        A topic that nobody holds any longer is gone; so is a claim without requesters (``None``).
+        The claim loses topics that nobody holds any longer. Without requesters it is ``None``.
         """
         holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
         for topic in self.held.topic_keys():

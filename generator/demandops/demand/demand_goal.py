@@ -62,7 +62,7 @@ class GoalDelivery(FrozenModel):
 
 
 class GoalPosition(FrozenModel):
-    """Where a node is that has no position in the inventory, in metres in its map frame."""
+    """The position of a node that has none in the inventory, in metres in its map frame."""
 
     node: str = ""
     x: Coordinate = 0.0
@@ -116,7 +116,7 @@ def _lease_form(value: object) -> object:
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""A duration or seconds; no union, for which pydantic would report a fault for each member."""
+"""A duration or seconds. It is no union: pydantic would report a fault for each member."""
 
 
 class DemandGoal(FrozenModel):

@@ -38,9 +38,9 @@ class Demanded:
     connect: str = "none"
     """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
     note: str = ""
-    """How it is carried, if not as the request says; a warning of the receipt."""
+    """How a connection is carried, if not as the request says; the receipt warns of it."""
     placed: tuple[str, ...] = ()
-    """Where the generator placed it and its services and why, as far as it names no node."""
+    """Where the generator placed the application and its services, and why."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault of a field of this item."""
@@ -62,11 +62,11 @@ class DemandRequest:
     own_requesters: tuple[str, ...] = ()
 
     operation: ClassVar[str]
-    """Its name in commits and files."""
+    """The operation's name in commits and files."""
     adds_claims: ClassVar[bool] = False
-    """Whether it can add claims."""
+    """Whether the request can add claims."""
     is_reference: ClassVar[bool] = False
-    """Whether it is a goal of the reference's action, which names no demand."""
+    """Whether the request is a goal of the reference's action, which names no demand."""
 
     def requesters(self) -> tuple[str, ...]:
         """Return all requesters, each once, in the order of the request."""
@@ -102,8 +102,8 @@ class Shutdown(DemandRequest):
 class Put(DemandRequest):
     """Our own goal: its demand then holds exactly the listed applications and connections.
 
-    ``lease_s`` is the wanted lease in seconds. ``positions`` says where nodes are that have no
-    position in the inventory. ``priority`` is its priority among demands that wait for room.
+    ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that
+    have none in the inventory. ``priority`` is its priority among demands that wait for room.
     """
 
     lease_s: int | None = None
@@ -130,14 +130,14 @@ class Renew(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Expire(DemandRequest):
-    """The generator releases a demand whose lease has ended."""
+    """The generator's request to release a demand whose lease has ended."""
 
     operation = "expire"
 
 
 @dataclass(frozen=True, slots=True)
 class Decommission(DemandRequest):
-    """An operator removes a node or a requester, named by ``id``, for good.
+    """An operator's request to remove a node or a requester, named by ``id``, for good.
 
     ``kinds`` are ``node``, ``requester`` or both. ``nodes`` are the node in each of its access
     domains. ``by`` is the operator, ``name <email>``, who may give a ``reason``. The request is

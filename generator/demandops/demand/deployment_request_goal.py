@@ -105,7 +105,10 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the message's field for ``path`` of a connection, whose topics are two lists there."""
+    """Return the message's field for ``path`` of a connection.
+
+    The message has a connection's topics in two lists.
+    """
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"
     if path in ("source", "target", "broker"):

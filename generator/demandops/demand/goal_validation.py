@@ -75,7 +75,7 @@ def is_unicode(text: str) -> bool:
 def _blank(
     data: dict[str, Any], location: Sequence[int | str], lists_of_text: Container[str]
 ) -> dict[str, Any]:
-    """Return ``data`` without the value at ``location``; ``data`` is changed in place.
+    """Return ``data`` without the value at ``location``; change ``data`` in place.
 
     A field is removed, so that its default applies. An item of a list is replaced by an empty one,
     so that later items keep their positions.

@@ -66,7 +66,7 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run.
 
     These are its node, sources of inputs, and the nodes of services that run once for a cluster or
-    are placed one by one. A node to which an override moves a service is its owner's decision.
+    are placed one by one. The owner of an override decides on the node to which it moves a service.
     """
     services = config.services.get(app.appdef, {}).values()
     roles = {role for one in services if one.at_source for role in one.roots}
@@ -82,7 +82,7 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
 def may_place(one: Demanded, appdef: str, node: str, config: Config) -> bool:
     """Return whether the requesters may have an application of this type on a node.
 
-    If ``appdef`` is empty: whether they may have a connection to the node.
+    With an empty ``appdef``, return whether they may have a connection to the node.
     """
     domain = config.domain_of.get(node)
     access: Access = [("applications", appdef)] if appdef else []

@@ -17,7 +17,7 @@ from demandops.demand.demand_request import AnyRequest, DemandRequest
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request; applications not of the default version become separate instances."""
+    """Return the request in which applications of other versions are separate instances."""
     demanded = (
         replace(one, held=_separated(one.held, config))
         if isinstance(one.held, Application) and one.held.version

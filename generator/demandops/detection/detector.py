@@ -81,7 +81,7 @@ class Detector:
         """Replace the rules; return what changes for the events that last.
 
         An event ends if its rule is gone or is no longer for its entities. If the rule demands
-        something else now, that is wanted instead.
+        something else now, the event wants that instead.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)

@@ -20,7 +20,7 @@ from demandops.detection.rules.rule_demand import Goal
 Purpose = Literal["start", "renew", "end"]
 
 _RENEW_AFTER = 1 / 3
-"""The part of a lease after which it is renewed; two more attempts fit before its end."""
+"""The part of a lease after which to renew it; two more attempts fit before its end."""
 _RETRY_S = 5.0
 _NOT_SENT = frozenset({"no-server", "rejected"})
 """The codes of goals that the node did not accept."""
@@ -48,7 +48,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Entry:
-    """One event. ``held`` is the goal that the node has booked; ``is_sure`` unless it timed out."""
+    """One event. ``held`` is the goal that the node has booked, for sure only if ``is_sure``."""
 
     wanted: Goal | None = None
     held: Goal | None = None
@@ -104,7 +104,7 @@ class WantedDemands:
     def hold(self, key: Key, goal: Goal) -> None:
         """Record that a demand was booked before the start; call :meth:`want` for it next.
 
-        It is renewed at once, to learn its lease.
+        The next goal renews the demand, because its lease is not known.
         """
         entry = self._entries.setdefault(key, _Entry())
         entry.held, entry.renew_at = goal, -inf

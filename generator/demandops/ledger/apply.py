@@ -1,6 +1,6 @@
 """The one way to change the ledger: :func:`apply` carries out a request.
 
-What each operation means: ``docs/demand.md``, "How a demand is booked".
+``docs/demand.md``, "How a demand is booked", says what each operation means.
 """
 
 from __future__ import annotations

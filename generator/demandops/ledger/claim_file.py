@@ -32,7 +32,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only a later version writes: for the nodes of services."""
+"""Folders that only a later version writes; it keeps the nodes of services there."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
@@ -119,7 +119,7 @@ class _Route(RouteOptions):
 
 
 def _plain_route(value: object) -> object:
-    """Read ``/a: /b`` as a route without options."""
+    """Return ``/a: /b`` as a route without options."""
     return {"target": value} if isinstance(value, str) else value
 
 
@@ -177,7 +177,7 @@ class _Claim(FrozenModel):
         return claim.with_holders(held, holders)
 
     def _is_old_join(self) -> bool:
-        """Return whether a join booked it when claim files had no field ``action`` yet."""
+        """Return whether a join booked the claim before claim files had the field ``action``."""
         return self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))
 
 
@@ -297,7 +297,7 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
 
 
 def place_data(place: Requirement) -> dict[str, Any]:
-    """Return the requirement on a node in the form that a claim's file has it in."""
+    """Return the requirement on a node as a claim's file has it."""
     listed = {"labels": dict(place.labels), "capabilities": list(place.capabilities)}
     return {name: value for name, value in ({"role": place.role} | listed).items() if value}
 
@@ -337,7 +337,7 @@ def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
 
 
 def read(text: str, path: str) -> Claim:
-    """Parse a claim's file.
+    """Return the claim in a file.
 
     Raises:
         InvalidInput: with every fault, also if the path does not match the ids in the file.

@@ -55,9 +55,10 @@ def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: d
     """Return the steps that a service keeps after the need of its demands changed.
 
     Args:
-        steps: what it kept before.
+        steps: what the service kept before.
         needed, was_needed: the replicas that its demands need now and needed before.
-        now, until: the time, and until when it keeps what was needed.
+        now: the time.
+        until: the end of the time for which it keeps the replicas that were needed.
     """
     if was_needed > needed:
         steps = (*(one for one in steps if one.replicas > was_needed), Kept(was_needed, until))
@@ -81,7 +82,7 @@ class KeptReplicas:
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        """Return the records with these steps of an instance; without steps, with no record."""
+        """Return the records with these steps for an instance; empty steps remove its record."""
         known = self.steps.get(instance) or ()
         if known == steps:
             return self

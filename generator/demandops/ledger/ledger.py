@@ -36,9 +36,9 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 class Ledger:
     """All claims, and an index of them.
 
-    ``claims`` has those on each subject, sorted by demand id, because the planner asks for all of
-    them. All claims on a subject agree on its type and nodes. If a person writes one that does not,
-    the first one decides.
+    ``claims`` has the claims on each subject, sorted by demand id, because the planner asks for
+    all of them. All claims on a subject agree on its type and nodes. If a person writes one that
+    does not, the first one decides.
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
     ``minutes`` are those in which a lease ends, so that the next end is found without a full scan.
     ``ended`` maps the name of each override that ended to the expiry that it had then.
@@ -140,7 +140,7 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield the further inputs in ``role`` that names of topics call ``part``.
+        """Yield the further inputs in ``role`` for which names of topics contain ``part``.
 
         With each comes the version of its application if that is a separate instance, else "".
         """
@@ -165,7 +165,7 @@ class Ledger:
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def moved_applications(self) -> tuple[str, ...]:
-        """Return the applications of which overrides move a service, sorted."""
+        """Return the applications with a service that an override moves, sorted."""
         return self._ids("moved")
 
     def is_only_kept(self, subject: Subject) -> bool:
@@ -208,7 +208,7 @@ class Ledger:
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
         """Return the claims whose leases end first, in the same minute.
 
-        It is the same object while none of them comes, goes or gets another end.
+        The set is the same object while no claim joins it, leaves it or gets another end.
         """
         return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 

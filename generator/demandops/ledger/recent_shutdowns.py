@@ -4,7 +4,7 @@ A client that lost the answer sends its shutdown again, perhaps to another gener
 record the repeat would release another demand of the same requesters. A join that adds something
 in the name of one of the requesters ends the record: a later shutdown may mean what was joined.
 
-Each is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
+Each record is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ REMEMBERED = timedelta(minutes=15)
 """For how long the same shutdown counts as a repeat, not as a new one."""
 
 _KEPT = timedelta(hours=1)
-"""How long a record is kept: longer, because a repeat may wait in a journal meanwhile."""
+"""How long a record is kept: longer, because a repeat may have waited in a journal."""
 
 _FORGOTTEN = 10
-"""The most old records of shutdowns that one booking removes."""
+"""How many old records of shutdowns one booking removes at most."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 

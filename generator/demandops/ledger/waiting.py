@@ -4,7 +4,7 @@ A waiting demand holds nothing. When room may be free, the generator decides wai
 those of the highest priority first, and among these the one that came first. A demand that still
 does not fit does not hold up the others.
 
-Each is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
+Each waiting demand is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Goals of the reference's action that book everything that is held there."""
+"""Goals of the reference's action that book what its requesters still hold."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The files of the reference's operators, and its custom resources.
 
 Each of its operators keeps two files. The bookkeeping maps a resource to the requesters that hold
-it, each as often as it joined; for a fusion, it does so for each topic. The versioning file maps a
-resource to the requests that reached it, by the version of the resource.
+it, and lists each as often as it joined. For a fusion it has a list for each topic. The versioning
+file maps a resource to the requests that reached it, by the version of the resource.
 
 A file is recognized by its content, so it may have any name.
 """
@@ -122,7 +122,7 @@ class ObjectDetection(_Part):
 
     @property
     def source(self) -> str:
-        """The node that publishes its point cloud."""
+        """The node that publishes the detection's point cloud."""
         return self.ros_name.removeprefix("pcod_")
 
     @property

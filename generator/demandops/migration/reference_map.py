@@ -1,7 +1,7 @@
 """The map from the reference's resources to the applications and connections of demands.
 
-The names of its resources are made of ids, but not the other way round: ``/``, ``_`` and ``-`` all
-become ``-``. So :func:`propose` only proposes a map, and a person checks it.
+Ids give the names of resources, but a name does not give the ids: ``/``, ``_`` and ``-`` all become
+``-``. So :func:`propose` only proposes a map, and a person checks it.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class PointCloud(CamelModel):
 class MappedApplication(CamelModel):
     """An application of the reference's only type.
 
-    ``egoData`` maps each topic to the node that it comes from, ``pointClouds`` each topic with an
-    object list to the point cloud behind it.
+    ``egoData`` maps each topic to the node that it comes from, ``pointClouds`` maps each topic
+    with an object list to the point cloud behind it.
     """
 
     id: _Filled

@@ -82,7 +82,7 @@ def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
 
 
 def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
-    """Return the bookkeeping that requests result in; it is wrong if an operator changed one."""
+    """Return the bookkeeping that requests result in, if no operator changed a request."""
     book = Counter[Hold]()
     for request in requests.values():
         if request.shutdown:

@@ -1,4 +1,4 @@
 """Stage 4, what should run: releases derived from claims.
 
-Knows the ledger and the configuration, but not Helm, Flux or files.
+This stage knows the ledger and the configuration, but not Helm, Flux or files.
 """

@@ -36,8 +36,8 @@ class Flow:
     """A topic that is made on one node and needed on another.
 
     ``name`` is the role, or ``<service>.<output>``. ``target`` is the topic's name at the receiver.
-    ``root`` is the demanded topic that needs it; ``delivery`` is its index in ``deliver``, if it is
-    delivered.
+    ``root`` is the demanded topic that needs it; ``delivery`` is the index of its delivery in
+    ``deliver``, if it has one.
     """
 
     name: str
@@ -52,8 +52,8 @@ class Flow:
 def node_of(app: Application, service: Service, source: str) -> str:
     """Return the node on which an application's service runs for the inputs of ``source``.
 
-    Empty if the service runs once for each cluster, but not in the application's cluster, or if it
-    has no node yet.
+    The result is empty if the service has no node yet, or if it runs once for each cluster, but not
+    in the application's cluster.
     """
     if service.nodes:
         return service.runs_at.get(app.node, "")

@@ -78,7 +78,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
 
 
 def _note(needed: Connection, type: str) -> str:
-    """Return what to tell of a connection that others demanded with another type."""
+    """Return a note on a connection that others demanded with another type."""
     if needed.type is None or type in ("auto", needed.type.word):
         return ""
     topic = needed.topics[0].source

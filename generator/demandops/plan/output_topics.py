@@ -46,7 +46,7 @@ def instance_of(config: Config, role: str, topic: InputTopic, version: str = "")
 
 
 def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return what the names of a service's topics have beside the source of its input."""
+    """Return what tells names of a service's topics apart if the source is the same."""
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return topic.told_apart_by(further, version)
@@ -54,7 +54,7 @@ def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) ->
 
 @lru_cache(maxsize=65_536)
 def published(pattern: str, source: str, told: str) -> InputTopic:
-    """Return a topic that a service publishes for a source; a fusion reads hundreds each time."""
+    """Return a topic that a service publishes for a source, from a cache: a fusion has hundreds."""
     return InputTopic(named(pattern, naming.topic_part(source, told)), source)
 
 
@@ -70,7 +70,7 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request with every input marked that is a further topic of its source."""
+    """Return the request, in which a mark says which inputs are further topics of a source."""
     if not request.adds_claims:
         return request
     own = request.demand if isinstance(request, Put) else None  # a put may release what it holds
@@ -105,7 +105,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
     """Return the ledger of an earlier format with further topics marked as such.
 
-    The topic of a source that was booked first is its usual one.
+    The usual topic of a source is the one that was booked first.
     """
     first: dict[tuple[str, str], str] = {}
 

@@ -156,7 +156,7 @@ def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> In
 def _inputs(
     config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
 ) -> tuple[InputTopic, ...]:
-    """Return the topics that an instance reads in a role, sorted; a known type fills a gap."""
+    """Return the topics that an instance reads in a role, sorted, with their types if known."""
     found: set[InputTopic] = set()
     for part in parts:
         origin = _origin(config, key, role, part)
@@ -249,8 +249,8 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             for claim in claims[:3]
         )
         message = (
-            f"demands contradict each other: {shown}; agree, or have the application definition "
-            "say how to merge them"
+            f"demands contradict each other: {shown}; agree, or ask that the application "
+            "definition say how to merge them"
         )
         raise Refused.at(f"parameters.{name}", message, code="conflict")
     return given[0]
@@ -300,7 +300,7 @@ def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     """Return whether the initial deployment already carries a topic between two ends.
 
-    It keeps topic names, so it does not carry a route that renames the topic.
+    The initial deployment keeps topic names, so it carries no route that renames the topic.
     """
     sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)

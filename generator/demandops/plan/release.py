@@ -49,7 +49,7 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """Its key among the replicas that the ledger keeps."""
+        """The key of the service instance in the ledger's kept replicas."""
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
@@ -93,16 +93,16 @@ class ServiceRelease:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The registry's names of its images."""
+        """The names of the service's images in the registry."""
         return self.service.images
 
     def image(self, name: str, config: Config) -> Image:
-        """Return one of its images, as its version and overrides pin it."""
+        """Return one of the service's images, as its version and overrides pin it."""
         return self.shaping.image(name, self.version.image(name, config.images[name]))
 
     @property
     def description(self) -> str:
-        """Its description in commit messages."""
+        """The service's description in commit messages."""
         for_whom = self.key.source or self.key.application
         what = f"{self.key.service} {self.key.version}".rstrip()
         return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
@@ -127,7 +127,7 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what it decides) for each configuration entry that shapes it."""
+        """Yield (file, entry, what it decides) for each configuration entry behind the release."""
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "its definition"

@@ -107,7 +107,7 @@ def takes(app: Application, service: Service, key: ServiceKey) -> bool:
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
     """Return the application's service that ``key`` may be an instance of.
 
-    ``None`` if there is none, for example because the application moved.
+    It is ``None`` if there is none, for example because the application moved.
     """
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}

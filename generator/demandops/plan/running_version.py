@@ -1,9 +1,9 @@
 """The version that runs: the newest one that is asked for.
 
 A claim on an application asks for a version, or else for the default. The application runs the
-newest of them. A service that applications share runs the newest version of these applications. So
-the order of the claims does not matter. Whether a demand may ask for a version is decided before,
-in :mod:`demandops.plan.checks.version_difference`.
+newest version asked for. A service that applications share runs the newest version of these
+applications. So the order of the claims does not matter. Before that,
+:mod:`demandops.plan.checks.version_difference` decides whether a demand may ask for a version.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ _TEMPLATE_FAULTS = (
 )  # errors that a template can cause, so that its author must fix them
 
 _MAX_LENGTH = 100_000
-"""The most characters of a values template."""
+"""How many characters a values template may have."""
 
 
 class _Verbatim(str):
@@ -57,7 +57,7 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the template's text, its path for tracebacks, and that it never changes."""
+        """Return the template's text, its path, and a function that says that it is up to date."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]
@@ -153,11 +153,11 @@ class Engine:
         self._config = Sandbox(_FILTERS, loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
 
     def text(self, template: str, **context: object) -> str:
-        """Render a template of the program (``flux/release.yaml.j2``)."""
+        """Return a rendered template of the program (``flux/release.yaml.j2``)."""
         return self._own.get_template(template).render(**context)
 
     def data(self, template: str, **context: object) -> dict[str, Any]:
-        """Render a values template of the configuration and parse it.
+        """Return the data that a values template of the configuration renders to.
 
         Raises:
             InvalidInput: if the template fails; it names the template and, if known, the line.

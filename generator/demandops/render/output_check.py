@@ -48,7 +48,7 @@ def check_values(
 ) -> None:
     """Check Helm values against the chart's schema, if the chart is in the state repo.
 
-    Like Helm, this merges the values into the chart's defaults first: a schema may require a value
+    Like Helm, it merges the values into the chart's defaults first: a schema may require a value
     that has a default.
 
     Args:
@@ -89,7 +89,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
-            faults.append(fault("", "is not in a folder that the generator writes").within(path))
+            faults.append(
+                fault("", "is in no folder that the generator writes; report it").within(path)
+            )
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
@@ -114,7 +116,9 @@ def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, 
         if isinstance(document, dict):
             yield document
         else:
-            faults.append(fault("", "has a document that is not a mapping").within(path))
+            faults.append(
+                fault("", "has a document that is not a mapping; fix its template").within(path)
+            )
 
 
 def _check_object(
@@ -144,7 +148,7 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
 
 @lru_cache(maxsize=64)
 def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
-    """Compile the schema of a built-in kind."""
+    """Return the compiled schema of a built-in kind."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
     package = find_spec("kubernetes_validate")  # its import is slow, and only its files are used

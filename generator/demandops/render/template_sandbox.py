@@ -33,11 +33,11 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
 MAX_STEPS = 1_000_000
-"""The most steps of one rendering, a few seconds of work; 100 topics take some thousand."""
+"""How many steps a rendering may take, a few seconds of work; 100 topics take some thousand."""
 MAX_LENGTH = 1_000_000
-"""The most characters of a text. Kubernetes takes no object above 1.5 MB."""
+"""How many characters a text may have. Kubernetes takes no object above 1.5 MB."""
 MAX_SIZE = 100_000
-"""The most parts of a value. Each item, each key and every 16 characters of text are a part."""
+"""How many parts a value may have: each item, each key and every 16 characters are one."""
 _MAX_BITS = 1024
 
 _DIGITS = re.compile(r"\d{1,9}")
@@ -102,7 +102,7 @@ def budget() -> Iterator[None]:
 def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts; a part that occurs twice counts twice.
 
-    With ``data``, any other object is refused, because its text would hold an address in memory.
+    With ``data``, it refuses an object of another kind, whose text holds an address in memory.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -341,7 +341,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return "".join(pieces)
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        """Evaluate an operator; refuse a result that is too large."""
+        """Return the result of an operator; refuse one that is too large."""
         if isinstance(left, int) and isinstance(right, int):
             bits = left.bit_length() * right if operator == "**" else left.bit_length()
             _refuse_large(
@@ -364,7 +364,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return super().getitem(obj, argument)
 
     def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        """Call a macro, a function or a method; refuse methods that are not listed."""
+        """Return the result of a macro, function or method; refuse methods that are not listed."""
         steps = _budget.get()
         for value in (*args, *kwargs.values()):
             steps.take(_size(value, data=False))
@@ -379,7 +379,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _kept(super().call(__context, __obj, *args, **kwargs))
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        """Wrap ``str.format``; refuse a result that is too large."""
+        """Return ``str.format`` wrapped, so that it refuses a result that is too large."""
         wrapped = super().wrap_str_format(value)
         if wrapped is None:
             return None

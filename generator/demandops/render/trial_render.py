@@ -1,4 +1,4 @@
-"""A check of new configuration: renders it for invented demands before a real one arrives."""
+"""A check of new configuration: it is rendered for invented demands before a real one arrives."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     """Return appdef → its services for a trial demand on the first node, without overrides.
 
     Raises:
-        Refused: if one cannot be planned.
+        Refused: if a service cannot be planned.
     """
     if not config.domain_of:
         return {}

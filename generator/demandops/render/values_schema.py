@@ -76,7 +76,7 @@ def _outside(schema: object, place: tuple[int | str, ...]) -> Iterator[tuple[Any
 
 
 class _Work:
-    """Computes the most schemas that a validation may apply along one path into the values."""
+    """Computes how many schemas a validation may apply along one path into the values."""
 
     def __init__(self, document: object) -> None:
         self._document = document
@@ -86,7 +86,7 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return the most schemas that a schema applies to values of this depth.
+        """Return the highest number of schemas that a schema applies to values of this depth.
 
         Raises:
             RecursionError: if a schema applies itself to the same value, or applies too many.

@@ -34,7 +34,7 @@ def access_domain(
     """Return path → text of a new access domain. Without requesters all may demand everything.
 
     Raises:
-        InvalidInput: there is one of this name, or one that has every node.
+        InvalidInput: a domain of this name exists, or a domain has every node.
     """
     if name in config.domains:
         raise InvalidInput.at("NAME", f"'{name}' is an access domain already; choose another name")

@@ -1,6 +1,7 @@
 """The container file and the pipelines of a ROS package of one's own, for its own repository.
 
-They test it, build its image, and propose the image to the state repo, pinned by its digest. Pure.
+The pipelines test the package, build its image, and propose the image to the state repo, pinned by
+its digest. Pure.
 """
 
 from __future__ import annotations

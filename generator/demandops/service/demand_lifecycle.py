@@ -119,7 +119,7 @@ class Demands:
         self._arrival.set()
 
     def wake(self) -> None:
-        """End the worker's wait without a demand; from any thread."""
+        """End the worker's wait without a demand; any thread may call it."""
         with self._changed:
             self._woken = True
             self._changed.notify()
@@ -133,7 +133,7 @@ class Demands:
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Return the demands that are new since the last call or :meth:`take`; wait for one.
 
-        None are returned after ``timeout`` seconds, a withdrawal or :meth:`wake`.
+        After ``timeout`` seconds, a withdrawal or :meth:`wake` the list is empty.
 
         Raises:
             Unsound: nobody knows what is in the journal.
@@ -252,7 +252,7 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Return demands that no longer need approval to the state waiting.
+        """Put demands that no longer need approval back into the state waiting.
 
         A person may have merged one of them meanwhile.
         """
@@ -364,7 +364,7 @@ class Demands:
             self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand of a batch with an error."""
+        """Answer every demand of a batch with an error; ``keep`` leaves them in the journal."""
         self.answer([(ticket, error) for ticket in batch], keep)
 
     def end(self, error: Unsound) -> None:

@@ -43,7 +43,7 @@ class Evaluator:
         """Decide a demand, commit it on the commit batch and return its result.
 
         Returns:
-            Its receipt or error; if it needs approval, the decision, which is not committed.
+            The demand's receipt or error; if it needs approval, the decision, not committed.
 
         Raises:
             Unavailable, PushDenied, Unsound: nothing can be written now.
@@ -98,7 +98,7 @@ class Evaluator:
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of demands that are already published at ``tip``, in that order.
+        """Return the results of demands that are already published at ``tip``, oldest first.
 
         Such a demand was not answered because the connection or the process ended after the remote
         accepted the push, or because a sync failed. So the commits since its base are written

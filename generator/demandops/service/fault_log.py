@@ -1,4 +1,4 @@
-"""What the log tells of the state repo, each thing once."""
+"""What the log says about the state repo; it says each thing once."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FaultLog:
             self._warned_of_signers = True
             log.warning(
                 "%s lists who may sign, but this generator has no key; `verify` will refuse its "
-                "commits, and generators will take them for a person's: start it with "
+                "commits, and generators will take them for a person's; start the generator with "
                 "--signing-key",
                 allowed_signers.ALLOWED_SIGNERS,
             )

@@ -116,7 +116,7 @@ class Generator:
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time; does not fetch.
+        """Return the state in effect at a commit or a time, without a fetch.
 
         Any thread may call it; it may take seconds.
 
@@ -136,7 +136,7 @@ class Generator:
 
     @property
     def unpublished(self) -> int:
-        """How many demands are in the journal and do not await approval; from any thread."""
+        """How many demands are in the journal and await no approval; any thread may read it."""
         return self._demands.unpublished
 
     @property
@@ -146,11 +146,11 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Name of each thread that failed and has not recovered → the reason; from any thread."""
+        """Name of each failed thread that has not recovered → the reason; for any thread."""
         return self._runtime.failures
 
     def fetch_now(self) -> None:
-        """Fetch from the state repo now, because a push was reported; from any thread."""
+        """Fetch from the state repo now, because a push was reported; any thread may call it."""
         self._worker.fetch_now()
 
     def submit(
@@ -182,24 +182,25 @@ class Generator:
         try:
             ticket.goal = json.loads(json.dumps(goal))
         except (TypeError, ValueError, RecursionError):
-            ticket.refuse(Refused([fault("", "the goal is not plain data")]))
+            message = "the goal is not plain data; give text, numbers, lists and mappings"
+            ticket.refuse(Refused([fault("", message)]))
             return ticket
         ticket.base = str(self.snapshot.commit)
         self._demands.arrive(ticket)
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or a descendant of it; from any thread."""
+        """Return whether ``commit`` is ``other`` or a descendant; any thread may call it."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether two commits have the same content at ``path``; from any thread."""
+        """Return whether two commits have equal content at ``path``; any thread may call it."""
         return self._repository.unchanged(commit, other, path)
 
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
         """Return the newest published commit and the paths that changed since another.
 
-        The paths are None if the other commit is unknown. From any thread.
+        The paths are None if the other commit is unknown. Any thread may call it.
         """
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
@@ -216,7 +217,7 @@ class Generator:
         self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
-        """Refuse further demands, finish the queued ones and stop; returns at once.
+        """Refuse further demands, finish the queued ones and stop; return at once.
 
         Args:
             timeout: seconds for the queued demands. The demands that are not published then stay in

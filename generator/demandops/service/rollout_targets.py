@@ -58,7 +58,7 @@ def domains_of_state(state: State) -> list[ClusterDomain]:
 
 
 def place_of(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
-    """Return an access domain on a cluster, with what applies its folder there."""
+    """Return an access domain on a cluster, with the object that applies its folder."""
     application = None
     if repository.gitops == "argocd" and repository.argocd:
         application = ObjectName(repository.argocd.namespace, project_of(domain, repository))

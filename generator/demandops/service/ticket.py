@@ -91,7 +91,7 @@ class Ticket:
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
 
     def refuse(self, error: DemandOpsError) -> None:
-        """Answer a demand that is not journaled."""
+        """Answer a demand with an error before it is journaled."""
         self.state = "done"
         self.future.set_exception(error)
         self.journaled.set_result(False)

@@ -45,8 +45,8 @@ _NAME = "writer"
 class Worker:
     """Follows the state repo and turns batches of demands into published commits.
 
-    Any thread may read ``snapshot``, the newest published state, and ``remote``. The ``listeners``
-    are called with the configuration in effect after every publication.
+    Any thread may read ``snapshot``, the newest published state, and ``remote``. It calls the
+    ``listeners`` with the configuration in effect after every publication.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, with the demands that arrive during retries, and end leases.
 
-        The batch is empty then.
+        Afterwards the batch is empty.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -206,7 +206,7 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
 
     def _require_time(self) -> None:
-        """Raise after :meth:`end_soon`.
+        """Raise an error if :meth:`end_soon` was called.
 
         Raises:
             ShuttingDown: says that the demand is resumed.
@@ -264,7 +264,7 @@ class Worker:
         )
 
     def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
-        """Evaluate a demand; if it frees room, book demands that wait for room next."""
+        """Return the result of a demand; if it frees room, book demands that wait for that."""
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         self._own_work.follow(commits, before)
@@ -315,10 +315,10 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out the commits of others, and do what time makes due.
+        """Fetch if a fetch is due, carry out the commits of others, and do what is due.
 
-        That is ending overrides, draining nodes, scaling down, and booking demands that wait. A
-        repository on this disk is read each time, because that is cheap.
+        The end of an override, a drain, a scale-down or a waiting demand can be due. The worker
+        reads a repository on this disk each time, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
@@ -356,7 +356,7 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's changes up to the fetched tip; return if there were any.
+        """Publish the effects of people's fetched changes; return whether there were any.
 
         It does not fetch first.
         """

@@ -48,7 +48,7 @@ class Reader:
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        """Open the state repo; a URL is fetched into a clone that is kept."""
+        """Return the open state repo; fetch a URL into a clone, which stays."""
         slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         try:
             repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
@@ -64,7 +64,7 @@ class Reader:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch, read from the newest commit from now on, and return it.
+        """Fetch, read from the newest commit from now on, and return that commit.
 
         Raises:
             StateRepoError: if the state repo cannot be reached or read.
@@ -94,7 +94,7 @@ class Reader:
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load the state in effect at a commit (:func:`state_in_effect.snapshot_at`)."""
+        """Return the state in effect at a commit (:func:`state_in_effect.snapshot_at`)."""
         commit = self.commit(revision)
         try:
             return state_in_effect.snapshot_at(self._objects, commit, progress)
@@ -104,7 +104,7 @@ class Reader:
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Load a commit, with the last valid versions of invalid files.
+        """Return a commit with the last valid versions of invalid files.
 
         Unlike :meth:`snapshot`, it does not need a generator to have quarantined the files.
         """
@@ -114,7 +114,7 @@ class Reader:
             return state_in_effect.state_at(self._objects, revision, progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        """Load the newest commit like :meth:`last_valid_snapshot`, if possible from ``before``."""
+        """Return the newest commit like :meth:`last_valid_snapshot`; start from ``before``."""
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
@@ -136,8 +136,8 @@ class Reader:
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
         """Return the generated files that a generator has yet to write or remove.
 
-        That may be so only after a commit by a person. Files that cannot be rendered do not count:
-        they are problems.
+        There can be such files only after a commit by a person. Files that cannot be rendered do
+        not count: they are problems.
         """
         commit = trees.commit_of(self._objects, snapshot.commit)
         if commit_log.is_by_generator(self._objects, commit):
@@ -167,7 +167,7 @@ class Reader:
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``.
 
-        If a file or folder is given, only the commits that changed it.
+        With ``path``, yield only the commits that changed this file or folder.
         """
         since, until = self._sides(spec or "")
         if path is not None:
@@ -263,14 +263,14 @@ class Reader:
 
 @contextmanager
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
-    """Open a state repo, and close it at the end; ``only_read`` also allows a checkout."""
+    """Yield an open state repo, and close it at the end; ``only_read`` also allows a checkout."""
     with closing(Reader.of(address, only_read=only_read)) as reader:
         yield reader
 
 
 @contextmanager
 def opened_offline(address: str) -> Iterator[Reader | None]:
-    """Open a state repo without the network; None if its URL was never fetched."""
+    """Yield an open state repo without the network; None if its URL was never fetched."""
     if not is_url(address):
         with opened(address) as found:
             yield found

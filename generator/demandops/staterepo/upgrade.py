@@ -67,7 +67,7 @@ class Upgrade:
 
     @property
     def handover(self) -> SwitchSteps:
-        """The steps on the clusters before and after."""
+        """The steps on the clusters before and after the upgrade."""
         return switch_steps(self.old, self.new, self.files)
 
 
@@ -104,7 +104,7 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again and publish it as one commit, if any file differs.
+    """Render everything again, publish the differences as one commit, and return them.
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.
@@ -115,7 +115,8 @@ def upgrade(
 
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
-        StateRepoError: it cannot be read or written, or other writers moved it each time.
+        StateRepoError: the state repo cannot be read or written, or other writers moved it at each
+            attempt.
     """
     with reader.opened(address) as repo:
         repository = repo.repository

@@ -46,7 +46,7 @@ class ClusterWatch:
 
     @property
     def changes(self) -> tuple[HealthChange, ...]:
-        """The changes of health since the start, oldest first; from any thread."""
+        """The changes of health since the start, oldest first; any thread may read them."""
         return tuple(self._changes.copy())
 
     def statuses(

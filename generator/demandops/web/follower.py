@@ -115,7 +115,7 @@ class Follower:
         return moment.last_changes[path]
 
     def wake(self) -> None:
-        """Check for a new commit now; from any thread."""
+        """Check for a new commit now; any thread may call it."""
         self._wake.set()
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""The state at one commit, and the situation: this state with what clusters and forge tell."""
+"""The state at one commit, and the situation: that state with reports of clusters and forge."""
 
 from __future__ import annotations
 
@@ -45,9 +45,10 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class KnownRows:
-    """The rows of a list by their ids, each with what it was made of.
+    """The rows of a list by their ids, each with the parts from which it was made.
 
-    ``made_for`` are the statuses that they were made for, or None if the books were others.
+    ``made_for`` are the statuses that they were made for, or None if an earlier moment made
+    them.
     """
 
     made_for: object
@@ -55,10 +56,10 @@ class KnownRows:
 
 
 class Moment:
-    """The books at one commit: what runs, and for whom. Derived once, when it is asked for.
+    """What runs at one commit, and for whom. Each part is derived once, when it is asked for.
 
-    What later books have in common with them, :meth:`take_over` keeps: then a commit costs what it
-    changes.
+    :meth:`take_over` keeps the parts that are the same at an earlier moment. So a commit costs
+    only what it changes.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class Moment:
     def take_over(self, before: Moment) -> None:
         """Keep what an earlier moment has derived, and derive only what may differ.
 
-        Does nothing if the configuration or the overrides differ, because then all may differ.
+        It does nothing if the configuration or the overrides differ, because then all may differ.
         """
         old, new = before.state, self.state
         if (old.config, old.overrides) != (new.config, new.overrides):
@@ -217,7 +218,7 @@ def _held_by(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
 def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
     """Return the subjects whose claims differ.
 
-    What did not change is the same object in both, and a look-up by subject takes longer.
+    It compares objects: unchanged claims are the same object, and look-ups would take longer.
     """
     before = {id(claims): subject for subject, claims in old.claims.items()}
     after = {id(claims): subject for subject, claims in new.claims.items()}

@@ -1,4 +1,4 @@
-"""The page's server: an own address and an own thread."""
+"""The page's server, with an address and a thread of its own."""
 
 from __future__ import annotations
 

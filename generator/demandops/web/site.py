@@ -1,4 +1,4 @@
-"""The site: how its views become pages, its events, and the headers that keep it closed.
+"""The site: how its views become pages, its events, and the headers that keep other sites out.
 
 Every address is read only, and no page loads anything from another host. Templates escape every
 value that they print, and show what is not visible.
@@ -60,8 +60,8 @@ _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 _EARLIER_AT_ONCE = 4
-"""How many views of earlier moments are made at once. One may take seconds, and must not keep those
-of now waiting."""
+"""How many views of earlier moments are made at once. One may take seconds, and must not
+delay views of the present."""
 
 
 class Site:
@@ -77,8 +77,8 @@ class Site:
 
         Args:
             follower: the state repo.
-            hosts: the names that a browser may call it by, so that no other site can have its
-                visitors' browsers read this page; ``*`` for any.
+            hosts: the host names under which browsers may ask for the page; ``*`` for any. They
+                keep another site from reading the page through its visitors' browsers.
             documentation: the folder of the documentation's site; None: it was not built.
         """
         self._follower, self._has_docs = follower, documentation is not None
@@ -194,7 +194,7 @@ class _Events:
 
 
 class _ClosedHeaders:
-    """Adds the headers that keep a page closed to every answer."""
+    """Adds to every answer the headers that keep other sites out of the page."""
 
     def __init__(self, application: ASGIApp) -> None:
         self._application = application

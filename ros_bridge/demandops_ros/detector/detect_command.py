@@ -35,9 +35,9 @@ def detect(
 ) -> None:
     """Watch topics and demand by rules.
 
-    RULES is a file of rules (docs/detector.md); the ROS parameter rules can name it instead. It is
-    read again when it changes. Everything after --ros-args goes to ROS. Stop it with Ctrl-C or
-    SIGTERM: its demands stay booked, and the next start continues them.
+    RULES is a file of rules (docs/detector.md); the ROS parameter rules can name it instead. The
+    detector reads it again when it changes. Everything after --ros-args goes to ROS. Stop it with
+    Ctrl-C or SIGTERM: its demands stay booked, and the next start continues them.
 
     \b
     Examples:
@@ -55,7 +55,7 @@ def detect(
         return
     for option, given in (("--plot", plot is not None), ("--output", output != "text")):
         if given:
-            raise click.UsageError(f"{option} is for --replay")
+            raise click.UsageError(f"{option} is for --replay; add that, or leave it out")
     _run(rules, ros_args)
 
 
@@ -77,7 +77,7 @@ def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
     finally:
         recorded.close()
     for topic, type_name in recorded.unread.items():
-        errors.print(f"warning: {topic} has the type {type_name}, and is not read")
+        errors.print(f"warning: {topic} is not read, because its type is {type_name}")
     replay.show(found, output)
     if plot is not None:
         try:

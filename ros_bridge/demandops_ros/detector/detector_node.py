@@ -36,7 +36,7 @@ _RELOAD_S = 1.0
 _PATIENCE_S = 10.0
 _MOST_OBSERVATIONS = 100_000
 _UNHEARD_CLOCK = 0.0
-"""The time until the first message of a simulated clock. What starts from it is soon long ago."""
+"""The time until the first message of a simulated clock. Once the clock runs, it is long ago."""
 _SET_CLOCK_S = 1.0
 """If a clock jumps by more, somebody has set it, or a simulation was restarted."""
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)

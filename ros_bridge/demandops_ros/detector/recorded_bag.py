@@ -28,7 +28,7 @@ class RecordedBag:
         """Open a bag: its folder, or an MCAP file.
 
         Raises:
-            InvalidInput: if it is not a bag that can be read, or none of its topics is.
+            InvalidInput: if the bag cannot be read, or the rules read none of its topics.
         """
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))

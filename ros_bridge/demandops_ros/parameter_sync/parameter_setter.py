@@ -37,7 +37,7 @@ class ParameterSetter:
         node.create_timer(_LOOK_S, self._look)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
-        """Replace the parameters that the target must have; from any thread.
+        """Replace the parameters that the target must have; any thread may call it.
 
         Raises:
             TypeError, ValueError: if ROS has no type for a value; the message names the parameter.
@@ -84,7 +84,7 @@ class ParameterSetter:
         self._changed.trigger()  # other parameters may be wanted by now
 
     def _endpoints(self) -> frozenset[tuple[int, ...]]:
-        """Return the target's endpoints for parameter events; a killed node's stay a while."""
+        """Return the target's endpoints for parameter events, also those of a killed node."""
         return frozenset(
             tuple(info.endpoint_gid)
             for info in self._node.get_publishers_info_by_topic(_EVENTS)

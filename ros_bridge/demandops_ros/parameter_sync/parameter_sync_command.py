@@ -39,10 +39,10 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     """Keep a ROS node's parameters as a ConfigMap has them.
 
     It watches the ConfigMap, which holds a ROS parameter file, and sets the parameters of the
-    running node when they change or it starts again. Everything after --ros-args goes to ROS.
-    Parameters, as those of the reference's k8s_configmap_watcher: configmap_name, namespace,
-    ros_params_file_name (the key in the ConfigMap; params.yml), target_ros_node. Stop it with
-    Ctrl-C or SIGTERM.
+    running node when they change, or when the node starts again. Everything after --ros-args goes
+    to ROS. Parameters, as those of the reference's k8s_configmap_watcher: configmap_name,
+    namespace, ros_params_file_name (the key in the ConfigMap; params.yml), target_ros_node. Stop
+    it with Ctrl-C or SIGTERM.
 
     \b
     Examples:
@@ -76,7 +76,7 @@ def _watch(node: Node, kubeconfig: Path | None) -> ConfigMapWatch:
     def take(data: Mapping[str, str]) -> None:
         try:
             if key not in data:
-                raise InvalidInput.at("", "is missing", file=file)
+                raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
             setter.want(parameters_of(target, data[key], file))
         except (DemandOpsError, TypeError, ValueError) as error:
             node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))

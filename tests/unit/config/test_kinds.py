@@ -119,7 +119,7 @@ def test_the_list_of_the_documentation_is_taken() -> None:
         ),
         (
             {"kinds": f"[{', '.join(KINDS)}]", "network": "namespace"},
-            ": kinds: with NetworkPolicy a chart could open what network: namespace closes; "
+            ": kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; "
             "remove one of them",
         ),
     ],

@@ -113,7 +113,7 @@ def test_the_capacity_of_a_machine_is_one_for_all_its_domains() -> None:
     repo.send(fusion("a", "both", node="edge@city"))
     assert repo.faults(fusion("b", "both", node="edge@fleet")) == [
         ": 'edge' has 0.4 of 1 cpu free, but 0.6 is asked for; choose another node, release "
-        "something first, or have inventory/nodes.yaml changed"
+        "something first, or ask for a change of inventory/nodes.yaml"
     ]
     made = fusion("b", "both", node="")
     made["applications"][0]["place"] = {"role": "edge"}

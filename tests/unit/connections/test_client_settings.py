@@ -117,8 +117,8 @@ def test_an_override_of_connections_patches_the_settings_of_their_clients() -> N
 
 def test_settings_and_patches_that_are_not_valid_are_named() -> None:
     assert refusals(clients(env={"ROS_DOMAIN_ID": "1"}, launchfile="x")) == [
-        "registry/clients.yaml: mqtt.env: ROS_DOMAIN_ID follows from ros of the node; set it at "
-        "the node in the inventory",
+        "registry/clients.yaml: mqtt.env: ROS_DOMAIN_ID follows from 'ros' of the node; set "
+        "that in the inventory, and remove this",
         "registry/clients.yaml: mqtt.launchfile: is not a field here; remove it or correct its "
         "spelling",
     ]

@@ -63,7 +63,7 @@ def test_a_topic_that_is_carried_back_goes_to_one_place() -> None:
     routes = [Route("/a", "/x", reverse=True), Route("/b", "/x", reverse=True)]
     assert told(faults("topics", routes)) == [
         "topics[1].target: '/x' is carried back to '/a' and to '/b'; one topic goes to one place, "
-        "use a second connection"
+        "so use a second connection"
     ]
 
 

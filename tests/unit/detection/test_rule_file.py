@@ -75,7 +75,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{entity}/{x}")),
-            "rules.yaml:18: rules[0].demand.demand: '{x}' changes; an id must stay the same",
+            "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but an id must stay "
+            "the same; leave it out",
         ),
         (
             rule("a", near=NEAR, demand=demand(operation="release")),
@@ -108,8 +109,8 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "d": {"topic": "/d/{entity}", "type": "p/msg/M", "timeout": "0s"},
     }
     assert faults(text_of(rule("r", near={**NEAR, "source": "a"}), sources=sources)) == [
-        "rules.yaml:4: sources.a: needs the name of the entity once: {entity} as a part of topic, "
-        "or the field with it in entity",
+        "rules.yaml:4: sources.a: needs the name of the entity once: write {entity} as a part of "
+        "topic, or name in entity the field that has it",
         "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
         "letters, digits and '_' between single '/', no part starting with a digit",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "

@@ -114,8 +114,8 @@ def test_an_application_whose_topics_another_publishes_is_refused() -> None:
     repo = MemoryRepo()
     repo.send(join(CLOUD, id="edge/fusion-1"))
     assert repo.faults(join(CLOUD, id="edge-fusion/1")) == [
-        "apps[0].header.id: its fused_objects is /edge_fusion_1_global_objectlist, which "
-        "application 'edge/fusion-1' publishes on 'edge' already; use another application id"
+        "apps[0].header.id: its output fused_objects is /edge_fusion_1_global_objectlist, "
+        "which application 'edge/fusion-1' publishes on 'edge' already; use another application id"
     ]
     repo.send(goal([application("edge-fusion/1", node="cloud")]))
 
@@ -124,9 +124,9 @@ def test_a_source_whose_topic_another_publishes_is_refused() -> None:
     repo = with_nodes({"id": "robo-1"}, {"id": "robo/1", "selector": {"a": "b"}})
     repo.send(join(("/a", "robo-1")))
     assert repo.faults(join(("/b", "robo/1"), id="edge/other")) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its object_list is "
-        "/robo_1_local_objectlist, which object-detection for /a of 'robo-1' publishes on 'edge' "
-        "already; give 'robo/1' another id in inventory/nodes.yaml"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
+        "object_list is /robo_1_local_objectlist, which object-detection for /a of 'robo-1' "
+        "publishes on 'edge' already; give 'robo/1' another id in inventory/nodes.yaml"
     ]
 
 
@@ -138,10 +138,10 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
     repo.state = replace(repo.state, ledger=rebuilt(claims))
     repo.send(goal([application("cloud/x", node="cloud", clouds=[FRONT])]))
     assert repo.faults(goal([application("cloud/y", node="cloud", clouds=[REAR])])) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its object_list is "
-        "/vehicle01_local_objectlist, which object-detection for /front/points of 'vehicle01' "
-        "publishes on 'cloud' already; name the usual one of the two as topics.point_cloud of "
-        "'vehicle01' in inventory/nodes.yaml"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
+        "object_list is /vehicle01_local_objectlist, which object-detection for /front/points of "
+        "'vehicle01' publishes on 'cloud' already; name the usual one of the two as "
+        "topics.point_cloud of 'vehicle01' in inventory/nodes.yaml"
     ]
 
 
@@ -158,8 +158,8 @@ def test_an_application_whose_topic_a_connection_brings_is_refused(at_once: bool
     else:
         repo.send(link)
     assert repo.faults(app) == [
-        "apps[0].header.id: its fused_objects is /edge_1_global_objectlist, which connection "
-        "'link' brings to 'edge' already; use another application id"
+        "apps[0].header.id: its output fused_objects is /edge_1_global_objectlist, which "
+        "connection 'link' brings to 'edge' already; use another application id"
     ]
 
 
@@ -167,9 +167,9 @@ def test_a_source_whose_topic_a_connection_brings_is_refused() -> None:
     repo = MemoryRepo()
     repo.send(bringing(PLAIN))
     assert repo.faults(join(FRONT)) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its object_list is "
-        f"{PLAIN}, which connection 'link' brings to 'edge' already; let the connection give it "
-        "another name there"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
+        f"object_list is {PLAIN}, which connection 'link' brings to 'edge' already; let the "
+        "connection give it another name there"
     ]
     repo.send(join(REAR, FRONT, shutdown=False) | {"apps": [application(node="cloud")]})
 
@@ -223,8 +223,8 @@ def test_a_claim_that_a_person_writes_or_restores_must_not_bring_a_topic_twice()
     refusal = here.take(Restoration("rollback", claims=tuple(both.ledger)))
     assert sorted(str(refusal).splitlines()) == sorted(found)
     assert found == [
-        f"{path_of(app.key)}: id: its fused_objects is /edge_fusion_1_global_objectlist, which "
-        "application 'edge/fusion-1' publishes on 'edge' already; use another application id",
+        f"{path_of(app.key)}: id: its output fused_objects is /edge_fusion_1_global_objectlist, "
+        "which application 'edge/fusion-1' publishes on 'edge' already; use another application id",
         f"{path_of(link.key)}: topics[0].target: connection 'link' brings "
         "/edge_fusion_1_global_trajectories to 'edge', where application 'edge/fusion-1' "
         "publishes it already; use a connection that gives it another name there",

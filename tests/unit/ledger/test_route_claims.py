@@ -121,7 +121,7 @@ class TestContradictions:
         ledger = joined(Ledger(), Route("/a", "/x", reverse=True))
         assert refusal(ledger, Route("/b", "/x", reverse=True)) == [
             "connections[0].topics[0].target: '/x' is carried back to '/a' already: 'c' is held by "
-            "v; one topic goes to one place, use a second connection"
+            "v; one topic goes to one place, so use a second connection"
         ]
         assert joined(ledger, Route("/b", "/x"), who="w")
 

@@ -111,8 +111,8 @@ def test_a_cluster_without_a_node_for_it_is_refused() -> None:
     demanded["applications"][0]["connect"] = "none"
     assert MemoryRepo(files()).faults(demanded) == [
         "applications[0].node: 'vehicle02' is in cluster 'depot', where map-server, which it "
-        "needs, has no node; choose a node in c-its, or have nodes in "
-        "appdefs/map-server/service.yaml changed"
+        "needs, has no node; choose a node in c-its, or ask for a change of nodes in "
+        "appdefs/map-server/service.yaml"
     ]
 
 
@@ -139,8 +139,16 @@ def test_its_node_counts_it_and_its_rules_hold() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "fault"),
     [
-        ("nodes: {c-its: cloud}\n", "", "scope 'cluster' needs nodes, the node of each cluster"),
-        ("scope: cluster", "scope: node", "scope 'cluster' needs nodes, the node of each cluster"),
+        (
+            "nodes: {c-its: cloud}\n",
+            "",
+            "scope 'cluster' needs 'nodes', the node of each cluster",
+        ),
+        (
+            "scope: cluster",
+            "scope: node",
+            "scope 'cluster' needs 'nodes', the node of each cluster",
+        ),
         (
             "nodes: {c-its: cloud}",
             "nodes: {c-its: cloud}\nplacement: source",

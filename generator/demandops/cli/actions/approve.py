@@ -25,7 +25,7 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 
 
 def proposal_named(repo: Reader, name: str) -> PendingProposal:
-    """Return the proposal with this branch, with this text in its branch, or of this demand."""
+    """Return the proposal of this branch or demand, or with this text in the branch's name."""
     pending = list(pending_proposals(repo.repository))
     exact = [one for one in pending if name == one.branch or name in one.demands]
     found = exact or [one for one in pending if name in one.branch]

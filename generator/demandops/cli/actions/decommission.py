@@ -81,7 +81,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
 
 
 def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
-    """Return the result, or None if a known node holds nothing, which is not an error."""
+    """Return the result, or None if the node is known and holds nothing; that is no error."""
     with started_generator(state_repo, signing_key) as generator:
         try:
             ticket = generator.submit(goal)

@@ -19,7 +19,7 @@ _LOOK_UP_S = 0.5
 
 
 def await_answer(future: Future[Any]) -> None:
-    """Return once a demand has an answer; Ctrl-C and SIGTERM interrupt it.
+    """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait.
 
     It polls, because an endless wait may miss a signal that arrived just before it, or a signal
     that a handler of another library takes.
@@ -30,7 +30,7 @@ def await_answer(future: Future[Any]) -> None:
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    """Yield a generator that is closed at the end; meanwhile SIGTERM is like Ctrl-C."""
+    """Yield a generator, and close it at the end; meanwhile SIGTERM acts like Ctrl-C."""
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
         signal.signal(signal.SIGTERM, signal.default_int_handler)

@@ -50,7 +50,7 @@ def override() -> None:
 
 
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    """Refuse a name that no override may have."""
+    """Return the name, or raise if no override may have it."""
     if not is_override_name(name):
         raise click.BadParameter(
             f"{quoted(name)} cannot name an override; use lower-case letters, digits and '-'"
@@ -123,7 +123,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 def end(name: str, way: Way) -> None:
     """End an override: remove its file.
 
-    The releases that it changed become again as they are demanded.
+    The releases that the override changed return to what the demands ask for.
 
     \b
     Examples:

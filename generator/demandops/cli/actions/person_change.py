@@ -92,7 +92,7 @@ class Way:
 
 
 def editing(command: Command) -> Command:
-    """Add the options that give the ``way`` of a command."""
+    """Return the command with the options that give its ``way``."""
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
@@ -117,7 +117,7 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override: path, new text (None: removed), and the commit's words."""
+    """A person's edit of one override: its new text (None: removed), and the commit message."""
 
     name: str
     text: str | None
@@ -147,7 +147,7 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 
 
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
-    """Commit the edit to main, or push it as a branch with a merge request."""
+    """Commit the edit to main, or to a branch with a merge request; return what was published."""
     files = {edit.path: edit.text}
     author = Author(repo.operator(), REAL.now(), edit.summary, one_line(edit.reason))
     if not propose:
@@ -183,7 +183,7 @@ def _opened(repo: Reader, edit: Edit, branch: str) -> str:
             return ""
         return forge.open(branch, MAIN_BRANCH, one_line(edit.summary), one_line(edit.reason)).link
     except ForgeError as error:
-        errors.print(f"warning: no merge request was opened: {error}; open it for {branch}")
+        errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
         return ""
 
 
@@ -242,7 +242,7 @@ SELECTORS = ("application", "appdef", "service", "connection", "node", "requeste
 
 
 def selecting(command: Command) -> Command:
-    """Add the options that select the releases and claims of an override."""
+    """Return the command with the options that select an override's releases and claims."""
     for name in reversed(SELECTORS):
         command = click.option(
             f"--{name}",

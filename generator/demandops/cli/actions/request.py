@@ -40,7 +40,7 @@ class Document:
     text: str = ""
     """The text of the file."""
     number: int = 0
-    """Its place among the documents of the text."""
+    """The place of the document in the text, from 0."""
 
     @property
     def request_id(self) -> str:
@@ -79,9 +79,9 @@ def request(
     """Book demand requests from files.
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
-    documents of the kind Demand (docs/demand.md). Write - for standard input. If a document cannot
-    be parsed, nothing is booked. Otherwise they are booked in order; if one is refused, the others
-    are still booked.
+    documents of the kind Demand (docs/demand.md). Write - for standard input. If it cannot parse a
+    document, the command books nothing. Otherwise it books the documents in order. If one is
+    refused, it still books the others.
 
     \b
     Examples:
@@ -94,7 +94,7 @@ def request(
     if release:
         documents = [replace(one, goal=_release_of(one.goal)) for one in documents]
     if not documents:
-        raise InvalidInput([fault("", "no request in " + ", ".join(files))])
+        raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     book_or_show(documents, state_repo, dry_run, wait, signing_key, output)
 
 
@@ -130,7 +130,7 @@ def book_or_show(
 
 
 def _is_unanswered(row: dict[str, Any]) -> bool:
-    """Return whether a request has no answer yet; one that waits for room has one, its commit."""
+    """Return whether a request has no answer yet; for one that waits for room, that is a commit."""
     return row["outcome"] == "waiting" and row["commit"] is None
 
 
@@ -141,7 +141,7 @@ def _documents(file: str) -> Iterable[Document]:
 
 
 def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    """Return the goal that releases what a goal demands; what is no goal stays, to be refused."""
+    """Return the goal that releases what a goal demands; other data stay, to be refused."""
     if not isinstance(goal, dict):
         return goal
     if not is_demand_goal(goal):
@@ -215,7 +215,7 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
     """Return the row of a request.
 
     Raises:
-        Unsound: nobody knows whether it was booked.
+        Unsound: nobody knows whether the request was booked.
     """
     try:
         result = answer.result(timeout=0)
@@ -258,7 +258,7 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Decide the requests one after the other, in memory only."""
+    """Return the row of each request, decided one after the other, in memory only."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()
@@ -295,7 +295,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
 
 
 def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
-    """Yield what a lease without a unit means; a person may have meant minutes."""
+    """Yield a warning if the lease has no unit; a person may have meant minutes."""
     lease = goal.get("lease") if isinstance(goal, dict) else None
     if isinstance(lease, int) and not isinstance(lease, bool):
         yield f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"

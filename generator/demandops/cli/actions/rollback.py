@@ -65,7 +65,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
     Claims that were released since then are booked again, with the current configuration. A lease
     starts again with its full term. REV is a commit; TIME means the newest commit at or before it.
-    At a terminal, the consequences are shown and confirmed first.
+    At a terminal, the command shows the consequences first and asks.
 
     \b
     Examples:
@@ -100,7 +100,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
 
 def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
-    """Decide the rollback on a commit, in memory only."""
+    """Return the outcome of the rollback on a commit, decided in memory only."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])

@@ -47,9 +47,9 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
     DIR is a checked-out state repo; default: this folder. Its files must be valid, every
     application must render, no generated file may be edited (the override to write instead is
     printed), and a changed chart needs a new version. Helm lints the charts and renders them, for
-    what runs and for an example of each application. Then the consequences of a merge are shown:
-    changed releases, files and bookkeeping. docs/pull-requests.md describes the check in a
-    pipeline.
+    what runs and for an example of each application. Then the command shows the
+    consequences of a merge: changed releases, files and bookkeeping. docs/pull-requests.md
+    describes the check in a pipeline.
 
     \b
     Examples:

@@ -42,8 +42,8 @@ directory_option = click.option(
 def new() -> None:
     """Write a new application, node, access domain or override.
 
-    The files are valid as they are: `demandops check` passes. No existing file is changed, and
-    nothing is committed.
+    The files are valid as they are: `demandops check` passes. The command changes no
+    existing file and commits nothing.
 
     \b
     Examples:
@@ -265,7 +265,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Ask for the options that are missing on the terminal; elsewhere raise which are missing."""
+    """Return the options' values; ask for missing ones on a terminal, elsewhere raise their names."""
     missing = [option for option, values in given.items() if not values]
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
@@ -274,7 +274,7 @@ def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Ask until every word of the answer is valid."""
+    """Return an answer's words; ask again until each word is valid."""
 
     def valid(answer: str) -> tuple[str, ...]:
         words = tuple(answer.split())
@@ -375,7 +375,7 @@ def _lay_down(
 
 def _write(directory: Path, found: Files, output: str, then: list[str]) -> None:
     if there := [path for path in found if (directory / path).exists()]:
-        raise StateRepoError(f"{directory / there[0]} exists; nothing was changed")
+        raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
     for path, text in found.items():
         (directory / path).parent.mkdir(parents=True, exist_ok=True)
         (directory / path).write_text(text, encoding="utf-8")

@@ -19,7 +19,7 @@ def describe(schema: dict[str, Any], root: str) -> None:
     """Add a description and an example to each property of a schema and its definitions.
 
     Args:
-        schema: the JSON Schema of a model; it is changed.
+        schema: the JSON Schema of a model; the function changes it.
         root: the model's name.
     """
     for model, part in {root: schema, **schema.get("$defs", {})}.items():

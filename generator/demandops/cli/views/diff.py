@@ -27,7 +27,7 @@ from demandops.staterepo.reader import Reader
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
     """Show the differences between two commits.
 
-    They are shown in bookkeeping, releases and other files. A and B are commits, or times like
+    The command compares bookkeeping, releases and other files. A and B are commits, or times like
     2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h.
 
     \b
@@ -63,7 +63,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    """Load a commit; warn about invalid files whose last valid version is in effect."""
+    """Load and return a commit; warn about files whose last valid version is in effect."""
     with progress("reading the ledger") as report:
         snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))

@@ -99,8 +99,8 @@ def get(
     proposal is a branch that a person merges to approve its demand, or deletes to refuse it.
     NAME and the filters may be patterns with * and ?. Of several filters, all must match. The
     state of an override is `in force`, `not rendered yet` (a generator has yet to write its files),
-    `held back` (a hold of another one keeps the files as they
-    are), `expired` or `matches nothing`.
+    `held back` (a hold of another one keeps the files as they are), `expired` or `matches
+    nothing`.
 
     \b
     Examples:

@@ -72,7 +72,7 @@ def _demands(source: Source) -> list[Json]:
 
 
 def _now(state: str, lease: Lease | None, now: datetime) -> str:
-    """Return the state of what is held: ``overdue`` if its lease is over and no one books that."""
+    """Return the state of what is held: ``overdue`` if its lease ended and it is still booked."""
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 

@@ -54,7 +54,7 @@ _TRAILERS = {
 
 
 def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
-    """Parse the time of --since or --until."""
+    """Return the time of --since or --until."""
     if text is None:
         return None
     time = revisions.parse_time(text, REAL.now(), end=param.name == "until")

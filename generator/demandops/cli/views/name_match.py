@@ -1,4 +1,4 @@
-"""What a name means that a person gives to ``demandops why``."""
+"""The meaning of a name that a person gives to ``demandops why``."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 
 
 def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Iterator[Match]:
-    """Yield what is meant if no release, application or connection has exactly this name."""
+    """Yield what a name may mean that no release, application or connection has."""
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
     if found is not None:
@@ -107,7 +107,7 @@ def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> I
 
 
 def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield what has exactly this name beside releases, applications and connections."""
+    """Yield what has this name, other than releases, applications and connections."""
     config = world.config
     if ("demand", name) in world.ledger.index:
         yield Match("demand", name)
@@ -122,13 +122,13 @@ def _named(world: World, name: str) -> Iterator[Match]:
 
 
 def _release_with(part: str, world: World) -> Release | None:
-    """Return the only release with a part in its name, or None; raise if there are several."""
+    """Return the only release whose name contains ``part``, or None; raise if several do."""
     found = {one.name: one for one in release_causes.releases(world) if part in one.name}
     return found[_only(part, [*found])] if found else None
 
 
 def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator[Match]:
-    """Yield the only release with a part in its name that no longer runs; raise if several."""
+    """Yield the only ended release whose name contains ``part``; raise if several do."""
     commit = str(snapshot.commit)
     found = sorted(name for name in repo.stopped_release_names(commit) if part in name)
     if found:
@@ -163,7 +163,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     if release is not None and path_of(release) == path:
         return Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
-        raise StateRepoError(f"{quoted(path)} is not in the state repo and never was")
+        raise StateRepoError(f"{quoted(path)} is not in the state repo and never was; correct it")
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return Match("file", path, path)
     return Match("claim" if claim_file.kind_of(path) else "release", name, path)

@@ -148,7 +148,7 @@ class Status:
         return cls(commit, rows, problems, known, repo.not_rendered(snapshot), old, missing)
 
     def amiss(self, clusters: Mapping[str, access.ClusterAccess]) -> str:
-        """Return the numbers of problems and unhealthy releases as text; empty without any."""
+        """Return how many problems and unhealthy releases there are, as text; empty if none."""
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
         failing = sum(row["failing"] for row in watched)
@@ -188,7 +188,7 @@ class Status:
 def _read(
     clusters: Mapping[str, access.ClusterAccess], domains: Iterable[ClusterDomain]
 ) -> dict[str, ObjectCache]:
-    """Read all clusters at the same time, so that an unreachable one does not delay the others."""
+    """Return the objects of each cluster; read all at once, so that none delays the others."""
     wanted: dict[str, dict[ObjectSelector, None]] = {}
     for domain in domains:
         watched = health_reader(domain).objects_to_watch(domain)

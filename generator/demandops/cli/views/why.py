@@ -73,10 +73,11 @@ def why(
 ) -> None:
     """Explain why something runs or ran.
 
-    Shown are the requesters, the configuration and overrides that apply, and the commits. NAME is
-    that of a release or a part that no other release has, the id of an application, connection,
-    demand, node or requester, or the name of an application definition or override. PATH is one
-    below clusters/ or ledger/. If it no longer runs, the commit that stopped it is shown.
+    The command shows the requesters, the configuration and overrides that apply, and the commits.
+    NAME is a release, or a part of its name that no other release has; the id of an application,
+    connection, demand, node or requester; or the name of an application definition or override.
+    PATH is a file below clusters/ or ledger/. For what no longer runs, the command shows the commit
+    that stopped it.
 
     \b
     Examples:
@@ -116,7 +117,7 @@ def _answer(
 
 
 def _missing(world: World, answer: dict[str, Any]) -> list[str]:
-    """Return why topics do not arrive that the answer's claims need."""
+    """Return why topics that the answer's claims need do not arrive."""
     files = {one["file"] for one in answer.get("claims", ())}
     found = (one for one in missing_inputs(world) if one.file in files)
     return list(dict.fromkeys(f"application '{one.application}': {one.reason}" for one in found))
@@ -262,7 +263,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped it."""
+    """Return the commits that started, changed and stopped what the name means."""
     if match.kind in ("node", "requester"):  # demandops log --node and --requester have them
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
@@ -275,7 +276,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 
 
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
-    """Return commits as JSON data, with people's commits that they carry out."""
+    """Return commits as JSON data, each with the people's commits that it renders."""
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:
         if entry is None:

@@ -1,8 +1,8 @@
 """The health of releases, from Argo CD's objects. Pure.
 
-Objects are plain data as the Kubernetes API returns them. Field names as of Argo CD 3.2
-(argoproj.io/v1alpha1). The status lags behind the spec, so it counts only if it is about the
-current spec: ``status.sync.comparedTo`` holds the source that it is about.
+Objects are plain data as the Kubernetes API returns them. The field names are
+those of Argo CD 3.2 (argoproj.io/v1alpha1). The status lags behind the spec. So it counts only if
+it is about the current spec: ``status.sync.comparedTo`` holds the source that it is about.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demandops.cluster.health.release_health import (
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""The most objects of a failed sync that a reason lists."""
+"""How many objects of a failed sync a reason lists at most."""
 
 
 class ArgoCd(HealthReader):

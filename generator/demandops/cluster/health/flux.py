@@ -1,7 +1,7 @@
 """The health of releases, from Flux's objects. Pure.
 
-Objects are plain data as the Kubernetes API returns them. Field names as of Flux 2.9
-(kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
+Objects are plain data as the Kubernetes API returns them. The field names are
+those of Flux 2.9 (kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ class HealthReader(ABC):
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far a service has started whose object exists."""
+        """Return how far a service whose object exists has started."""
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:

@@ -41,17 +41,17 @@ class Service(Deployed):
 
     @property
     def at_source(self) -> bool:
-        """Whether it runs at the sources of its inputs."""
+        """Whether the service runs at the sources of its inputs."""
         return self.placement == "source"
 
     @property
     def is_movable(self) -> bool:
-        """Whether an application may have it on another node than its own."""
+        """Whether the service may run on another node than its application."""
         return not self.at_source and not self.nodes
 
     @property
     def file(self) -> str:
-        """The file that defines it."""
+        """The file that defines the service."""
         return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"
 
 
@@ -142,7 +142,7 @@ def _place(service: Service, role: str) -> str:
 
 
 def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
-    """Set the roots of a service from those of the services that it reads."""
+    """Set the roots of a service from those of the services that it reads; yield the problems."""
     service, root = services[name], None
     made_from: dict[str, tuple[str, ...]] = {}
     for role, origin in service.inputs.items():

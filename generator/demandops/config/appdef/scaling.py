@@ -16,10 +16,10 @@ Count = Annotated[int, Field(ge=0, le=1000)]
 """A number of replicas."""
 
 Percent = Annotated[int, Field(ge=1, le=1000)]
-"""A share of what a pod requests; it may use more than that."""
+"""A share of what a pod requests, in percent; a pod may use more than it requests."""
 
 Measure = Literal["topics", "sources", "claims", "requesters"]
-"""What a service may have replicas for: one for each so many topics, sources and so on."""
+"""What may set the number of replicas: one replica for so many topics, sources and so on."""
 
 Resource = Literal["cpu", "memory"]
 """What an autoscaler measures."""
@@ -47,8 +47,8 @@ class Scaling(CamelModel):
     ``per`` gives one replica for that many topics, sources, claims or requesters, ``sizes`` as many
     as a parameter's value stands for. ``autoscaler`` has the targets of a HorizontalPodAutoscaler,
     in percent of what the pods request. ``divides_work`` says that replicas publish nothing twice.
-    More replicas start at once; with ``down_after`` the service keeps them for that time after the
-    demands needed them (:mod:`demandops.ledger.kept_replicas`).
+    More replicas start at once. With ``down_after`` the service keeps them for that time after the
+    last demand that needed them (:mod:`demandops.ledger.kept_replicas`).
     """
 
     min: Count = 1
@@ -109,7 +109,7 @@ class Scaling(CamelModel):
 
     @property
     def most(self) -> int:
-        """The highest number of replicas that it may give."""
+        """The highest number of replicas that the service may have."""
         if self.sizes:
             return max(self.sizes.replicas.values())
         return self.max if self.per or self.autoscaler else self.min

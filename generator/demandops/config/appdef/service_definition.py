@@ -115,8 +115,8 @@ class ServiceDefinition(Deployed, FileModel):
     def _consistent(self) -> ServiceDefinition:
         if bool(self.nodes) is not (self.scope == "cluster"):
             raise ValueError(
-                "scope 'cluster' needs nodes, the node of each cluster where it runs, and no other "
-                "scope may have them"
+                "scope 'cluster' needs 'nodes', the node of each cluster, and no other scope may "
+                "have it"
             )
         if self.placement == "source" and self.scope == "cluster":
             raise ValueError("scope 'cluster' runs at its nodes; leave out placement")
@@ -129,7 +129,7 @@ class ServiceDefinition(Deployed, FileModel):
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
         if self.place and self.scope != "application":
             raise ValueError(
-                "place needs the scope 'application': of any other scope, one instance serves "
+                "place needs the scope 'application': with any other, one instance serves "
                 "applications that would choose different nodes"
             )
         if problems := [*size_problems(self.scaling, self.parameters)]:

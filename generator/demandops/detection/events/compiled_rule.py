@@ -38,7 +38,7 @@ class CompiledRule:
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:
-        """Return whether the rule is for an entity, which one of its sources reports."""
+        """Return whether the rule is for an entity of one of its sources."""
         return self.is_for(who[1])
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
@@ -96,7 +96,7 @@ class ThresholdRule(CompiledRule):
 
 
 class AreaRule(CompiledRule):
-    """A rule on the distance to an area: an entity is near it, or is counted there."""
+    """A rule on the distance to an area, either of one entity or of a number of them."""
 
     def __init__(self, rule: Rule, condition: Near | Count) -> None:
         super().__init__(rule)
@@ -106,7 +106,7 @@ class AreaRule(CompiledRule):
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the position and the distance, or how many there are."""
+        """Return the position and the distance, or the number of entities."""
         named = self._named(subjects)
         if self.count is not None:
             return Facts({**named, "count": count}, f"{count} are there")
@@ -117,7 +117,7 @@ class AreaRule(CompiledRule):
 
 
 class PairRule(CompiledRule):
-    """A rule on the distance of two entities. Squares as wide as its stop distance find them."""
+    """A rule on the distance of two entities. It looks for them in squares of the stop distance."""
 
     def __init__(self, rule: Rule, condition: Together) -> None:
         super().__init__(rule)

@@ -35,7 +35,7 @@ class Observation(NamedTuple):
 
 
 class Event(NamedTuple):
-    """A demand is wanted from now on, or no longer.
+    """The start or the end of an event: a demand is wanted from now on, or no longer.
 
     ``values`` fill in the rule's template. ``why`` says for people what has happened.
     """

@@ -1,6 +1,7 @@
-"""One step of the engine: takes a copy of a state, applies observations and time, collects events.
+"""One step of the engine, which collects the events of observations and of passing time.
 
-Copies are cheap: the values in the mappings are immutable, and a step takes many observations.
+It changes a copy of the state. Copies are cheap: the values in the mappings are immutable, and a
+step takes many observations.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class EngineStep:
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Do what is due until then: end dwell times, lose silent entities, follow schedules."""
+        """Do what time makes due: end dwell times, lose silent entities, follow schedules."""
         while until >= self._due:
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
                 if at > until:

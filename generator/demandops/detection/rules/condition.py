@@ -64,7 +64,7 @@ def _refuse_distances(start: float, stop: float) -> None:
 
 
 class Near(_InArea):
-    """An entity is at most ``start`` metres away; it ends when it is more than ``stop`` away."""
+    """Starts when an entity is at most ``start`` metres away; ends when over ``stop``."""
 
     start: Metres
     stop: Metres
@@ -76,7 +76,7 @@ class Near(_InArea):
 
 
 class Together(CamelModel):
-    """Two entities are at most ``start`` metres apart; it ends when more than ``stop``.
+    """Starts when two entities are at most ``start`` metres apart; ends when over ``stop``.
 
     They are of the same source, or the second one is of the source ``other``.
     """
@@ -93,7 +93,7 @@ class Together(CamelModel):
 
 
 class Count(_InArea):
-    """At least ``start`` entities are within ``radius`` of an area; it ends at ``stop`` or less."""
+    """Starts with ``start`` or more entities within ``radius``; ends with ``stop`` or fewer."""
 
     radius: Metres = 0.0
     start: Positive
@@ -104,12 +104,12 @@ class Count(_InArea):
         if self.stop >= self.start:
             raise ValueError(f"stop {self.stop} must be below start {self.start}")
         if self.point is not None and not self.radius:
-            raise ValueError("radius is missing: nothing is exactly at a point")
+            raise ValueError("radius is missing, and nothing is exactly at a point; add it")
         return self
 
 
 class Threshold(CamelModel):
-    """A number is above or below a limit; it ends when it is back at ``stop``."""
+    """Starts when a number is above or below a limit; ends when it is back at ``stop``."""
 
     source: DnsLabel
     field: FieldPath
@@ -122,9 +122,13 @@ class Threshold(CamelModel):
         if (self.above is None) == (self.below is None):
             raise ValueError("needs either above or below")
         if self.above is not None and self.stop > self.above:
-            raise ValueError(f"stop {self.stop:g} must be at most above {self.above:g}")
+            raise ValueError(
+                f"stop {self.stop:g} must be at most {self.above:g}, the value of above"
+            )
         if self.below is not None and self.stop < self.below:
-            raise ValueError(f"stop {self.stop:g} must be at least below {self.below:g}")
+            raise ValueError(
+                f"stop {self.stop:g} must be at least {self.below:g}, the value of below"
+            )
         return self
 
 
@@ -142,7 +146,7 @@ def _zone(text: str) -> ZoneInfo:
 
 
 class Hours(CamelModel):
-    """From a time of day to another one, on some days of the week."""
+    """Lasts from a time of day to another one, on some days of the week."""
 
     days: Annotated[
         tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],

@@ -63,7 +63,8 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
         for name, value in stable:
             for path, text in rule_template.texts(value, f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
-                    yield fault(path, f"'{{{changing[0]}}}' changes; an id must stay the same")
+                    message = f"'{{{changing[0]}}}' changes, but an id must stay the same; "
+                    yield fault(path, f"{message}leave it out")
     else:
         yield from _missing(data, field, "id")
         why = "a shutdown finds its claims by their requesters"

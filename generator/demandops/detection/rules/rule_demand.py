@@ -26,12 +26,12 @@ class Goal:
 
     @property
     def id(self) -> str:
-        """The id by which people know it: the demand's, or the request's."""
+        """The id by which people know the goal: the demand's, or the request's."""
         return str(self.data["demand" if self.action == "demand" else "id"])
 
     @property
     def requesters(self) -> tuple[str, ...]:
-        """All requesters that it names, sorted."""
+        """All requesters that the goal names, sorted."""
         return tuple(sorted({*requesters_in(self.action, self.data)}))
 
     @property
@@ -84,7 +84,7 @@ class RuleDemand:
         return Goal(self.action, filled(self.data, values))
 
     def names(self) -> set[str]:
-        """Return the names in braces that it uses, such as ``entity``."""
+        """Return the names in braces that the template uses, such as ``entity``."""
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:

@@ -33,7 +33,7 @@ POSITIONS: Mapping[str, tuple[str, str]] = {
     "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
     "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
 }
-"""Where the messages of a type have x and y, unless the source says it."""
+"""The fields with x and y in messages of a type, unless the source names them."""
 
 
 class Source(CamelModel):
@@ -55,8 +55,8 @@ class Source(CamelModel):
     def _names_entities(self) -> Source:
         if ("{entity}" in self.topic) == bool(self.entity):
             raise ValueError(
-                "needs the name of the entity once: {entity} as a part of topic, or the field with "
-                "it in entity"
+                "needs the name of the entity once: write {entity} as a part of topic, or name in "
+                "entity the field that has it"
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
@@ -66,7 +66,7 @@ class Source(CamelModel):
 
     @property
     def position(self) -> tuple[str, str] | None:
-        """The fields with x and y, or ``None`` if its entities have no position."""
+        """The fields with x and y, or ``None`` if the entities have no position."""
         return (self.x, self.y) if self.x and self.y else POSITIONS.get(self.type)
 
 
@@ -103,21 +103,23 @@ class Rule(CamelModel):
         if (self.demand is None) == (self.deployment_request is None):
             raise ValueError("needs either demand or deploymentRequest")
         if self.renew and self.demand is not None:
-            raise ValueError("renew is for a deploymentRequest; a demand is renewed by its lease")
+            raise ValueError(
+                "renew is for a deploymentRequest; leave it out, because a demand has its lease"
+            )
         if seconds_of(self.retry) < 1 or (self.renew and seconds_of(self.renew) < 1):
             raise ValueError("retry and renew must be one second or more")
         return self
 
     @property
     def condition(self) -> Near | Together | Count | Threshold | Hours:
-        """Its only condition."""
+        """The only condition of the rule."""
         found = self.near or self.together or self.count or self.threshold or self.schedule
         assert found is not None  # noqa: S101 - validated above
         return found
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The sources that its condition reads: none, one, or two for ``together``."""
+        """The sources that the rule's condition reads: none, one, or two for ``together``."""
         named = (getattr(self.condition, name, None) for name in ("source", "other"))
         return tuple(name for name in named if name)
 
@@ -137,7 +139,7 @@ class Rule(CamelModel):
 
     @property
     def template(self) -> RuleDemand:
-        """The template of its demand or deploymentRequest."""
+        """The template of the rule's demand or deploymentRequest."""
         if self.demand is not None:
             return RuleDemand("demand", self.demand)
         return RuleDemand("deployment_request", self.deployment_request or {})
@@ -177,7 +179,7 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in seen:
-            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule a name")
+            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule its own")
         seen.add(rule.name)
         kind = next(name for name in CONDITIONS if getattr(rule, name) is not None)
         for part in ("source", "other"):

@@ -18,7 +18,7 @@ class Schedule:
     zone: tzinfo
 
     def is_on(self, now: float) -> bool:
-        """Return whether ``now``, in seconds since 1970 UTC, is in its hours."""
+        """Return whether ``now``, in seconds since 1970 UTC, is in the hours."""
         local = datetime.fromtimestamp(now, self.zone)
         clock, today = local.time(), local.weekday()
         if self.start < self.end:

@@ -72,7 +72,7 @@ def _of_routes(one: Demanded, demanded: Connection, claim: Claim, held: str) -> 
             yield one.fault(
                 f"{where}.target",
                 f"'{route.target}' is carried back to '{other.source}' already: {held}; one topic "
-                "goes to one place, use a second connection",
+                "goes to one place, so use a second connection",
                 code="conflict",
             )
 
@@ -84,7 +84,7 @@ def _of_route(
         yield one.fault(
             f"{where}.target",
             f"'{route.source}' goes to '{current.target}' already: {held}; one source topic has "
-            "one target, use a second connection",
+            "one target, so use a second connection",
             code="conflict",
         )
     for name, old, new in routes.contradictions(current, route):

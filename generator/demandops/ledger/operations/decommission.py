@@ -20,10 +20,12 @@ from demandops.subject import Subject, SubjectKind
 
 
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Release all claims of a node or a requester, and the demands that wait for it alone.
+    """Return the ledger without the claims of a node or requester, and the changes.
+
+    Demands that wait for this requester alone stop waiting.
 
     Raises:
-        Refused: if it holds nothing.
+        Refused: if the node or requester holds nothing.
     """
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)

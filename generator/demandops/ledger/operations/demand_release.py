@@ -9,7 +9,7 @@ from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
-    """Release all claims of a demand; if it waits for room, it stops waiting.
+    """Return the ledger without the claims of a demand, waiting or not, and the changes.
 
     Raises:
         Refused: if the demand holds nothing or belongs to other requesters.

@@ -1,4 +1,4 @@
-"""A drain: moves placed applications, with their connections, off a node that is drained.
+"""A drain moves placed applications, with their connections, off a node that is drained.
 
 The generator requests it. :mod:`demandops.plan.nodes.relocation` works out the claims that change.
 """
@@ -14,7 +14,7 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class Drain(DemandRequest):
-    """The generator moves applications that it placed off the drained node ``id``.
+    """The generator's request to move applications that it placed off the drained node ``id``.
 
     ``moves`` are the changes of claims, ``moved`` says what is placed where, ``stays`` what is not
     moved and why.

@@ -1,4 +1,4 @@
-"""An expiry: releases the claims whose lease has ended. The generator requests it."""
+"""An expiry releases the claims whose lease has ended. The generator requests it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from demandops.ledger.ledger import Ledger
 
 
 def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:
-    """Release the claims of a demand whose lease has ended; none if it was renewed meanwhile."""
+    """Return the ledger without the claims of a demand whose lease has ended, and the changes."""
     held = ledger.claims_of_demand(request.demand)
     ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
     after = ledger.without(ended)

@@ -15,7 +15,7 @@ from demandops.ledger.operations.conflicts import conflicts
 
 
 def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]:
-    """Book a whole request, in addition to what its demand holds.
+    """Return the ledger with a request added to what its demand holds, and the changes.
 
     Raises:
         Refused: with every conflict with an existing claim.

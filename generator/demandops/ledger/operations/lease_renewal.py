@@ -13,9 +13,9 @@ from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
-    """Renew each lease of a demand for its own term; claims without a lease stay as they are.
+    """Return the ledger with each lease of a demand renewed for its term, and the changes.
 
-    A waiting demand has no lease yet, and keeps its place.
+    Claims without a lease stay as they are. A waiting demand has no lease yet, and keeps its place.
 
     Raises:
         Refused: if the demand holds nothing or belongs to other requesters.

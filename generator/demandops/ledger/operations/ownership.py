@@ -17,7 +17,7 @@ def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
     """Return whether the request's demand waits for room.
 
     Raises:
-        Refused: if it belongs to other requesters.
+        Refused: if the demand belongs to other requesters.
     """
     waiting = ledger.waiting.get(request.demand)
     if waiting is not None:

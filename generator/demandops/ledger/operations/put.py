@@ -15,7 +15,7 @@ from demandops.ledger.operations.ownership import is_waiting, refuse_other_owner
 
 
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
-    """Book the items that ``request`` lists; release all other claims of the demand.
+    """Return the ledger in which the demand holds only what ``request`` lists, and the changes.
 
     Raises:
         Refused: if the demand belongs to other requesters or conflicts with other demands.

@@ -21,7 +21,9 @@ from demandops.subject import TopicKey
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Take the holds that a shutdown names; none if it repeats one of the last 15 minutes.
+    """Return the ledger without the holds that a shutdown names, and the changes.
+
+    A shutdown that repeats one of the last 15 minutes changes nothing.
 
     Raises:
         Refused: if the requesters hold none of them.

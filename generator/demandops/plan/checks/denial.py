@@ -1,7 +1,7 @@
 """``deny``: a demand that an override denies is refused, with the reason and the owner.
 
-A demand that only repeats existing claims renews them. That is always allowed; it gets a warning
-that they are suspended.
+A demand that only repeats existing claims renews them. Such a demand is always allowed, and gets a
+warning that the claims are suspended.
 """
 
 from __future__ import annotations

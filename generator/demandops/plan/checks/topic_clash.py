@@ -75,7 +75,7 @@ def _of_service(
     for name, topic, clash, remedy in islice(clashes, 1):
         yield fault(
             _field(request, key, service),
-            f"its {name} is {topic}, which {clash} '{key.node}' already; {remedy}",
+            f"its output {name} is {topic}, which {clash} '{key.node}' already; {remedy}",
             code="conflict",
         )
 
@@ -123,7 +123,8 @@ def _of_deliveries(one: Demanded, app: Application, after: World) -> Iterator[Fa
             if other is not None and {*other.nodes} != {flow.sender, flow.receiver}:
                 yield one.fault(
                     f"deliver[{flow.delivery}].output",
-                    f"{flow.target} comes to '{flow.receiver}' by '{id}' already; leave it out",
+                    f"{flow.target} comes to '{flow.receiver}' by connection '{id}' already; leave "
+                    "it out",
                     code="conflict",
                 )
                 continue

@@ -49,12 +49,12 @@ class Difference:
     """The fault to report if the policy refuses the difference."""
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether it matters to a demand; one that names no version takes a newer one."""
+        """Return whether a demand minds the difference; one without a version takes a newer one."""
         return bool(asked) or self.newer or self.is_refused
 
     @property
     def is_refused(self) -> bool:
-        """Whether the policy refuses it."""
+        """Whether the policy refuses the difference."""
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
@@ -141,7 +141,7 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim that asks for a version, and how it names it."""
+    """Return the requesters of the first claim on a version, and the claim's name for that."""
     for claim in ledger.claims_on(subject):
         word = claim.application.version
         if same_version(known.get(word, known[""]), version):

@@ -1,1 +1,1 @@
-"""Nodes: what runs where: the choice, its capacity, and moves to other nodes."""
+"""Nodes of applications and services: their choice, their capacity, and moves to others."""

@@ -50,7 +50,7 @@ class Usage:
 
 
 def whole_usage(world: World) -> Usage:
-    """Return what all services request; empty without planning if no node has a capacity."""
+    """Return what all services request; empty if no node has a capacity."""
     if not world.config.limits_capacity:
         return Usage()
     keys: dict[ReleaseKey, None] = {}
@@ -128,8 +128,8 @@ def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[
     """Yield a fault for each capacity that would be exceeded; see :func:`excesses`."""
     for node, excess in excesses(usage, grown, config):
         message = (
-            f"'{node}' {excess}; choose another node, release something first, or have "
-            f"{config.place_of(NODES_FILE)} changed"
+            f"'{node}' {excess}; choose another node, release something first, or ask "
+            f"for a change of {config.place_of(NODES_FILE)}"
         )
         yield fault("", message, code="capacity")
 
@@ -185,8 +185,8 @@ class Room:
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
         """Return what an application's own services request, which is the same on each node.
 
-        It shows that a node is full without planning all services there. It is empty if there are
-        overrides whose effects may differ by node.
+        A caller compares it with a node's room before it plans all services there. It is empty if
+        there are overrides whose effects may differ by node.
         """
         subject, world = claims[0].subject, self._world
         if any(one.node or one.deny or one.replicas is not None for one in world.overrides):

@@ -31,14 +31,14 @@ NO_ROOM = "no-room"
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A node, and why it is this one, for people."""
+    """A chosen node, and the reason of the choice, for people."""
 
     node: str
     why: str
 
 
 Positions = Mapping[str, Position]
-"""Where nodes are that have no position in the inventory."""
+"""The positions of nodes that have none in the inventory."""
 
 
 def requirement_of(service: Service) -> Requirement:
@@ -154,7 +154,7 @@ class Choice:
         return f"with the {'most' if choose == 'pack' else 'fewest'} applications"
 
     def _is_home(self, node: Node) -> bool:
-        """Return whether a service is placed, and this is the node of its application."""
+        """Return whether the choice is for a service, and the node is its application's."""
         return self.service is not None and node.id == self.app.node
 
     def _rank(
@@ -227,7 +227,7 @@ class Choice:
         more = [f"{len(misses) - len(shown)} more do not"] if len(misses) > len(shown) else []
         message = f"no node fits: {'; '.join([*shown, *more]) or 'there is none'}"
         less = f"change place in {self.service.file}" if self.service else "ask for less"
-        message += f"; {less}, or have {self.config.place_of(NODES_FILE)} changed"
+        message += f"; {less}, or ask for a change of {self.config.place_of(NODES_FILE)}"
         return self._fault(message, code)
 
     def _fault(self, message: str, code: str) -> Fault:

@@ -1,8 +1,8 @@
-"""Moved connections: what carried the topics of an application that moves still does so afterwards.
+"""Moved connections: when an application moves, its demands' connections follow it.
 
-What a demand's connections brought to the old node, or took from it, comes to the new one, with the
-same type and options. What nothing carried is not carried afterwards either. The reference's
-requests list their connections themselves, so theirs are left as they are.
+They bring the same topics to the new node, or take them from it, with the same type and options. A
+topic that no connection carried still has none. The reference's requests list their connections
+themselves, so a move does not change those.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Move = Callable[[Application], Application]
 def with_moved(
     world: World, claims: Iterable[Claim], move: Move
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with an application and its connections moved, and what changes."""
+    """Return the world with an application and its connections moved, and the changed claims."""
     ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
@@ -43,7 +43,7 @@ def with_moved(
 
 
 def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which what a demand's connections carried is carried after the move."""
+    """Return the ledger in which a demand's connections follow a move, and the changed keys."""
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application
     old, new = (flows(config, each) for each in (app, move(app)))

@@ -1,7 +1,7 @@
 """Placement: the nodes of a demand's applications and services, where it does not name them.
 
-They are decided before the booking, by the configuration and the claims at that commit alone. The
-claim holds the nodes as if the demand had named them, so nothing after this knows the difference.
+The configuration and the claims at a commit alone decide them, before the booking. The
+claim holds the nodes as if the demand had named them, so no later stage knows the difference.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def with_chosen_nodes(
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
-    What is booked stays where it is, if the node has what is required. Otherwise it gets one of the
-    nodes that fit and have room, the first by ``placement`` of the settings. Last, overrides move
-    services.
+    What is booked stays where it is, if the node has what is required. Otherwise it gets the
+    first of the nodes that fit and have room, in the order of ``placement`` in the settings. Last,
+    overrides move services.
 
     Args:
         request: the request.
@@ -75,7 +75,7 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
 def _overridden(app: Application, world: World) -> Application:
     """Return an application with its services where overrides move them.
 
-    What is booked there stays as it is: only a changed override or definition moves it.
+    A booked service stays where it is: only a changed override or definition moves it.
     """
     booked = world.ledger.application(app.id)
     if booked is not None and replace(app, moved=booked.moved).decided_like(booked):
@@ -109,7 +109,7 @@ def _placed(request: AnyRequest, world: World, usage: Usage) -> tuple[AnyRequest
 
 
 def _without_services(one: Demanded, world: World) -> Demanded:
-    """Return an application whose services that get nodes of their own are nowhere yet."""
+    """Return an application without the nodes of services that get nodes of their own."""
     if not isinstance(one.held, Application):
         return one
     services = {service.name: "" for service in _services_to_place(one.held, world)}
@@ -119,8 +119,8 @@ def _without_services(one: Demanded, world: World) -> Demanded:
 def may_wait(request: DemandRequest, world: World) -> bool:
     """Return whether a demand that lacks room may wait.
 
-    Each of its applications and services that is placed fits a node of a domain that lets it wait,
-    and needs no approval there: a person approves what is there to be booked.
+    Each application and service to place must fit a node of a domain that lets demands wait, and
+    must need no approval there: a person approves only what can be booked now.
     """
     return all(
         any(_waits_for(node, request, choice) for node in choice.nodes())
@@ -176,7 +176,7 @@ def _positions(request: DemandRequest) -> Positions:
 
 
 def _named(choice: Choice) -> Fault | None:
-    """Return why the node that the demand names lacks what the demand requires as well."""
+    """Return the fault if the demand names a node that lacks what it also requires."""
     node = choice.config.nodes.get(choice.app.node)
     lacking = list(lacks(node, choice.requirement)) if node else []  # admission reports no node
     if not lacking:
@@ -189,7 +189,7 @@ def _named(choice: Choice) -> Fault | None:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node where it is booked; ``None`` if ``demand`` may get another one."""
+    """Return the node of the booked application or service; ``None`` if it may get another."""
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None
@@ -210,16 +210,16 @@ def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
 
 
 def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
-    """Return a claim of another demand; what an override keeps is nobody's."""
+    """Return a claim of another demand; a claim that an override keeps is of no demand."""
     return next((c for c in claims if c.demand != demand and not c.keeping_override), None)
 
 
 def _with_services(
     request: DemandRequest, one: Demanded, world: World, room: Room
 ) -> tuple[Demanded, list[Fault]]:
-    """Return a demanded application with its services on nodes of their own, and what does not fit.
+    """Return a demanded application with its services on nodes of their own, and the faults.
 
-    What others hold as well, or a join adds to, stays as it is booked.
+    If other demands hold the application too, or a join adds to it, its services stay.
     """
     app = one.held
     assert isinstance(app, Application)  # noqa: S101 - the caller knows

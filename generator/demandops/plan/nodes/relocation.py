@@ -147,7 +147,7 @@ class Followed:
 
 
 def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> Followed:
-    """Return the ledger with services, and their connections, where overrides move them to.
+    """Return the ledger with services and their connections where overrides move them.
 
     Args:
         world: the claims and the configuration.
@@ -185,7 +185,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a rollback of which the claims have services where overrides move them to now."""
+    """Return a rollback whose claims have services where overrides now move them."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims
@@ -208,7 +208,7 @@ def _all_moved(
 
 
 def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
-    """Yield for each override that would move a service of an application that it does not."""
+    """Yield the file of each override that fails to move a service of an application, and why."""
     app = world.ledger.application(id)
     assert app is not None  # noqa: S101 - it is claimed
     wanted = with_overridden_nodes(app, world).moved
@@ -247,7 +247,7 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
     """Yield a fault for each output that comes to a node by this connection and from another node.
 
-    Inputs may: the demands say which sources they want.
+    Inputs may come from several nodes: the demands say which sources they want.
     """
     if claim.is_on_application:
         return

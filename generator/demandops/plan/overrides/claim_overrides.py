@@ -4,8 +4,8 @@ A suspended claim stays booked but is not planned. The planner reads a view of t
 checks each claim when it is read. So there is no second ledger to keep up to date.
 
 When the last claim on a subject is released, ``keep`` books a claim with the same content for the
-override's owner. It is removed when a demand asks for the subject again. Because it is a claim,
-bookkeeping and history show it like any other.
+override's owner. A later demand for the subject replaces it. Because it is a claim, bookkeeping and
+history show it like any other.
 """
 
 from __future__ import annotations
@@ -201,7 +201,9 @@ def with_kept_claims(
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger with exactly the kept claims that overrides ask for, and their keys.
+    """Return the ledger with the kept claims that overrides ask for on ``subjects``, no others.
+
+    The keys of the kept claims before and after come with it.
 
     Args:
         before: the ledger before a change.

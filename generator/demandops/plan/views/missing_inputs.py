@@ -28,12 +28,12 @@ class MissingInput:
 
     @property
     def warning(self) -> Fault:
-        """Return it as a warning, in the claim's file."""
+        """Return the missing input as a warning, located in the claim's file."""
         return fault(f"application '{self.application}'", self.reason).within(self.file)
 
 
 def missing_inputs(world: World) -> list[MissingInput]:
-    """Return what does not arrive, sorted; suspended claims need nothing."""
+    """Return the inputs that do not arrive, sorted; suspended claims need nothing."""
     active = without_suspended(world)
     found = {
         MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)

@@ -43,7 +43,7 @@ def warnings(world: World) -> Iterator[Fault]:
 
 
 def _drained(world: World) -> Iterator[Fault]:
-    """Yield for each drained node which of its applications will move, and which will stay."""
+    """Yield a warning for each drained node: which applications will move, and which stay."""
     for node in world.config.drained_nodes:
         if world.ledger.applications_on.get(node):
             drain = with_moves(Drain(node), world, whole_usage(world))
@@ -120,7 +120,7 @@ def _listed(ids: list[str]) -> str:
 
 
 def _charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each kind in a chart of the state repo that a domain may not use."""
+    """Yield a warning for each kind that a chart has and its access domain may not use."""
     for folder, domains in sorted(_domains_of_charts(config).items()):
         yield from _dependencies(folder, config.files)
         texts = {path: text for path, text in config.files.items() if path.startswith(f"{folder}/")}

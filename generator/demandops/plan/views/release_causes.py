@@ -50,7 +50,7 @@ def needs(claim: Claim, release: Release) -> bool:
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return the versions that claims on its applications name, and who asks for each."""
+    """Return the versions that claims on a service's applications name, and who asks for each."""
     found: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:

@@ -44,7 +44,7 @@ class TracedPlan:
     def advance(
         self, ledger: Ledger, changes: Iterable[ClaimChange], kept: Iterable[Instance] = ()
     ) -> dict[ReleaseKey, Release | None]:
-        """Plan the releases again that the changes may affect; the first time, all of them.
+        """Plan again the releases that the changes may affect; at the first call, all releases.
 
         Args:
             ledger: the ledger after the changes.

@@ -13,7 +13,7 @@ from demandops.quoting import quoted
 def warnings(config: Config) -> Iterator[Fault]:
     """Yield a warning for each pattern of an access domain that matches nothing.
 
-    Patterns of requesters are not checked, because the repo has no list of requesters.
+    It does not check patterns of requesters, because the repo has no list of requesters.
     """
     for name, domain in sorted(config.domains.items()):
         file = config.file_of(DOMAINS_FILE, name)
@@ -27,7 +27,7 @@ def warnings(config: Config) -> Iterator[Fault]:
 def _patterns(
     domain: AccessDomain, config: Config
 ) -> Iterator[tuple[str, str, str, tuple[str, ...]]]:
-    """Yield (field, pattern, what it should match, their names)."""
+    """Yield (field, pattern, the kind of things that it should match, the names of these)."""
     own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == domain.name))
     others = tuple(sorted(config.domains.keys() - {domain.name}))
     nodes = tuple(sorted(config.nodes))

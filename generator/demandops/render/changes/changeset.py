@@ -46,7 +46,7 @@ class ReleaseChange:
 
     @property
     def order(self) -> tuple[int, str]:
-        """Its place in a list of changes."""
+        """The key by which a list of changes is sorted."""
         return CHANGE_ORDER.index(self.change), self.name
 
 
@@ -61,7 +61,7 @@ class Changeset:
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """The releases that may differ, as they are now."""
+    """The releases that may differ, as they are after the change."""
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
     """The same releases as they were before."""
 
@@ -139,8 +139,8 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
         if size > max(most, len((read(path) or "").encode()) if size > most else 0):
             message = (
-                f"would have {size} bytes; at most {most} are allowed; demand less of it, or have "
-                f"a platform engineer raise limits.fileBytes in {ROOT_FILE}"
+                f"would have {size} bytes; at most {most} are allowed; demand less of it, or ask "
+                f"a platform engineer to raise limits.fileBytes in {ROOT_FILE}"
             )
             faults.append(fault("", message, code="too-large").within(path))
     if faults:

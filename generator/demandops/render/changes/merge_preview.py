@@ -1,7 +1,7 @@
 """The releases and files that differ between two commits, or before and after a merge. Pure.
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
-may affect any release, so this compares all of them. The files decide whether a release differs,
+may affect any release, so this module compares all. The files decide whether a release differs,
 because the clusters follow the files. The plans of both sides describe the difference.
 """
 
@@ -40,7 +40,7 @@ class FileChange:
 
     @property
     def change(self) -> Literal["added", "changed", "removed"]:
-        """How it changes."""
+        """How the file changes."""
         if self.before is None:
             return "added"
         return "removed" if self.after is None else "changed"

@@ -1,6 +1,6 @@
 """Manifests for Argo CD: one Application for each service and one for each access domain's folder.
 
-Fields of argoproj.io/v1alpha1 as of Argo CD 3.2. Each cluster has its own Argo CD. The
+The fields are those of argoproj.io/v1alpha1 in Argo CD 3.2. Each cluster has its own Argo CD. The
 Applications of services are in the access domain's namespace. In Argo CD's own namespace they could
 name another domain's project (docs/decisions/0011).
 """

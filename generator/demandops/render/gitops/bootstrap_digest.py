@@ -1,6 +1,6 @@
-"""The digest of a bootstrap file: an annotation by which a cluster tells which one it has. Pure.
+"""The digest of a bootstrap file: an annotation that says which version a cluster has. Pure.
 
-Nobody but a person applies the file, so the cluster may have an older one. The object that applies
+Only a person applies the file, so the cluster may have an older one. The object that applies
 an access domain's folder carries the digest, and ``demandops status`` compares it.
 """
 
@@ -19,7 +19,7 @@ _LENGTH = 16
 
 
 def with_digest(render: Callable[[str], str]) -> str:
-    """Return the file that ``render`` returns for the digest of its objects; comments are none."""
+    """Return the file that ``render`` returns, given the digest of its objects without comments."""
     objects = json.dumps(list(strict_yaml.load_all(render(""))), sort_keys=True)
     return render(hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH])
 

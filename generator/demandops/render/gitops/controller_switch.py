@@ -1,8 +1,8 @@
 """The steps on the clusters when a state repo is upgraded, or switches to Flux or Argo CD.
 
 Pure: returns instructions and commands for a person. The order matters. A running controller would
-remove the workloads when its releases leave the repo, so it is stopped first. Its objects are
-deleted only after the other controller has taken over.
+remove the workloads when its releases leave the repo, so the person stops it first. The
+person deletes its objects only after the other controller has taken over.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class SwitchSteps:
-    """The steps before the state repo changes, and those after."""
+    """What a person does on the clusters, before and after the state repo changes."""
 
     before: tuple[Step, ...] = ()
     after: tuple[Step, ...] = ()

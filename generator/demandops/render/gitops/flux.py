@@ -1,7 +1,8 @@
 """Manifests for Flux: one HelmRelease for each service, one source for each chart and domain.
 
-Fields of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 as of Flux 2.9. Requesters are
-not in the manifests, so one more requester of a running service changes only the ledger.
+The fields are those of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 in Flux 2.9.
+Requesters are not in the manifests, so one more requester of a running service changes only the
+ledger.
 """
 
 from __future__ import annotations

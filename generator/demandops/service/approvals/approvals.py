@@ -1,8 +1,8 @@
 """The proposals that await approval, and how each one ends.
 
-Runs in the worker thread. A proposal is complete once main has its claims, by any kind of merge.
-Until then the branch is kept up to date, so that merging it gives what main would render. A
-:class:`Proposal` decides its verdict; this module carries it out.
+It runs in the worker thread. A proposal is complete once main has its claims, by any kind of merge.
+Until then this module keeps the branch up to date, so that merging it gives what main would render.
+A :class:`Proposal` decides its verdict; this module carries it out.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Remove the proposals that demands of a batch release; call it before it is evaluated.
+        """Remove the proposals that demands of a batch release; call this before the evaluation.
 
         Nobody can merge a proposal without its branch. If it was merged earlier, the demands are
         evaluated on a tip that has the merge.
@@ -147,7 +147,7 @@ class Approvals:
         if proposal is None and (full := self._requester_with_most(request)):
             message = (
                 f"{PROPOSAL_LIMIT} demands of {quoted(full)} await approval already; release some, "
-                "or have them decided"
+                "or ask a person to decide about them"
             )
             self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
             return
@@ -195,7 +195,7 @@ class Approvals:
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Fetch the commits of the branches, and plan the next check even if this one fails.
+        """Fetch and return the commits of the branches; plan the next check even if this fails.
 
         Raises:
             RemoteAway: if the remote cannot be reached.
@@ -325,7 +325,7 @@ class Approvals:
     def _bring_up_to_date(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
-        """Commit the demands on main and push the branch, unless it is up to date."""
+        """Commit the demands on main and push the branch; return False if one was withdrawn."""
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(verdict.waiting, snapshot.state, commits.read)
         verdict.failed.extend(failed)

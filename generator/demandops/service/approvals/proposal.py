@@ -80,7 +80,7 @@ class Proposal:
         head: str,
         pull_request: PullRequest | None,
     ) -> Verdict:
-        """Return the verdict on its demands.
+        """Return the verdict on the proposal's demands.
 
         A demand is booked if the history of main has its operation id, or if the ledger has its
         claims: a squash merge may lose the trailer.
@@ -132,7 +132,7 @@ class Proposal:
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
 
     def requesters(self) -> set[str]:
-        """Return the requesters of its demands."""
+        """Return the requesters of the proposal's demands."""
         return {name for request in self.requests for name in request.requesters()}
 
 

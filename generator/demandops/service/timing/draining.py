@@ -15,7 +15,7 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 log = logging.getLogger("demandops")
 
 _RETRY = timedelta(seconds=60)
-"""The pause before moving the applications that stayed on a drained node is tried again."""
+"""The pause before a retry to move the applications that stayed on a drained node."""
 
 
 class Draining:

@@ -30,7 +30,7 @@ _SHORTEST_S = 1.0
 LONGEST_WAIT_S = 60.0
 """The longest time between two checks of the leases, because the clock may be set meanwhile."""
 _RETRY = timedelta(seconds=LONGEST_WAIT_S)
-"""The pause before a failed release of claims, or a failed end of an override, is tried again."""
+"""The pause before a retry of a failed release of claims, or of a failed end of an override."""
 
 
 class LeaseExpiry:
@@ -81,8 +81,8 @@ class LeaseExpiry:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        Never zero, because an ended lease stays in the ledger if its release failed or if it was
-        granted more time.
+        It is never zero, because an ended lease stays in the ledger if its release failed or if
+        it was granted more time.
         """
         first = ledger.first_to_end()
         if first is not self._first:  # many leases may end in one minute

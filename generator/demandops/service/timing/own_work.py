@@ -1,4 +1,4 @@
-"""What the generator commits by itself when it is due, and nobody demands it."""
+"""What the generator commits by itself when it is due, without a demand."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class OwnWork:
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """Commit nothing that ends for a while, because the commits could not be published."""
+        """End nothing for a while, because the commits could not be published."""
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
 

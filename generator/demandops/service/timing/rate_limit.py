@@ -1,6 +1,6 @@
 """How many demands a requester may send in a minute, by the quotas of the access domains.
 
-Counts the demands that this generator received, each once however often it is evaluated.
+It counts each demand that this generator received once, however often it is evaluated.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """When the demands that wait for room are tried again, and in which order.
 
-When a state may have room for them, they are tried before any other demand is decided. So no demand
+When a state may have room for them, the generator tries them before it decides others. So no demand
 gets the room for which an earlier one, or one of a higher priority, was waiting.
 """
 

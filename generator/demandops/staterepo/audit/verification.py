@@ -179,7 +179,7 @@ def _loaded(repo: Repository, entry: LogEntry) -> State:
 
 
 def _differing_whole(commit: Commit, state: State) -> tuple[str, ...]:
-    """Render a commit whole, without the results of another one."""
+    """Return the differing files of a commit, rendered whole without results of another one."""
     before = trees.parent_tree(commit) if _holds(state) else None
     held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
     wanted = {path: _blob(text) for path, text in rendered_files(state, held).items()}

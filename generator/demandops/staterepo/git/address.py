@@ -40,7 +40,7 @@ def connect(
     allow_offline: bool = False,
     only_read: bool = False,
 ) -> StateRepository:
-    """Open the state repo at a bare repository's folder, or at a URL that git clones to ``folder``.
+    """Return the state repo in a bare repository, or at a URL that git clones to ``folder``.
 
     Args:
         notify: called with a text before work that takes a while.

@@ -53,7 +53,7 @@ class Checkout(LocalRepository):
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Refuse: a generator writes to a bare repository or through a URL."""
-        raise PushDenied(f"{self.address} is a checkout, which is only read; name its remote")
+        raise PushDenied(f"{self.address} is a checkout, which commands only read; name its remote")
 
 
 class LastFetch(LocalRepository):

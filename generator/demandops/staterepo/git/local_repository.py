@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import (
 )
 
 _STALE_LOCK_S = 5.0
-"""Git holds a branch's lock for milliseconds. One this old was left by a killed process."""
+"""Git holds a branch's lock for milliseconds. If one is this old, a killed process left it."""
 
 log = logging.getLogger("demandops")
 
@@ -56,7 +56,7 @@ class LocalRepository(StateRepository):
         )
 
     def renew_if_damaged(self) -> bool:
-        """Raise StateRepoError if git finds it damaged; a repository on this disk has no copy."""
+        """Return False; raise StateRepoError if git finds damage, because there is no copy."""
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
@@ -99,7 +99,7 @@ class LocalRepository(StateRepository):
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Move the branch if it still is at ``expected``, checked under Git's lock."""
+        """Move the branch and return True, if under Git's lock it still is at ``expected``."""
         reference = self.objects.references[MAIN]
         if reference.target != expected:
             return False
@@ -140,7 +140,7 @@ class LocalRepository(StateRepository):
     def _break_stale_lock(self) -> None:
         """Remove the branch's lock if a killed process left it.
 
-        Its age is measured by a clock that nobody sets, from when it was first seen here.
+        The lock's age counts from when this process first saw it, by a clock that nobody sets.
         """
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:

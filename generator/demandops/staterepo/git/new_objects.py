@@ -1,8 +1,8 @@
 """New objects of a state repo: in memory until one pack makes them durable.
 
-A pack costs a few syncs, however many commits a batch has; loose objects cost some for each object.
+A pack costs a few syncs, however many commits a batch has; loose objects cost some syncs each.
 The pack holds every object that its commits need and their parent lacks, also those that the repo
-has already: a loose object may not be on the disk yet, or about to be pruned.
+has already: a loose object may not be on the disk yet, or may be about to be pruned.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LAST = 0
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-"""The errors of file systems without hard links, or if a file has too many of them."""
+"""The errors if a file system has no hard links, or a file has too many."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -77,7 +77,7 @@ class NewObjects(pygit2.OdbBackend):
         return oid
 
     def folder(self, oid: Oid) -> Entries:
-        """Return the entries of a folder, which may be changed and added again."""
+        """Return the entries of a folder; the caller may change them and add them again."""
         known = self._folders.pop(oid, None)
         return _entries_of(self.repo[oid].peel(Tree).read_raw()) if known is None else known
 
@@ -156,7 +156,7 @@ class NewObjects(pygit2.OdbBackend):
                     keep.unlink()
 
     def _copy_to_pack(self, folder: str, revisions: str) -> Path:
-        """Have git read and write objects; it checks their content, and syncs the pack."""
+        """Have git write checked objects to a synced pack, and return the pack's path."""
         done = subprocess.run(
             ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
              "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
@@ -230,7 +230,7 @@ def _entries_of(data: bytes) -> Entries:
 
 @contextmanager
 def _folder_until_done(parent: str) -> Iterator[str]:
-    """Yield a new folder. A failure to remove it is none: the next start removes it."""
+    """Yield a new folder, and remove it at the end. If that fails, the next start removes it."""
     folder = mkdtemp(dir=parent, prefix=UNFINISHED)
     try:
         yield folder
@@ -259,7 +259,7 @@ def _pack_in(folder: str) -> Path:
 def _mark(keep: Path, index: Path) -> None:
     """Make the .keep of a pack: a link to its index, which is synced already.
 
-    Where a file system has no hard links it is a file, synced before it has its name.
+    On a file system without hard links it is a file, synced before it gets its name.
     """
     try:
         keep.hardlink_to(index)

@@ -20,9 +20,9 @@ from pygit2.enums import ObjectType
 
 _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 _LEVEL = 1
-"""Objects are new and short-lived in this form, so speed counts more than size."""
+"""The level of compression. A pack is short-lived, so speed counts more than size."""
 _SHORT_OFFSETS = 1 << 31
-"""Offsets from here on are in a table of their own."""
+"""An index keeps offsets from here on in a table of their own."""
 
 
 class Packed(NamedTuple):

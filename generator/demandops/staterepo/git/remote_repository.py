@@ -1,4 +1,4 @@
-"""The state repo behind a URL: a bare clone that git fetches and pushes; git's errors explained."""
+"""The state repo behind a URL: a bare clone, git's fetches and pushes, and its errors."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ _REMEDIES = (
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
-"""The limit of a first clone; git ends a connection that carries nothing much earlier."""
+"""The limit of a first clone. Git ends an idle connection much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 _NO_CLONE = re.compile(r"^(?!remote:).*fatal: not a git repository", re.MULTILINE)
 """Matches what git says if it cannot read the repository in which it runs."""
@@ -147,7 +147,7 @@ class RemoteRepository(StateRepository):
             return False
 
     def renew_if_damaged(self) -> bool:
-        """Make the clone anew if git finds it damaged."""
+        """Make the clone anew if git finds it damaged; return whether it was."""
         try:
             with git.Repo(self._folder) as repo:
                 self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
@@ -188,12 +188,12 @@ class RemoteRepository(StateRepository):
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch, but stop if something is urgent: a demand must not wait for a slow remote."""
+        """Fetch and return the tip; stop if ``urgent``: a demand must not wait for the remote."""
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit``; the remote accepts it only on top of its own tip."""
+        """Push ``commit`` and return True, if it is on top of the remote's own tip."""
         try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
@@ -228,7 +228,7 @@ class RemoteRepository(StateRepository):
 
         Args:
             spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
-            lease: ``<reference>:<commit>``, which commit the remote must have; empty for none.
+            lease: ``<reference>:<commit>``: the commit that the remote must have; empty for none.
             options: options for the server (``git push --push-option``).
         """
         push_options = [f"--push-option={option}" for option in options]
@@ -239,7 +239,7 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return ``PushDenied`` if the remote rejected a push, else why it failed."""
+        """Return ``PushDenied`` if the remote rejected a push, else the error that says why."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()
@@ -358,7 +358,7 @@ def _wait_for(
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its child processes; SIGTERM first, so that git removes its locks."""
+    """End git and its children and return the output; SIGTERM first, so that git unlocks."""
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)

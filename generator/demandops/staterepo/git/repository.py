@@ -34,23 +34,23 @@ ENVIRONMENT = {
 
 
 class Unavailable(StateRepoError):
-    """The state repo cannot be written now; until then the journal keeps the demands."""
+    """Raised when the state repo cannot be written now; the journal keeps the demands."""
 
 
 class RemoteAway(Unavailable):
-    """The remote cannot be reached."""
+    """Raised when the remote cannot be reached."""
 
 
 class DiskFull(Unavailable):
-    """The disk of the state repo, or of its clone, has no room."""
+    """Raised when the disk of the state repo, or of its clone, has no room."""
 
 
 class FetchInterrupted(StateRepoError):
-    """A fetch was ended because something was more urgent."""
+    """Raised when a fetch ended because something was more urgent."""
 
 
 class PushDenied(StateRepoError):
-    """The state repo may not be written (a hook, a protected branch, missing rights)."""
+    """Raised when a hook, a protected branch or missing rights prevent a write."""
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -87,7 +87,8 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
 def access_error(error: Exception, address: str) -> Exception:
     """Return the error to raise if a folder or state repo could not be read or written.
 
-    An error of the system or of libgit2 is no fault of the program; any other is returned as it is.
+    It replaces an error of the system or of libgit2, and returns any other unchanged, as a fault of
+    the program.
     """
     if not isinstance(error, OSError | pygit2.GitError):
         return error
@@ -106,17 +107,17 @@ class StateRepository(ABC):
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
     runtime: Runtime = REAL
-    """The clock, chance and threads of the code that writes to it."""
+    """The clock, chance and threads of the code that writes to the state repo."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
     _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
-    """The branch, or its remote-tracking branch of the last fetch."""
+    """The reference of main, or of its remote-tracking branch."""
     branches = "refs/heads/"
-    """The start of the names of its branches here."""
+    """The prefix of the references of branches in this repository."""
 
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here; does not ask the remote."""
+        """Return the newest published commit that is known here, without asking the remote."""
         target = self.objects.references[self.main_reference].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
@@ -149,7 +150,7 @@ class StateRepository(ABC):
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant; false if one is not here.
 
-        May be called from any thread.
+        Any thread may call it.
         """
         if commit == other:
             return True

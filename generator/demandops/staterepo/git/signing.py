@@ -97,7 +97,7 @@ def create_commit(
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Add a commit by ``people`` (author, committer), signed if there is a signer."""
+    """Add a commit by ``people`` (author, committer), signed if possible, and return its id."""
     content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
     if signer is not None:
         head, end, message = content.partition("\n\n")

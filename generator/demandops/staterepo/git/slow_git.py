@@ -1,4 +1,4 @@
-"""Who is told that git takes long with a remote: the terminal of a command, or nobody."""
+"""Tells a listener, the terminal of a command, that git takes long with a remote."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _listeners: list[Callable[[str], None]] = []
 
 
 def listen(listener: Callable[[str], None]) -> None:
-    """Call ``listener`` each second with what git does, and with no text when it has ended."""
+    """Call ``listener`` each second with what git does, and with an empty text at its end."""
     _listeners[:] = [listener]
 
 

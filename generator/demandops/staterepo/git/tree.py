@@ -74,7 +74,7 @@ def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
     """Yield (path, object) of each file, link or submodule at or below the paths ``roots``.
 
     The order is Git's. A folder that is deeper than :data:`MAX_DEPTH` is yielded like a file. In a
-    name that is not UTF-8, ``\\xff`` stands for such a byte.
+    name that is not UTF-8, ``\\xff`` stands for a byte that is not.
     """
     for root in roots:
         found = entry(tree, root)
@@ -124,7 +124,7 @@ def differences(
 ) -> Iterator[tuple[str, Oid | None]]:
     """Yield (path, new blob id or None) of each file that differs; skip equal subtrees.
 
-    Compares what is at or below the paths ``roots``, by default everything.
+    It compares what is at or below the paths ``roots``, by default everything.
     """
     if not roots:
         yield from _differences_below(before, after, "")

@@ -100,7 +100,7 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit: it is the committer, and signed if it must."""
+    """Return whether the generator made a commit: it is the committer, and signed if required."""
     return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
 
 
@@ -141,7 +141,7 @@ def _told_apart(
 
 
 def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
-    """Yield a commit, its first parent, that one's first parent and so on."""
+    """Yield a commit, then its first parent, and so on along the first parents."""
     walker = repo.walk(commit_of(repo, tip).id)
     walker.simplify_first_parent()
     return iter(walker)
@@ -167,7 +167,7 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     """Return operation id → outcome of every demand that commits after ``base`` record.
 
     A person who merges a proposal may keep its trailers; any other commit by a person records no
-    demand. Reads the whole history if ``base`` is unknown, because the remote was made anew.
+    demand. It reads the whole history if ``base`` is unknown, because the remote was made anew.
     """
     if str(tip) == base:
         return {}
@@ -252,7 +252,7 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that ever stopped; reads the whole history."""
+    """Return the names of all releases that ever stopped, from the whole history."""
     removed = _removed(repo, tip, "*.yaml")
     return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
 

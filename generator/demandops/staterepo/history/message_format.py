@@ -1,10 +1,10 @@
 """The text of commit messages: paragraphs of lines, and trailers in the last paragraph.
 
-The only writer and reader of messages. A line of a paragraph is for people: its text is escaped and
-cut off. A trailer is for programs: its value is read back exactly. A visible value stands as it is,
-so ``git log --format='%(trailers:key=Requester)'`` shows it; any other value stands in double
-quotes with escapes like ``\\u202e``. So no value can begin a line, end the message or pass for a
-trailer. Messages of earlier versions, which did not quote, are read the same way.
+This module alone writes and reads messages. A line of a paragraph is for people: its text is
+escaped and cut off. A trailer is for programs: its value is read back exactly. A visible value
+stands as it is, so ``git log --format='%(trailers:key=Requester)'`` shows it; any other value
+stands in double quotes with escapes like ``\\u202e``. So no value can begin a line, end the message
+or pass for a trailer. Messages of earlier versions, which did not quote, are read the same way.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def _precision(text: str) -> timedelta:
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     """Return the commit that a revision or a time names, or raise StateRepoError.
 
-    Tries the name of a branch or tag first, then a time, then any other revision.
+    It tries the name of a branch or tag first, then a time, then any other revision.
     """
     named = _found(repo.lookup_reference_dwim, text)
     if named is not None:
@@ -80,7 +80,7 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     if found is None:
         raise StateRepoError(
             f"'{text}' is neither a commit of the state repo nor a time; `demandops log` lists the "
-            f"commits, a time is written like {TIMES}"
+            f"commits; write a time like {TIMES}"
         )
     return found
 

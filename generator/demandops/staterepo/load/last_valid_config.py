@@ -1,8 +1,8 @@
 """The configuration at a commit; the last valid versions of files replace invalid ones.
 
-A file's last valid version replaces an invalid file, the other files of its application definition,
-and the other files of the commits that changed it: a commit applies whole or not at all. All other
-changes apply. If the result is not valid either, no change applies.
+If a file is invalid, its last valid version is in effect. So are those of the other files of its
+application definition and of the commits that changed it: a commit applies whole or not at all. All
+other changes apply. If the result is not valid either, no change applies.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
 
 
 def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
-    """Return the key of the claim in effect whose file is at a path; reads the whole ledger."""
+    """Return the key of the claim in effect at a path, found in the whole ledger."""
     if claim_file.kind_of(path) is None:
         return None
     return next((one.key for one in ledger if claim_file.path_of(one.key) == path), None)

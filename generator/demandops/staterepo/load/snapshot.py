@@ -79,7 +79,9 @@ class Advance:
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load a commit whole; ``progress`` is called with (files read, all files) of the ledger.
+    """Load and return a commit whole.
+
+    It calls ``progress`` with (files read, all files) of the ledger.
 
     Raises:
         InvalidInput, StateRepoError: with every fault of every file.
@@ -115,7 +117,7 @@ def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
 def advance(
     repo: Repository, before: Snapshot, to: Oid, recorded: ConfigSource | None = None
 ) -> Advance:
-    """Advance a snapshot to another commit, reading only what differs.
+    """Return the advance of a snapshot to another commit; read only what differs.
 
     Invalid changes are not applied; the new snapshot's problems list them.
 

@@ -42,7 +42,7 @@ _TO_CHECK = Fault("invalid", "", "must be checked again")
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
-    """Return the trailers; none if all files of the commit are in effect."""
+    """Return the trailers that record the state; none if all files are in effect."""
     if not snapshot.problems:
         return []
     source = snapshot.config_source
@@ -96,7 +96,7 @@ def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest state that is recorded up to a commit, or of a commit that is fully valid.
+    """Return the newest recorded state up to a commit, or that of the newest fully valid commit.
 
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
@@ -171,8 +171,8 @@ def _source(record: LogEntry) -> ConfigSource:
         return ConfigSource(Oid(hex=commit), replacements)
     except ValueError:
         raise StateRepoError(
-            f"commit {record.commit} has trailers about invalid files that cannot be read; revert "
-            "it, or merge valid files"
+            f"commit {record.commit} has unreadable trailers about invalid files; revert it, or "
+            "merge valid files"
         ) from None
 
 
@@ -219,7 +219,7 @@ class Judgement:
         return self._without(replace(accepted, snapshot=snapshot), self.with_old)
 
     def _without(self, accepted: Advance, faults: Faults) -> Advance:
-        """Put the last valid claims of faulty subjects in effect."""
+        """Return the advance with the last valid claims of faulty subjects in effect."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)

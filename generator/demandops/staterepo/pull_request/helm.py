@@ -40,7 +40,7 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Helm:
-    """The installed program, and a folder for what it keeps."""
+    """The installed program ``helm``, and a folder for its files."""
 
     program: str
     home: Path

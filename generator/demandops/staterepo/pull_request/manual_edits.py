@@ -1,7 +1,8 @@
 """Manual edits to generated files, and overrides that would have the same effect.
 
-They are refused because the generator's next commit would silently undo them, but an override in
-``overrides/`` stays. A person can use a suggested override unchanged, except for its reason.
+The check refuses manual edits, because the generator's next commit would silently undo them. An
+override in ``overrides/`` stays. A person can use a suggested override unchanged, except for its
+reason.
 """
 
 from __future__ import annotations
@@ -134,7 +135,7 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return effects of an override that replace an edit, and the parts of it that they miss."""
+    """Return effects of an override that replace an edit, and the parts that they miss."""
     if after is None:
         return {"deny": True}, []
     try:
@@ -230,7 +231,7 @@ def _move_images(
     config: Config,
     moved: dict[str, dict[str, str]],
 ) -> None:
-    """Move changes of images that the registry lists from a patch of values to ``moved``."""
+    """Move the changes of registered images out of a patch of values, into ``moved``."""
     names: dict[str, list[str]] = {}
     for name in release.service.images:
         names.setdefault(config.images[name].repository, []).append(name)

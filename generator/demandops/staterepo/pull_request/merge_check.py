@@ -47,10 +47,10 @@ from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, 
 class CheckResult:
     """The result of a check.
 
-    ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if no valid commit
-    can be compared with. ``base`` is the commit compared with, if any; if its files are not valid
-    (``base_valid``), their last valid versions are used. ``newer`` are the commits that the merge
-    target has and the checkout lacks. ``warnings`` are likely mistakes.
+    ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if there is no
+    valid commit for a comparison. ``base`` is the commit of the comparison, if any; if its
+    files are not valid (``base_valid``), their last valid versions are used. ``newer`` are the
+    commits that the merge target has and the checkout lacks. ``warnings`` are likely mistakes.
     """
 
     faults: tuple[Fault, ...]
@@ -71,17 +71,18 @@ def check(
     *,
     require_helm: bool = False,
 ) -> CheckResult:
-    """Check the files of a folder, render them, and preview the effect of a merge.
+    """Return what a check of a folder finds: faults, rendered files, the effect of a merge.
 
     Args:
         folder: a checked-out state repo, or its files without Git.
         base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
             with the common ancestor.
         now: overrides that ended by then are left out; by default the current time.
-        require_helm: it is a fault if charts are not rendered because helm is missing.
+        require_helm: whether it is a fault that helm is missing.
 
     Raises:
-        StateRepoError: it is not a state repo, or ``base`` is not a commit with an ancestor here.
+        StateRepoError: the folder is not a state repo, or ``base`` is not a commit that has an
+            ancestor here.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
@@ -198,7 +199,7 @@ class _Edit:
         }
 
     def merged_into(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        """Return the generated files before the edit, or as wanted where the target has them so."""
+        """Return the generated files before the edit, with the wanted ones that the target has."""
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
             if there.get(path) == wanted.get(path):
@@ -240,7 +241,7 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield the faults for which claims that the edit adds or changes are refused."""
+        """Yield why the generator would refuse claims that the edit adds or changes."""
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)

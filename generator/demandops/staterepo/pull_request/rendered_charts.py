@@ -49,7 +49,7 @@ class RenderedCharts:
 def render_charts(
     folder: Path, state: State, changed: Collection[str] | None, wanted: Collection[str]
 ) -> RenderedCharts:
-    """Lint and render the charts of a checkout.
+    """Lint and render the charts of a checkout, and return the result.
 
     Args:
         folder: the checkout; its configuration is valid.
@@ -157,7 +157,7 @@ class _Run:
         return not reason
 
     def _place_libraries(self, folder: str) -> str:
-        """Copy a chart's libraries into ``charts/``; return why it cannot be rendered, if so."""
+        """Copy a chart's libraries into ``charts/``; return why that fails, or an empty text."""
         for one in chart_files.dependencies(folder, self._files):
             target = self._scratch / folder / "charts" / one.name
             if one.folder:
@@ -195,7 +195,7 @@ class _Run:
                 into[one.within(path)] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
-        """Return whether a rule of its domain lets the application of an example run there."""
+        """Return whether a rule of the domain lets an example's application run on its node."""
         rules, services = release.domain.rules, self._state.config.services
         appdefs = [name for name, known in services.items() if release.key.service in known]
         return not rules or any(
@@ -203,7 +203,7 @@ class _Run:
         )
 
     def _refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
-        """Yield the kinds that the access domain of a release may not have."""
+        """Yield a fault for each kind that the access domain of a release may not have."""
         domain = release.domain
         allowed = {(one.group, one.kind) for one in domain.allowed_kinds}
         for group, kind in report.kinds:

@@ -94,7 +94,7 @@ class CommitBatch:
     ) -> str:
         """Commit one demand and return the commit's id.
 
-        ``proposal`` is the branch that it awaits approval on; empty if it needs no approval.
+        ``proposal`` is the branch on which it awaits approval; empty if it needs none.
         """
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
@@ -161,7 +161,7 @@ class CommitBatch:
         self.commit_files(files, state, text, author, now)
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return the effect of people's changes; if the new configuration fails, with the old."""
+        """Return the effect of people's changes, with the old configuration if the new fails."""
         judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
@@ -172,7 +172,7 @@ class CommitBatch:
         return self._rendered_subjects(accepted, before, now)
 
     def _rendered_whole(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Render everything, because the configuration changed."""
+        """Return the effect of a changed configuration, with everything rendered."""
         marked = last_valid_config.end_markers_at(self._tree)
         state = accepted.snapshot.state
         applied = update_ledger(before.state, state, accepted.subjects, marked, now)
@@ -198,9 +198,9 @@ class CommitBatch:
         keys: Iterable[ClaimKey],
         now: datetime,
     ) -> _Followed:
-        """Start the leases of claims that a person approved.
+        """Return the effect with started leases for the claims that a person approved.
 
-        They start at approval because a lease could otherwise end before the demand is approved.
+        A lease that started earlier could end before the approval.
         """
         ledger, files = state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
@@ -249,7 +249,7 @@ class CommitBatch:
     def drain(self, node: str, operation: str, now: datetime) -> Decision:
         """Move placed applications off a drained node, in one commit; return the decision.
 
-        Its author is the person who last changed the node's file.
+        The commit's author is the person who last changed the node's file.
         """
         decision = decide(self.head.state, Drain(node), now, self.read)
         if decision.files:

@@ -72,7 +72,7 @@ class JournalEntry:
     proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
-        """Return its content, without copying the goal, which may be deep."""
+        """Return the entry's content, without copying the goal, which may be deep."""
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         del record["proposal"]
         return record | ({"proposal": asdict(self.proposal)} if self.proposal else {})
@@ -271,7 +271,7 @@ def _digest(body: bytes, chain: str) -> str:
 def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
     """Apply a line to the pending demands and return its digest; raise ValueError if it is damaged.
 
-    ``chain`` is the digest before it; None in a journal of the first version.
+    ``chain`` is the digest before the line; None in a journal of the first version.
     """
     if chain is not None:
         found = _SEALED.fullmatch(line)

@@ -58,7 +58,7 @@ class Published:
 def commit_to_main(
     repository: StateRepository, make: Callable[[FileReader], Files], author: Author
 ) -> Published:
-    """Commit files to main.
+    """Commit files to main, and return what was published.
 
     Args:
         repository: the state repo.
@@ -75,7 +75,9 @@ def commit_to_main(
 def commit_to_branch(
     repository: StateRepository, files: Files, author: Author, branch: str, options: Sequence[str]
 ) -> Published:
-    """Commit files to a new branch on top of main; ``options`` are push options for the server.
+    """Commit files to a new branch on top of main, and return what was published.
+
+    ``options`` are push options for the server.
 
     Raises:
         InvalidInput: the files are not valid; nothing was changed.
@@ -91,7 +93,7 @@ def commit_to_branch(
 
 
 def merge(repository: StateRepository, proposal: PendingProposal, author: Author) -> Published:
-    """Merge a proposal into main by a merge commit.
+    """Merge a proposal into main, and return the merge commit.
 
     Raises:
         StateRepoError: main has other changes to the same files, or cannot be written.
@@ -102,7 +104,10 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
     def make(tip: Commit) -> tuple[Files, list[Oid]]:
         base = objects.merge_base(tip.id, head.id)
         if base is None:
-            raise StateRepoError(f"{proposal.branch} and {MAIN_BRANCH} have no commit in common")
+            raise StateRepoError(
+                f"{proposal.branch} and {MAIN_BRANCH} have no commit in common; reject it with "
+                "`demandops reject`, and send the demand again"
+            )
         start = trees.commit_of(objects, base).tree
         proposed = [path for path, _ in trees.differences(start, head.tree)]
         if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):
@@ -130,7 +135,7 @@ def _publish(
         repository.new.forget()
         REAL.sleep(_PAUSE_S * attempt)
     raise StateRepoError(
-        f"{repository.address} moved {_ATTEMPTS} times; nothing was changed, try again"
+        f"{repository.address} moved {_ATTEMPTS} times, so nothing was changed; try again"
     )
 
 

@@ -1,7 +1,7 @@
 """Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
 
 The generator rebuilds a branch on a newer main and deletes it in the end, but only if the branch
-is at the commit that the generator put there. Knows no forge except GitLab's push options.
+is at the commit that the generator put there. It knows no forge except GitLab's push options.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class ProposalBranches:
     def _move(
         self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Move or delete a branch; if the push fails, check whether it took effect anyway."""
+        """Move or delete a branch; return the link that the server printed, or an empty text."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             self._set_here(reference, commit, expected)

@@ -57,7 +57,7 @@ class Slot:
         """Take over the journals of dead processes.
 
         An entry is written to this journal before it is removed from the old one. A crash between
-        leaves both, but with the same operation id they count once.
+        leaves two entries, which count once, because they have the same operation id.
         """
         for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
             lock = _lock(journal.parent) if journal.parent != self.folder else None

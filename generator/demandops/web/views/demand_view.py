@@ -44,10 +44,10 @@ class ExplainedDemand:
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand.
+    """Return a demand with its claims, and what its release would change.
 
     Raises:
-        StateRepoError: if it holds nothing.
+        StateRepoError: if the demand holds nothing.
     """
     claims = now.moment.claims_of_demands.get(id)
     if not claims:

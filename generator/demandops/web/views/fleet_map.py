@@ -53,7 +53,7 @@ class Mass:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The whole map; ``is_dimmed`` if a filter lights a part of it.
+    """The whole map; ``is_dimmed`` says that a filter lights only a part of it.
 
     ``nodes`` and ``lines`` are drawn one by one, ``many_nodes`` and ``many_lines`` together.
     ``only_lit`` says whether nodes that the filter does not light are left out.
@@ -92,7 +92,7 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     Args:
         now: the situation.
         wanted: lights the services, connections and nodes that match.
-        layout: ``place`` or ``cluster``; any other: by place if most nodes have one.
+        layout: ``place`` or ``cluster``; any other means ``place``, if most nodes have a position.
     """
     config = now.moment.config
     nodes = list(config.nodes.values())

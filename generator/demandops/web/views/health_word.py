@@ -17,7 +17,7 @@ WORDS = {
 """Each word and its tone, the worst first."""
 
 PLACES = {word: float(place) for place, word in enumerate(WORDS)}
-"""The place of each word in this order."""
+"""The place of each word in the order of ``WORDS``."""
 
 
 def word_of(status: ReleaseStatus) -> str:

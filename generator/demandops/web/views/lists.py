@@ -25,8 +25,8 @@ Parts: TypeAlias = "tuple[Any, ...]"
 class ListKind:
     """A kind of list: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields each entry's id and the parts that ``row`` makes its row of. The row is made
-    anew only if a part differs.
+    ``entries`` yields each entry's id and the parts from which ``row`` makes its row. It makes the
+    row anew only if a part differs.
     """
 
     name: str
@@ -38,12 +38,12 @@ class ListKind:
 
 
 def release_part(name: str) -> Part:
-    """Return a release's name, which leads to its view."""
+    """Return a release's name with a link to its view."""
     return Part(name, Link("release", {"name": name}))
 
 
 def demand_part(id: str) -> Part:
-    """Return a demand's id, which leads to its view."""
+    """Return a demand's id with a link to its view."""
     return Part(id, Link("demand", {"id": id}))
 
 
@@ -53,7 +53,7 @@ def health_cell(word: str) -> Cell:
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return values that lead to a view, filtered by them."""
+    """Return values, each with a link to the view that is filtered by it."""
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 
@@ -193,7 +193,7 @@ def _columns(*named: str) -> tuple[Column, ...]:
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; those of other books are taken where they are the same."""
+    """Return the rows of a list; reuse those of an earlier moment that are the same."""
     moment, kind = now.moment, LISTS[name]
     known = moment.rows.get(name, KnownRows(None, {}))
     if known.made_for is not now.statuses:

@@ -64,7 +64,10 @@ class Box:
 def by_cluster(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
-    """Lay out a box for each cluster, and in it a group of rows for each type of node."""
+    """Return the cards and boxes, one for each cluster, and the height.
+
+    A box has a group of rows for each type of node.
+    """
     clusters: dict[str, dict[str, list[NodeCard]]] = {}
     for node in sorted(nodes, key=lambda one: one.id):
         clusters.setdefault(node.cluster, {}).setdefault(node.type, []).append(cards[node.id])
@@ -114,7 +117,7 @@ def _box(
 def by_place(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], float]:
-    """Lay out nodes at their positions, north up, and those without one below."""
+    """Return the cards of nodes at their positions, north up, others below; and the height."""
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
     widest = max(cards[id].width for id in spots)

@@ -36,8 +36,8 @@ class DiffLine:
 class Explained:
     """A release that runs, was denied, or ran before; ``release`` is ``None`` if it does not run.
 
-    ``difference`` is what its newest change changed in its file. ``stop_with_it`` are the releases
-    that the override which the page shows would stop beside it.
+    ``difference`` is what its newest change changed in its file. The page shows an override that
+    would stop the release; ``stop_with_it`` are the other releases that it would stop.
     """
 
     name: str
@@ -66,20 +66,20 @@ class Explained:
 
     @property
     def since(self) -> datetime | None:
-        """The time since which it has its state, if the cluster reports it."""
+        """The time since which the release has its state, if the cluster reports it."""
         return since_of(self.status)
 
     @property
     def requesters(self) -> list[str]:
-        """Who needs it."""
+        """The requesters that need the release."""
         return sorted({who for claim in self.claims for who in claim.requesters})
 
 
 def explained(now: Situation, reader: Reader, name: str) -> Explained:
-    """Explain the release with a name.
+    """Return why the release with a name runs, and its history.
 
     Raises:
-        StateRepoError: if there is none and never was.
+        StateRepoError: if there is no such release and never was.
     """
     moment = now.moment
     release = moment.releases.get(name)
@@ -111,7 +111,7 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
 
 
 def _others_stopped(moment: Moment, release: Release) -> Iterable[str]:
-    """Yield what stops with a release if its service is denied on its node, or its connections."""
+    """Yield what else stops if a release's service on the node, or its connections, are denied."""
     for name, other in moment.releases.items():
         if name == release.name:
             continue

@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import TypeAlias
 
 PAGE = 100
-"""The most rows on a page of a list."""
+"""How many rows a page of a list has at most."""
 
 _MOST_PARTS = 4
 
@@ -84,7 +84,7 @@ class Row:
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
-        """Its texts by name, in the case that filters look at."""
+        """The row's texts by name, in the case that filters compare."""
         found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
         for key, texts in self.hidden.items():
             found[key] = (*found.get(key, ()), *texts)
@@ -92,7 +92,7 @@ class Row:
 
     @cached_property
     def all_texts(self) -> str:
-        """All its texts, each in a line."""
+        """All texts of the row, each on a line."""
         return "\n".join(text for texts in self.texts.values() for text in texts)
 
 
@@ -161,7 +161,7 @@ def exactly(key: str, value: str) -> str:
 def table(
     columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
 ) -> Table:
-    """Return a page of the rows that match; an unknown ``sort`` or ``page`` is the first."""
+    """Return a page of the rows that match; an unknown ``sort`` or ``page`` means the first."""
     every = list(rows)
     found = [row for row in every if wanted.matches(row)]
     key = sort.removeprefix("-")

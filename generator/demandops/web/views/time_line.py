@@ -86,7 +86,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """The time line as a picture; ``chosen`` is the place of the chosen moment, if it is in it."""
+    """The time line as a picture; ``chosen`` is where the chosen moment is, if it is shown."""
 
     span: str
     dots: tuple[Dot, ...]
