@@ -265,7 +265,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return the options' values; ask for missing ones on a terminal, elsewhere raise their names."""
+    """Return all values; ask for missing ones on a terminal, elsewhere raise their options."""
     missing = [option for option, values in given.items() if not values]
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
