@@ -41,7 +41,7 @@ OPEN = "SECRET may be read by everybody on this machine; run chmod o= on it"
 @pytest.mark.parametrize(
     ("text", "secret", "mode", "message"),
     [
-        (None, None, 0, NO_FILE),
+        (None, None, 0, f"{NO_FILE}; check the path"),
         ("clusters: {a: {}}\n", None, 0, "clusters.a: needs a kubeconfig, a receiver or a webhook"),
         ("", None, 0, "clusters: is missing; add it"),
         (SIGNED, None, 0, f"clusters.a.secret_file: SECRET {NO_FILE}; put the secret there"),
