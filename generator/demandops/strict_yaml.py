@@ -250,7 +250,7 @@ _STAND_IN = "demandops-list"
 
 
 def _load_around_lists(text: str) -> list[Any]:
-    """Return the document of a text with long lists; an empty list if that fails."""
+    """Return a list of the one document in a text with long lists, an empty one in other cases."""
     lists: dict[str, list[str]] = {}
 
     def stand_in(match: re.Match[str]) -> str:

@@ -201,7 +201,10 @@ class DemandNode(Node):  # type: ignore[misc]
         """Forget a goal whose client never got the acceptance; its demand is still carried out."""
         if goal.handle is None:
             del self._goals[id(goal.message)]
-            self.get_logger().warning(f"{goal}: nobody gets the answer of {goal.ticket.operation}")
+            self.get_logger().warning(
+                f"{goal}: its client did not get the acceptance and will get no result; demand "
+                f"{goal.ticket.operation} is still carried out"
+            )
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
         """Withdraw a demand and accept the cancel, unless the demand is committed."""

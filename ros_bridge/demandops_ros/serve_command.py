@@ -266,7 +266,7 @@ class _Signals:
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
         """Wait for a signal, or until ``until`` holds; :meth:`wake` makes it look again.
 
-        If the runtime is unsound, this ends the process.
+        If :class:`Unsound` was raised, because a demand could be lost, this ends the process.
         """
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)

@@ -239,7 +239,7 @@ class ApplicationVersion:
 
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
-        """The place among the versions of the definition; two of one rank are the same."""
+        """What orders the versions of a definition; versions of one rank are the same."""
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 

@@ -85,7 +85,7 @@ def _too_large(size: str, limit: str, most: int) -> str:
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of the fields that only our own requests have."""
+    """Yield the faults of the fields that a Demand has and a DeploymentRequest has not."""
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         message = (

@@ -167,7 +167,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return {*self.chosen_nodes, *self.moved.values(), *sources}
 
     def chosen_node(self, service: str) -> str:
-        """Return the node of a service, unless an override moves it or it runs at its sources."""
+        """Return the node that is chosen for a service.
+
+        The service runs elsewhere if an override moves it, or if it runs at its sources.
+        """
         return self.services.get(service, self.node)
 
     @property

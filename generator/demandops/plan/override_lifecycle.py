@@ -1,7 +1,8 @@
 """Changes to the ledger when overrides change or end: kept claims, moved services, markers.
 
-An override whose end had passed when it was merged never applies. The generator ends an override
-that was in effect with a commit of its own.
+A marker is a file of the ledger that says that an override has ended. An override whose end had
+passed when it was merged never applies. The generator ends an override that was in effect with a
+commit of its own.
 """
 
 from __future__ import annotations
@@ -41,12 +42,12 @@ def update_ledger(
     markers: Mapping[str, str],
     now: datetime,
 ) -> LedgerUpdate:
-    """Return the update that a change of the configuration requires.
+    """Return the changes to the ledger that a change of the configuration requires.
 
     Args:
         before, after: the world before and after the change.
         subjects: the subjects whose claims a person changed.
-        markers: the current markers, path → text.
+        markers: the current markers, by path, as text.
         now: the time; new overrides whose end has passed do not apply.
     """
     known = {one.name: one for one in before.overrides}

@@ -78,8 +78,8 @@ def kept_charts(
 ) -> dict[str, str]:
     """Return the chart sources to keep because a held release may still use them.
 
-    Sources of charts in this repo are not kept, because such a source would fetch the new chart
-    under its old name.
+    The source of a chart that lies in the state repo is not kept: it would fetch the changed chart
+    under the name of the old one.
 
     Args:
         files: the generated files as they will be.

@@ -135,8 +135,8 @@ def upgrade(
             REAL.sleep(_PAUSE_S * attempt * REAL.uniform(0.5, 1.0))
             repository.refresh()
     raise StateRepoError(
-        f"{repository.address} moved {_ATTEMPTS} times while it was rendered; stop its generators "
-        "and try again"
+        f"{repository.address} got new commits during each of {_ATTEMPTS} attempts to render it; "
+        "stop its generators and try again"
     )
 
 

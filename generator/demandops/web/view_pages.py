@@ -74,7 +74,7 @@ class Asked:
         return f"/{self.path if path is None else path}{query}"
 
     def link(self, link: Link) -> str:
-        """Return the address of a link, which keeps the moment."""
+        """Return the address of a link at the chosen moment, with the link's own filter or none."""
         return self.to(link.path, **{"q": "", **link.params})
 
 

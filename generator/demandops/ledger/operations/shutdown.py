@@ -71,10 +71,10 @@ def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: s
 def _holds(
     one: Demanded, requester: str, claims: list[Claim]
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield each listed topic as text, the claim to take holds from, and the topics' keys there.
+    """Yield for each listed topic its text, the claim to take holds from, and the keys to take.
 
-    The claim is ``None`` if the requester holds no such topic. If no topic is listed, all holds in
-    the first claim are taken.
+    The keys are those of the claim's topics that it means. The claim is ``None`` if the requester
+    holds no such topic. If no topic is listed, all holds in the first claim are taken.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]

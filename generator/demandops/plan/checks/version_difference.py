@@ -160,7 +160,10 @@ def _of_service(
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield the differences in a shared service that applications of the demand bring about."""
+    """Yield the differences between the demand's versions of a service and those of others.
+
+    The others are applications that use the same release.
+    """
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:

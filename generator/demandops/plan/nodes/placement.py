@@ -140,7 +140,7 @@ def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
 
 
 def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Choice]:
-    """Yield the choices of nodes that a demanded application needs, with all room free."""
+    """Yield the choices of a node for an application and its services, as if all were free."""
     if not isinstance(one.held, Application):
         return
     free, claims = Room(world, Usage(), ()), (_claim(request, one),)

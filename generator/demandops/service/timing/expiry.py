@@ -68,7 +68,7 @@ class LeaseExpiry:
         return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the time and the claims whose lease has ended, the first to end first.
+        """Return the current time, and the claims whose lease has ended, the first to end first.
 
         The ended claims of one demand are released together: if one of them is granted more time,
         none is returned.

@@ -64,7 +64,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository; the code that writes to it keeps it alive."""
+        """The repository. This object refers to it weakly; who writes to it holds it."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - whoever writes to it holds it
         return repo

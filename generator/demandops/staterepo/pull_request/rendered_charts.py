@@ -195,7 +195,7 @@ class _Run:
                 into[one.within(path)] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
-        """Return whether a rule of the domain lets an example's application run on its node."""
+        """Return whether the rules of a release's domain allow any application with its service."""
         rules, services = release.domain.rules, self._state.config.services
         appdefs = [name for name, known in services.items() if release.key.service in known]
         return not rules or any(

@@ -112,8 +112,8 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
         proposed = [path for path, _ in trees.differences(start, head.tree)]
         if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):
             raise StateRepoError(
-                f"{MAIN_BRANCH} changed since {proposal.branch} was made; a running generator "
-                "makes it anew, so try again then"
+                f"{MAIN_BRANCH} has changed files that {proposal.branch} changes too; wait until "
+                "a running generator has made the branch anew, then try again"
             )
         read = _reader(head.tree)
         return {path: read(path) for path in proposed}, [tip.id, head.id]
