@@ -179,7 +179,7 @@ class TestProposals:
         before = state.tip
         ran = demandops("approve", "visit", "--state-repo", state.path)
         assert (ran.code, state.tip) == (1, before)
-        assert "a running generator makes it anew, so try again then" in ran.err
+        assert "wait until a running generator has made the branch anew, then try again" in ran.err
 
     @pytest.mark.parametrize("scheme", ["", "file://"])
     def test_one_is_turned_down(
