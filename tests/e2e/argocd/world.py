@@ -25,6 +25,16 @@ class World(StateRepo[Domain]):
         assert project["spec"]["sourceNamespaces"] == [namespace]
         domain = self.domains[cluster] = Domain(rig.kube, namespace, folder["metadata"]["name"])
         self.apply(rig.kube, manifests)
+
+        def is_permitted() -> bool:
+            """Look again, else Argo CD goes by a project of the same name for minutes."""
+            trouble = domain.trouble(domain.name, NAMESPACE)
+            if "is not permitted in project" in trouble:
+                domain.wake()
+                return False
+            return bool(domain.fetched())
+
+        rig.kube.wait("Argo CD to see the project", is_permitted)
         domain.wait_applied(self.tip())
         return domain
 
