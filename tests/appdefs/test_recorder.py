@@ -13,9 +13,10 @@ import pytest
 import yaml
 
 from tests.kit.cli import Run
-from tests.kit.config import FAST, skeleton
+from tests.kit.config import skeleton
 from tests.kit.goals import BODY, CLOUD, STATION_CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.plain_yaml import FAST
 from tests.kit.repo import GitRepo
 from tests.scenarios.running import configuration
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-import yaml
 from demandops.config.appdef import Scaling
 from demandops.decision import rendered_files
 from demandops.demand.application import InputTopic
@@ -21,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.appdefs.test_recorder import ADDITIONS
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.config import override, skeleton
 from tests.kit.goals import CLOUD, STATION_CLOUD, application, goal
@@ -68,7 +68,7 @@ def demand(
 def release(repo: MemoryRepo) -> dict[str, Any]:
     """Return the recorder's HelmRelease or Application."""
     (path,) = (path for path in repo.rendered() if "/rec-" in path)
-    found: dict[str, Any] = yaml.safe_load(repo.files[path])
+    found: dict[str, Any] = plain_yaml.load(repo.files[path])
     return found
 
 
@@ -90,7 +90,7 @@ def replicas_by_overrides(*replicas: int) -> dict[str, str]:
 
 
 def test_the_page_has_a_row_for_each_way() -> None:
-    assert {key for row in ROWS for key in yaml.safe_load(row[0]).get("per", {})} == {
+    assert {key for row in ROWS for key in plain_yaml.load(row[0]).get("per", {})} == {
         *("topics", "sources", "claims", "requesters")
     }
     assert any("sizes" in row[0] for row in ROWS)

@@ -37,8 +37,8 @@ from hypothesis import strategies as st
 
 from tests.fuzz import Target
 from tests.kit import rich
-from tests.kit.config import FAST
 from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.plain_yaml import FAST
 from tests.unit.ledger.test_claim_file import TRICKY, claims, joined_claims, values
 from tests.unit.ledger.test_claim_file import (
     test_every_claim_survives_its_file as claim_is_read_back,

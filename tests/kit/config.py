@@ -10,8 +10,6 @@ import yaml
 from demandops.config.config import CONFIG_ROOTS
 from demandops.staterepo.skeleton import files
 
-FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
 
 @lru_cache
 def skeleton(gitops: str = "flux") -> Mapping[str, str]:

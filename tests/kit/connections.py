@@ -11,6 +11,7 @@ from demandops.config.load import load
 from demandops.decision import State
 from demandops.ledger.ledger import Ledger
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton
 from tests.kit.memory import MemoryRepo
 
@@ -28,7 +29,7 @@ def state(
     images: str = ZENOH_IMAGE + ROS_IMAGE, *, brokers: bool = True, **nodes: dict[str, Any]
 ) -> State:
     """Return a state without claims, in which some nodes of the skeleton have more fields."""
-    inventory = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
+    inventory = plain_yaml.load(skeleton()["inventory/nodes.yaml"])
     for node in inventory["nodes"]:
         node.update(deepcopy(nodes.get(node["id"], {})))
     changed = {

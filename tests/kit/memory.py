@@ -20,8 +20,9 @@ from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 
-from tests.kit.config import FAST, configuration, skeleton
+from tests.kit.config import configuration, skeleton
 from tests.kit.goals import Goal
+from tests.kit.plain_yaml import FAST
 from tests.model.books import in_model_words, object_lists
 
 NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)

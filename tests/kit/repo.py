@@ -23,6 +23,7 @@ from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME
 from demandops.staterepo.load import snapshot as snapshots
 
+from tests.kit import plain_yaml
 from tests.kit.memory import NOW
 
 NO_GIT_CONFIG = {
@@ -190,7 +191,7 @@ class Person:
 
     def policy(self, **changed: Any) -> None:
         """Set these fields of every access domain."""
-        data = yaml.safe_load(self.read(POLICY))
+        data = plain_yaml.load(self.read(POLICY))
         for domain in data["domains"]:
             domain.update(changed)
         self.change({POLICY: yaml.safe_dump(data)}, "Demands need approval")

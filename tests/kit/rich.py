@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import yaml
 from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile
@@ -15,6 +14,7 @@ from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
 from pydantic import BaseModel
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration, override
 from tests.kit.goals import CLOUD, EGO, Goal, application, connection, goal
 
@@ -372,5 +372,5 @@ connections:
       - {source: /a, target: /b, type: std_msgs/msg/String, reverse: false, qos: 1, retained: true,
          primitive: true, reliability: reliable, durability: volatile, queue: 5, rate: 0}
 """
-    made: dict[str, Any] = yaml.safe_load(text)
+    made: dict[str, Any] = plain_yaml.load(text)
     return made

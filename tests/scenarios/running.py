@@ -28,6 +28,7 @@ from demandops.service.timing.expiry import LeaseExpiry
 from demandops.service.timing.rate_limit import RateLimit
 from pydantic import Field, model_validator
 
+from tests.kit import plain_yaml
 from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
@@ -159,7 +160,7 @@ def configuration(
             }}),
         ]  # fmt: skip
     for path, above in (*overlays, *(config or {}).items()):
-        below = yaml.safe_load(files[path]) if path in files else {}
+        below = plain_yaml.load(files[path]) if path in files else {}
         files[path] = yaml.safe_dump(_laid_over(below, above), sort_keys=False)
     return files
 

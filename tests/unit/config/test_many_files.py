@@ -23,7 +23,7 @@ from demandops.config.config import (
 from demandops.config.load import load
 from demandops.errors import InvalidInput
 
-from tests.kit import rich
+from tests.kit import plain_yaml, rich
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
 
@@ -47,7 +47,7 @@ def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
     """Move entries of each collection to files of its folder, by chance."""
     result = dict(files)
     for path in {*COLLECTIONS} & {*files}:
-        data, parts = yaml.safe_load(result.pop(path)), dict[str, dict[str, Any]]()
+        data, parts = plain_yaml.load(result.pop(path)), dict[str, dict[str, Any]]()
         heads = ("apiVersion", "kind", "registry")
         head = {name: data.pop(name) for name in heads if name in data}
         for name, entries in data.items():

@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import Any
 
 import pytest
-import yaml
 from demandops.config.inventory import Tls
 from demandops.connections import connection_types
 from demandops.decision import State
@@ -20,9 +19,10 @@ from demandops.ledger.world import World
 from demandops.plan.planner import plan
 from demandops.plan.release_keys import all_keys
 
+from tests.kit import plain_yaml
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, decided, demand, state
 
-DECLARED = yaml.safe_load((Path(__file__).parent / "declared.yaml").read_text())
+DECLARED = plain_yaml.load((Path(__file__).parent / "declared.yaml").read_text())
 OPTIONS: dict[str, dict[str, Any]] = {
     "mqtt": {
         "qos": 2,

@@ -16,9 +16,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.config import FAST
 from tests.kit.goals import APP, CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.plain_yaml import FAST
 
 TEXT = st.text(max_size=12) | st.sampled_from(
     ["", "edge", "vehicle00", APP, CLOUD[0], "/a", "..", "~", "\\", "\ud800", "a" * 1100, "{{ x }}"]

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from tests.kit import plain_yaml
 from tests.kit.http import Answer, Call, serving
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
@@ -58,7 +57,7 @@ def replaying(*names: str, variables: dict[str, str] | None = None) -> Iterator[
         text = (_EXCHANGES / f"{name}.yaml").read_text()
         for key, value in (variables or {}).items():
             text = text.replace("{" + key + "}", value)
-        replay.left += yaml.safe_load(text)
+        replay.left += plain_yaml.load(text)
     with serving(replay.answer) as server:
         replay.url = server.url
         yield replay

@@ -13,7 +13,6 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-import yaml
 from demandops.demand import deployment_request_goal
 from demandops.demand.claim import ClaimKey, demand_id
 from demandops.demand.demand_request import DemandRequest, Join
@@ -21,13 +20,14 @@ from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import REMEMBERED
 
+from tests.kit import plain_yaml
 from tests.kit.chance import TIMES
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, Goal, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
 from tests.model.operators import Operators
 
 ROOT = Path(__file__).parents[3]
-RUN = yaml.safe_load((ROOT / "tests" / "fixtures" / "reference-run.yaml").read_text())
+RUN = plain_yaml.load((ROOT / "tests" / "fixtures" / "reference-run.yaml").read_text())
 ROW = re.compile(r"^\| `([\w-]+)` \|", re.MULTILINE)
 FURTHER_CLOUD = re.compile(r"^/([a-z]+\d\d)_.+(_local_objectlist)$")
 
@@ -101,7 +101,7 @@ def test_a_recorded_run_of_the_reference_is_what_the_model_says_and_what_comes_o
     for number, step in enumerate(RUN["steps"], 1):
         wanted = step["goal"]
         if isinstance(wanted, str):
-            wanted = yaml.safe_load((ROOT / wanted).read_text())
+            wanted = plain_yaml.load((ROOT / wanted).read_text())
         books.follow(step)
         runs.follow(step)
 

@@ -8,18 +8,18 @@ from random import Random
 from typing import Any
 
 import pytest
-import yaml
 from demandops.errors import InvalidInput
 from demandops.migration import imported_goals, reference_files
 from demandops.migration.reference_files import Hold, ReferenceFiles
 from demandops.migration.remaining_joins import Join
 from hypothesis import given
 
+from tests.kit import plain_yaml
 from tests.kit.chance import chances, examples
 from tests.kit.goals import EXPERIMENT, application, connection
 from tests.kit.reference import Reference
 
-RUN = yaml.safe_load((Path(__file__).parents[2] / "fixtures/reference-run.yaml").read_text())[
+RUN = plain_yaml.load((Path(__file__).parents[2] / "fixtures/reference-run.yaml").read_text())[
     "steps"
 ]
 CONNECTION, FUSION = "mqtt-connection-station00-edge", "of-edge-object-detection-fusion"
@@ -37,11 +37,11 @@ def read(reference: Reference, *wanted: str) -> ReferenceFiles:
     texts = {
         name: text for name, text in reference.texts().items() if any(w in name for w in wanted)
     }
-    return reference_files.read((name, yaml.safe_load(text)) for name, text in texts.items())
+    return reference_files.read((name, plain_yaml.load(text)) for name, text in texts.items())
 
 
 def experiment(steps: int) -> Reference:
-    return after(*(yaml.safe_load(path.read_text()) for path in EXPERIMENT[:steps]))
+    return after(*(plain_yaml.load(path.read_text()) for path in EXPERIMENT[:steps]))
 
 
 def holds(joins: list[Join]) -> Counter[Hold]:

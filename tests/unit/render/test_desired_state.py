@@ -11,10 +11,10 @@ import yaml
 from demandops.errors import InvalidInput
 from demandops.render.output_check import check_files
 
-from tests.kit.config import FAST
 from tests.kit.goals import application, connection, goal, perception
 from tests.kit.golden import CASES, rendered
 from tests.kit.memory import MemoryRepo
+from tests.kit.plain_yaml import FAST
 
 BUILT_IN = {"v1", "apps/v1", "rbac.authorization.k8s.io/v1"}
 

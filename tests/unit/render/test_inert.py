@@ -17,9 +17,10 @@ from demandops.config.load import load
 from demandops.errors import InvalidInput
 from demandops.identifiers import control_character
 
-from tests.kit.config import FAST, configuration, override, skeleton
+from tests.kit.config import configuration, override, skeleton
 from tests.kit.goals import application, connection, goal
 from tests.kit.memory import MemoryRepo
+from tests.kit.plain_yaml import FAST
 
 NODES = "inventory/nodes.yaml"
 
