@@ -10,7 +10,7 @@ from demandops.cli.main import COMMANDS, ExitCode, cli, load
 
 def page() -> str:
     """Return the page."""
-    group = click.Context(cli, info_name="demandops")
+    group = click.Context(cli, info_name="demandops", **cli.context_settings)
     parts = [
         "# Commands",
         "Generated from the program. `demandops COMMAND --help` prints the same.",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from demandops_ros import parameters
+from demandops_ros import node_parameters
 
 INTERFACES = Path(__file__).parents[1] / "ros_bridge" / "interfaces"
 
@@ -28,8 +28,8 @@ def page() -> str:
 
 def _parameters() -> str:
     rows = ["| parameter | default | meaning |", "| --- | --- | --- |"]
-    for name, default in parameters.DEFAULTS.items():
-        told = parameters.descriptor(name)
+    for name, default in node_parameters.DEFAULTS.items():
+        told = node_parameters.descriptor(name)
         ranges = [
             f"{one.from_value:g} to {one.to_value:g}"
             for one in (*told.floating_point_range, *told.integer_range)

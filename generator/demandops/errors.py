@@ -56,7 +56,7 @@ class Fault:
 
 
 def place_text(file: str, line: int | None) -> str:
-    """Return a file with a line, as editors and terminals link it."""
+    """Return ``file:line``, which editors and terminals turn into a link."""
     if line is None:
         return file
     return f"{file}:{line}" if file else f"line {line}"
@@ -92,7 +92,7 @@ class InvalidInput(DemandOpsError):
 
 
 def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
-    """Yield the first faults of each file, shortened, and how many more it has."""
+    """Yield the first faults of each file, shortened, then a fault that counts the others."""
     counts: dict[str, int] = {}
     for fault in faults:
         count = counts[fault.file] = counts.get(fault.file, 0) + 1
@@ -146,15 +146,20 @@ class QueueFull(DemandOpsError):
     """Raised when the demand queue is full."""
 
 
-def fault(field: str, message: str, *, code: str = "invalid") -> Fault:
+def fault(field: str, message: str, *, code: str = "invalid", line: int | None = None) -> Fault:
     """Return a fault that is not in a file yet."""
-    return Fault(code=code, field=field, message=message)
+    return Fault(code=code, field=field, message=message, line=line)
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """Return the similar word that is known, or None."""
+    """Return the known word that is most similar to ``word``, or None."""
     close = get_close_matches(word, _neighbors(word, sorted(known)), n=1)
     return close[0] if close else None
+
+
+def sentences(problems: Iterable[str]) -> str:
+    """Return problems as one text, each as a sentence."""
+    return ". ".join(problems).replace("?. ", "? ")
 
 
 def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
@@ -173,7 +178,7 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
 
 
 def _neighbors(word: str, names: list[str]) -> list[str]:
-    """Return the names next to a word in the order of their first, and of their last letters.
+    """Return the names next to a word in alphabetical order, and in the order of reversed names.
 
     Comparing a word with thousands of names is slow, and one file or goal may have thousands of
     unknown words.

@@ -16,7 +16,7 @@ from demandops.strict_yaml import LOADER, load_all
 def lines(text: str, document: int = 0) -> dict[str, int]:
     """Return the line of each field of a document, by its path: ``nodes[3].cluster``.
 
-    The result is empty if :func:`load_all` refuses the text; that fault already has its line.
+    The result is empty if :func:`load_all` refuses the text; a refusal already names its line.
     """
     found: dict[str, int] = {}
     with suppress(InvalidInput, yaml.YAMLError):
@@ -62,14 +62,14 @@ def nearest(field: str, known: Mapping[str, int]) -> int | None:
 
 
 def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
-    """Return faults with their lines, as far as they can be told."""
+    """Return the faults with the lines of their fields added where they are known."""
     known = FieldLines(text_of)
     return [replace(one, line=one.line or known.of(one.file, one.field)) for one in faults]
 
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """Add the lines to the faults that the block raises, which are all of one text."""
+    """Add lines to the faults that the block raises; all of them must be about ``text``."""
     try:
         yield
     except InvalidInput as error:

@@ -55,7 +55,7 @@ class Forge(ABC):
     HEADERS: ClassVar[dict[str, str]]
     """The HTTP headers of each call, with ``{token}`` for the token."""
     EXISTS: ClassVar[int]
-    """The HTTP status of a refusal because the branch already has a pull request."""
+    """The HTTP status with which the forge refuses a second pull request for a branch."""
 
     def __init__(self, api: str, token: str, owner: str, name: str) -> None:
         self._api = api.rstrip("/")

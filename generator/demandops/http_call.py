@@ -46,7 +46,7 @@ class HttpAnswer:
 
     @property
     def is_redirect(self) -> bool:
-        """Whether the service sends the caller elsewhere."""
+        """Whether the service redirects the caller."""
         return 300 <= self.status < 400
 
 

@@ -25,7 +25,7 @@ def absolute_topic(topic: str) -> str:
 
 
 def control_character(text: str) -> str:
-    """Return the first invisible or bidirectional control character as ``U+202E``, or ""."""
+    """Return the first invisible or bidirectional control character, like ``U+202E``, or ""."""
     for char in text:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return f"U+{ord(char):04X}"
@@ -82,8 +82,9 @@ _ANY = "letters, digits"
 PATTERN_WORDS = {
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": f"{_LOWER} and '-' between them, such as c-its",
     r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, such as road-station",
-    r"^[a-z][a-z0-9]{0,9}$": f"up to ten {_LOWER}, with a letter first, such as od",
+    r"^[a-z][a-z0-9]{0,9}$": "up to ten small letters and digits, with a letter first, such as od",
     r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, such as sensor_msgs",
+    r"^[a-z][A-Za-z0-9_]*$": f"{_ANY} and '_', with a small letter first, such as memoryGiB",
     r"^[a-z0-9./-]+$": f"{_LOWER}, '.', '/' and '-', such as cpu or nvidia.com/gpu",
     r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
     r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, such as ROS_DOMAIN_ID",

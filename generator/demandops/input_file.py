@@ -12,7 +12,7 @@ def read_input(file: str | Path) -> tuple[str, str]:
     """Return the name of a file for messages, and its text; ``-`` is standard input.
 
     Raises:
-        InvalidInput: if it cannot be read or is not UTF-8.
+        InvalidInput: if the file cannot be read or is not UTF-8.
     """
     name = "standard input" if file == "-" else str(file)
     try:
@@ -33,7 +33,7 @@ def read_secret(path: Path, *, private: bool = False) -> bytes:
         private: whether to refuse a file that other users may read.
 
     Raises:
-        InvalidInput: if it holds no secret, cannot be read, or is not private enough.
+        InvalidInput: if the file holds no secret, cannot be read, or is not private enough.
     """
     secret = b""
     try:

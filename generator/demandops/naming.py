@@ -53,8 +53,8 @@ def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
     An id that gives no valid name in this way gets a hash. ``extra`` keeps names with the same id
-    apart, for example two point clouds of one source. The name gets it as a slug with a hash. The
-    result is cached, because a release names all its inputs each time.
+    apart, for example two point clouds of one source. The name gets ``extra`` as a slug with a
+    hash. The result is cached, because a release names all its inputs each time.
     """
     plain = re.sub("[-/]", "_", id)
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):

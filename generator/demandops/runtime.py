@@ -5,7 +5,7 @@ clock that it moves, numbers from a seed, and threads that take turns. An object
 uses the repo's runtime. Commands, git's processes and locks, HTTP and ROS's executors always use
 :data:`REAL`.
 
-It also supervises the threads: none ends unseen.
+It also supervises the threads, so that no thread fails unnoticed.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes, from a cache, because words come often."""
+    """Return the tag of a scalar without quotes, from a cache, because words repeat often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -82,7 +82,7 @@ class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
     It refuses a text that is nested so deeply that code which reads the values could fail.
-    ``lists`` are the lists that the text has stand-ins for.
+    ``lists`` are the lists that replace the stand-ins in the text.
     """
 
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
@@ -230,7 +230,7 @@ def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]
     """Yield the documents of ``text``; more than ``most`` are an error.
 
     Raises:
-        InvalidInput: if it is not strict YAML; the fault names ``file``.
+        InvalidInput: if ``text`` is not strict YAML; the fault names ``file``.
     """
     if len(text) > MAX_LENGTH:
         message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
@@ -250,7 +250,7 @@ _STAND_IN = "demandops-list"
 
 
 def _load_around_lists(text: str) -> list[Any]:
-    """Return a list of the one document in a text with long lists, an empty one in other cases."""
+    """Return a list with the only document of a text that has long lists, else an empty list."""
     lists: dict[str, list[str]] = {}
 
     def stand_in(match: re.Match[str]) -> str:
@@ -272,7 +272,7 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
     """Return the only document of ``text``, or ``None`` if it is empty.
 
     Raises:
-        InvalidInput: if it is not strict YAML; the fault names ``file``.
+        InvalidInput: if ``text`` is not strict YAML; the fault names ``file``.
     """
     documents = _load_around_lists(text) or list(load_all(text, file, most=1))
     return documents[0] if documents else None
@@ -297,9 +297,9 @@ _MOST_OF_KEY = 100
 
 
 def _block(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return a value as it stands behind ``key:`` or ``-``, for lines that begin with ``indent``.
+    """Return the text of a value after ``key:`` or ``-``, for lines that begin with ``indent``.
 
-    It is what PyYAML writes, in a tenth of the time.
+    PyYAML writes the same text, but takes ten times as long.
     """
     if isinstance(value, str):
         return f" {_scalar(value)}"

@@ -1,4 +1,4 @@
-"""Subjects: the application or connection, by its exact id, that a claim holds."""
+"""Subjects of claims: an application or a connection, by its exact id."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     from demandops_ros import DemandClient
 
-The names of the client are imported when they are first used, because rclpy is slow to import and
-the command line does without it.
+The client's names are imported only when they are used, because rclpy is slow to import and the
+command line does not need it.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""The ends of an action: a client with deep queues, and a search for other servers of a name."""
+"""The client of an action, with deep queues, and a search for other nodes that serve the action."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from unique_identifier_msgs.msg import UUID
 from demandops_ros.ros_process import ExecutorThread
 
 DEEP_QOS = QoSProfile(depth=2000)
-"""The queues for goals, results, cancels and feedback. ROS's default of 10 loses messages of a
-burst, because a client's queue also gets the answers to other clients."""
+"""The queues for goals, results, cancels and feedback. ROS's default of 10 is too small
+for a burst, because a client's queue also gets the answers to other clients."""
 
 _UNHEARD_S = 5.0
-"""Seconds until a goal counts as lost; a node accepts a goal within milliseconds."""
+"""Seconds without a response until a goal counts as lost; a node responds within milliseconds."""
 
 _ASK_AGAIN_S = 0.2
 
@@ -35,7 +35,9 @@ class DemandError(Exception):
 
 
 def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
-    """Ask a node to cancel a goal that nobody has sent; its answer shows that it knows the client.
+    """Ask a node to cancel a goal that nobody has sent, and return the future of the answer.
+
+    The answer shows that the node has discovered the client.
 
     A client discovers the node before the node discovers the client, and an answer to a client
     that is not discovered yet is lost.
@@ -47,7 +49,7 @@ def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rcl
 class GoalSender:
     """Sends goals of one action and waits for the answers; many threads may send at once.
 
-    It works beside the caller's own rclpy: it has its own context and thread.
+    The sender has its own ROS context and thread, separate from the caller's own use of rclpy.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class GoalSender:
 
         Args:
             action: the action's class.
-            action_name: the name under which a node serves it.
+            action_name: the name under which a node serves the action.
             node_name: the name of the client's own ROS node.
             timeout_s: how long to wait for the node, and for each answer.
             domain_id: the ROS domain; the environment's if left out.
@@ -98,8 +100,8 @@ class GoalSender:
         """Send a goal and wait for its result.
 
         Returns:
-            Whether the goal succeeded, its result, and whether an earlier attempt was lost, which
-            may have succeeded as well.
+            Whether the goal succeeded, its result, and whether an earlier attempt was lost. A lost
+            attempt may have succeeded as well.
 
         Raises:
             DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
@@ -119,7 +121,7 @@ class GoalSender:
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
 
     def _wait_until_discovered(self, deadline: float) -> None:
-        """Wait until a node answers; if none does in time, the goal will fail with the reason."""
+        """Wait until a node answers, but not after the deadline; then the goal times out."""
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
                 self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
@@ -133,9 +135,9 @@ class GoalSender:
         on_feedback: Callable[[Any], None],
         deadline: float,
     ) -> tuple[Any, bool]:
-        """Send a goal until the node responds; return its handle and whether an attempt was lost.
+        """Send a goal until a node responds; return the goal's handle and if an attempt was lost.
 
-        The response is lost if the node was replaced by one that has not discovered this client
+        The response is lost if a new node replaced the old one and has not discovered this client
         yet. Sending again is harmless: a demand that is put twice counts once.
         """
         lost = False
@@ -169,7 +171,7 @@ class OtherServers:
         self._found = {node.resolve_service_name(action): list[str]() for action in actions}
 
     def find(self) -> dict[str, list[str]]:
-        """Return the other nodes that serve each action, as far as they are discovered."""
+        """Return the other nodes known to serve each action, by action."""
         for action, others in self._found.items():
             now = self._others(action)
             if now and now != others:
@@ -183,9 +185,9 @@ class OtherServers:
         return self._found
 
     def _others(self, action: str) -> list[str]:
-        """Return the nodes that publish an action's status, without this one."""
+        """Return the nodes that publish an action's status, except this node."""
         publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
         names = [f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers]
         if self._own in names:
-            names.remove(self._own)  # removes it once, because another node may have the same name
+            names.remove(self._own)  # only once, because another node may have this name
         return sorted(names)

@@ -46,9 +46,9 @@ _PAUSE_FACTOR = 20
 
 
 class BookkeepingTopic:
-    """Publishes the bookkeeping on ``~/bookkeeping`` after each change; late joiners get the last.
+    """Publishes the bookkeeping on ``~/bookkeeping`` after each change, also for late subscribers.
 
-    The work grows with the ledger, so a thread of its own does it, and rests for 19 times as long.
+    The work grows with the ledger. So a separate thread does it, then pauses 20 times as long.
     """
 
     def __init__(

@@ -8,7 +8,8 @@
             print(demand.commit)     # published; released at the end of the block
 
 Applications and connections have the fields of a YAML document of the kind ``Demand``
-(docs/demand.md). The client works beside the caller's own rclpy: it has its own context and thread.
+(docs/demand.md). The client has its own ROS context and thread, separate from the caller's own use
+of rclpy.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ StageListener = Callable[[str, str], None]
 """Called with each stage and its text, in the client's thread."""
 
 _RENEW_AFTER = 1 / 3
-"""The fraction of a lease after which to renew it; two more attempts fit before its end."""
+"""The fraction of a lease after which to renew it; two more attempts fit before the lease ends."""
 _RETRY_S = 5.0
 
 
@@ -128,7 +129,7 @@ class DemandClient:
         """Renew a demand's leases, and return the answer.
 
         Raises:
-            DemandError: as :meth:`put`; ``not-held`` if it has ended.
+            DemandError: as :meth:`put`; ``not-held`` if the demand has ended.
         """
         return self.send({"operation": "renew", "demand": demand})
 
@@ -136,7 +137,7 @@ class DemandClient:
         """Release all that a demand holds, and return the answer.
 
         Raises:
-            DemandError: as :meth:`put`; ``not-held`` if it holds nothing.
+            DemandError: as :meth:`put`; ``not-held`` if the demand holds nothing.
         """
         return self.send({"operation": "release", "demand": demand})
 
@@ -164,7 +165,7 @@ class DemandClient:
 
 
 class HeldDemand:
-    """A demand that is put when a block starts, renewed while it runs and released at its end."""
+    """A demand that is put at the start of a block, renewed during it and released at its end."""
 
     def __init__(self, client: DemandClient, demand: str, put: Callable[[], Answer]) -> None:
         self.id = demand

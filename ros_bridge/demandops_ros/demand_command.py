@@ -9,6 +9,7 @@ import click
 from demandops import strict_yaml
 from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import console, errors
+from demandops.config.durations import duration_text
 from demandops.errors import InvalidInput, fault
 from demandops.input_file import read_input
 from demandops.runtime import REAL
@@ -100,7 +101,7 @@ def _print_answer(answer: Answer, output: str) -> None:
             }
         )
         return
-    lease = f", for {answer.lease_s:g} s unless renewed" if answer.lease_s else ""
+    lease = f", for {duration_text(answer.lease_s)} unless renewed" if answer.lease_s else ""
     console().print(f"{answer.outcome} in {answer.commit}{lease}")
     for warning in answer.warnings:
         errors.print(f"warning: {warning}")

@@ -9,7 +9,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Duration
 from demandops.cluster.health.release_health import Level
-from demandops.config.policy import seconds_of
+from demandops.config.durations import seconds_of
 from demandops.connections.route import RouteOptions
 from demandops.errors import suggestion
 from demandops.settings import API_VERSION
@@ -18,7 +18,7 @@ from demandops_interfaces.action import Demand as DemandMessage
 
 
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-    """Return a message as mappings, lists and plain values, as its YAML form parses.
+    """Return a message as mappings, lists and plain values, like those of its YAML form.
 
     A ``DeploymentRequest.Goal`` becomes what
     :func:`demandops.demand.deployment_request_goal.parse` takes, so that a goal over ROS 2 equals
@@ -44,7 +44,7 @@ _DEMAND = {
     "priority": "priority",
 }
 _APPLICATION = {"id": "id", "type": "type", "node": "node_id", "version": "version"}
-_PLACE = {"role": "role", "labels": "labels", "capabilities": "capabilities"}
+_PLACE = {name: name for name in ("role", "labels", "capabilities", "properties")}
 _DELIVERY = {"output": "output", "node": "node_id", "topic": "topic_name"}
 _POSITION = {"node": "node_id", "x": "x", "y": "y"}
 _INPUT = {"topic": "topic_name", "source": "source_node_id", "type": "type"}
@@ -61,7 +61,8 @@ _ROUTE |= {name: name for name in RouteOptions.model_fields}
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return a ``Demand.Goal`` as plain data for :func:`demandops.demand.demand_goal.parse`.
 
-    A number that the message does not define becomes text, which the parser refuses by field.
+    A number that the message does not define becomes text. The parser refuses the text and names
+    the field.
     """
     data = {
         "apiVersion": API_VERSION,
@@ -108,6 +109,7 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
         inputs.setdefault(item.role, []).append(_data(item, _INPUT))
     return {
         **_data(app, _APPLICATION),
+        "services": dict(_pair(text) for text in app.services),
         "inputs": inputs,
         "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
         "connect": _word(_TYPES, app.connect),
@@ -117,12 +119,13 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    more = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver"}
+    more = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver", "services"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
     return messages.Application(
         **_fields(data, _APPLICATION, more, "an application"),
         **_fields(data.get("place", {}), _PLACE, set(), "a place"),
+        services=[f"{name}={node}" for name, node in data.get("services", {}).items()],
         deliver=[
             messages.Delivery(**_fields(delivery, _DELIVERY, set(), "a delivery"))
             for delivery in data.get("deliver", ())
@@ -135,6 +138,12 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
         parameters=[messages.Parameter(name=name, value_json=v) for name, v in values.items()],
         connect=_number(_TYPES, data.get("connect", "auto"), "connect"),
     )
+
+
+def _pair(text: str) -> tuple[str, str]:
+    """Return the service and the node of ``service=node``; without ``=`` there is no node."""
+    service, _, node = text.partition("=")
+    return service, node
 
 
 def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -35,18 +35,21 @@ from demandops_ros.diagnostics import Diagnostics
 _RESULT_KEPT_S = 900
 """How long a client may ask for a result, instead of rclpy's ten seconds."""
 _DEFAULT_DEPTH = 10
-"""How many answers ROS 2 queues for a client by default; it drops older ones."""
+"""How many answers ROS 2 queues for a client by default; it drops older answers."""
 _SHALLOW = (
     f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
     f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
 )
 _MOST_READERS = 4
-"""How many calls of the bookkeeping's service to answer at once; each may read all of history."""
+"""How many calls of the bookkeeping service to answer at once; each may read the whole history."""
 
 
 @dataclass(eq=False)
 class _Goal:
-    """A goal, its demand, and its handle once it is accepted; ``feedback`` waits for the handle."""
+    """A goal, its demand and, after the acceptance, its handle.
+
+    ``feedback`` keeps the feedback that comes before the handle.
+    """
 
     adapter: DeploymentRequestAdapter
     message: Any
@@ -90,7 +93,7 @@ class DemandNode(Node):  # type: ignore[misc]
         """The goals without a result, by the identity of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
-        # a callback group of its own, so that a service that waits does not block the events
+        # a separate callback group, so that a waiting service call does not block the events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
         )
@@ -126,7 +129,7 @@ class DemandNode(Node):  # type: ignore[misc]
         )
 
     def close(self) -> None:
-        """Stop the threads beside the executor."""
+        """Stop the node's threads, except the executor's."""
         self._bookkeeping_topic.close()
 
     @property
@@ -135,7 +138,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer a call of the service, in another thread: an old revision may take seconds."""
+        """Answer a call of the service in another thread, because an old revision takes seconds."""
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response
@@ -161,8 +164,8 @@ class DemandNode(Node):  # type: ignore[misc]
     ) -> GoalResponse:
         """Accept a goal once its demand is in the journal, so that no crash loses an accepted goal.
 
-        Goals that come meanwhile share the next sync. An invalid goal is accepted too, because a
-        result can contain the reason, but a rejection cannot.
+        Goals that arrive while the journal syncs share the next sync. An invalid goal is accepted
+        too, because a result can contain the reason, but a rejection cannot.
         """
         goal = self._goals[id(message)] = _Goal(adapter, message)
         journaled = Future(executor=self.executor)
@@ -179,7 +182,7 @@ class DemandNode(Node):  # type: ignore[misc]
                 self.executor.create_task(self._forget_unless_accepted, goal)
                 return GoalResponse.ACCEPT
             error = goal.ticket.future.exception()
-            if isinstance(error, Unsound):  # nobody may be told anything; the process ends
+            if isinstance(error, Unsound):  # answer nobody; the process ends
                 await Future(executor=self.executor)
             self.get_logger().error(f"{goal} rejected: {one_line(str(error))}")
         except Exception as error:
@@ -234,9 +237,9 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- an accepted goal, in the executor's thread ----
 
     def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
-        """Call ``step`` with a future's result or error, in the executor, once there is one.
+        """When a future is done, call ``step`` with its result or error, in the executor.
 
-        It uses no coroutine: rclpy's executor would resume each waiting coroutine at each event.
+        There is no coroutine, because rclpy's executor would resume all of them at each event.
         """
 
         def take() -> None:
@@ -249,7 +252,7 @@ class DemandNode(Node):  # type: ignore[misc]
         future.add_done_callback(lambda _: self._in_executor(take))
 
     def _answer(self, goal: _Goal, outcome: Receipt | BaseException) -> None:
-        if isinstance(outcome, Unsound):  # nobody may be told anything; the process ends
+        if isinstance(outcome, Unsound):  # answer nobody; the process ends
             return
         level = goal.adapter.answer_level(goal.message) or self._level
         if not isinstance(outcome, Receipt) or level == "pushed":
@@ -299,7 +302,7 @@ class DemandNode(Node):  # type: ignore[misc]
         while self._events:
             try:
                 self._events.popleft()()
-            except Exception as error:  # a failure must not keep events from other goals
+            except Exception as error:  # a failure must not stop the events of other goals
                 REAL.failed("events of goals", error)
 
 

@@ -1,8 +1,8 @@
 """The parameters of the reference's node, and what replaces them here.
 
-A fleet may start our node with the parameter file of the reference's node, whose name there is
+A fleet may start our node with the parameter file of the reference's node. The file calls that node
 ``application_manager``. Our node takes the action's name from the file. Brokers, topics and
-namespaces come from the state repo; a value in the file that the repo lacks gets a warning.
+namespaces come from the state repo. Each value in the file that the repo lacks causes a warning.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def read(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter that has no effect, and what replaces it."""
+    """Yield a warning for each parameter that has no effect; it names the replacement."""
     for name in dict.fromkeys(each.partition(".")[0] for each in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"

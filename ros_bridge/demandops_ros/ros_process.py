@@ -1,4 +1,4 @@
-"""A process with ROS: its ROS arguments, its log in ROS's log, its executor's thread, its end."""
+"""What a process with ROS needs: ROS arguments, a log, an executor's thread and stop signals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LAST_CALLBACK_S = 20.0
 
 
 class ExecutorThread:
-    """Runs a node's callbacks in a thread, which ends before its node, and before Python.
+    """Runs a node's callbacks in a thread that ends before the node, and before Python.
 
     The thread ends itself, because rclpy's ``shutdown`` waits for no callback and destroys what the
     thread may need. A thread that still waits for ROS when Python ends aborts the process.
@@ -37,7 +37,7 @@ class ExecutorThread:
         self._executor.add_node(node)
         self._over = REAL.event()
         self._thread = REAL.keep_running(name, self._spin)
-        atexit.register(self.close)  # it may be that nobody else does
+        atexit.register(self.close)  # in case no caller does
 
     def call(self, callback: Callable[[], object]) -> None:
         """Call ``callback`` in the thread."""
@@ -66,7 +66,7 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
 
     def wait() -> None:
-        while not over.wait(_POLL_S):  # a signal may come to another thread
+        while not over.wait(_POLL_S):  # the kernel may deliver a signal to another thread
             pass
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
@@ -124,7 +124,7 @@ def started(
 
 
 def log_to(logger: RcutilsLogger, level: str) -> None:
-    """Pass the generator's log on to a logger of ROS, from this level on."""
+    """Pass the generator's log records of at least this level to a logger of ROS."""
     set_logger_level(logger.name, LoggingSeverity[level.upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [RosLogHandler(logger)], False

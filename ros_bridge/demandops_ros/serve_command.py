@@ -13,7 +13,7 @@ import click
 from demandops.cli.main import ExitCode
 from demandops.cli.output import errors, progress
 from demandops.cli.target import signing_option
-from demandops.cluster import access, reconcile_trigger
+from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
 from demandops.cluster.rollout_watcher import RolloutWatcher
 from demandops.input_file import read_secret
@@ -27,7 +27,7 @@ from demandops.web.server import WebServer
 from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros import parameters, reference_parameters, ros_process
+from demandops_ros import node_parameters, reference_parameters, ros_process
 from demandops_ros.node import DemandNode
 
 _POLL_S = 0.02
@@ -109,11 +109,11 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
     \b
     Examples:
       demandops serve --state-repo fleet.git
-      demandops serve --state-repo https://git.example/fleet.git --clusters clusters.yaml
+      demandops serve --state-repo https://git.example/fleet.git --clusters c.yaml
     """
     with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args:
         of_reference = reference_parameters.read(ros_args)
-        settings = parameters.read(
+        settings = node_parameters.read(
             {
                 "action_name": of_reference.get(reference_parameters.ACTION_NAME),
                 "state_repo": state_repo,
@@ -123,7 +123,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         # the generator may publish demands of the journal before the node exists
         ros_process.log_to(get_logger("demandops"), settings["log_level"])
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
-        clusters = access.read(access_file).clusters if access_file else {}
+        clusters = clusters_file.read(access_file).clusters if access_file else {}
         with progress("reading the ledger") as report:
             generator = Generator(
                 settings["state_repo"],
@@ -166,7 +166,7 @@ def _page(
     address: str,
     generator: Generator,
     settings: dict[str, Any],
-    clusters: Mapping[str, access.ClusterAccess],
+    clusters: Mapping[str, clusters_file.ClusterAccess],
 ) -> WebServer:
     """Start and return the web page, which fetches the state repo itself, as often as the node."""
     interval = parse_interval(settings["fetch_interval"])
@@ -195,7 +195,7 @@ def _run(
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
         # read only, because the parameters are read at the start
-        node.declare_parameter(name, shown, parameters.descriptor(name, read_only=True))
+        node.declare_parameter(name, shown, node_parameters.descriptor(name, read_only=True))
     ros_process.log_to(node.get_logger(), settings["log_level"])
     # a thread of its own, so that the main thread notices a signal at once
     thread = ros_process.ExecutorThread(node)
@@ -230,7 +230,7 @@ def _drain(
         done = REAL.event()
         thread.call(done.set)
         done.wait(_TASK_S)
-    REAL.sleep(_FLUSH_S)  # time for clients to request them
+    REAL.sleep(_FLUSH_S)  # time for clients to request the results
     if not published:
         node.get_logger().warning(
             "the journal is not empty; its demands are resumed at the next start"
@@ -264,9 +264,9 @@ class _Signals:
         signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Wait for a signal, or until ``until`` holds; :meth:`wake` makes it look again.
+        """Wait for a signal, or until ``until()`` is true; after :meth:`wake`, check again.
 
-        If :class:`Unsound` was raised, because a demand could be lost, this ends the process.
+        If :class:`Unsound` was raised, because a demand could be lost, end the process.
         """
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)
@@ -275,7 +275,7 @@ class _Signals:
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly end could still answer goals
 
     def wake(self) -> None:
-        """Make :meth:`wait` look again; any thread may call it."""
+        """Make :meth:`wait` check again; any thread may call this."""
         os.write(self._write, b"\0")
 
     def _handle(self, number: int, frame: FrameType | None) -> None:

@@ -5,7 +5,7 @@ ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works without any
 variable. In a ROS installation colcon builds the same packages, without this script.
 
 The environment has a record of what is installed. A build deletes the record before it changes the
-first installed file and writes it at its end, so an interrupted build never counts as finished.
+first installed file and writes a new one last, so an interrupted build never counts as finished.
 
 Exit codes: 0 installed or already up to date, 1 a requirement is missing (the message names it),
 2 usage, 3 a stage failed, 130 interrupted.
@@ -267,8 +267,8 @@ def _stage(stage: str, command: list[str], log: Path) -> None:
 
 def _environ() -> dict[str, str]:
     """Return the environment of a stage, without variables that point to another ROS or prefix."""
-    # The wheels set the last one once a Python has its library path. It is inherited, so it may
-    # come from another environment's wheels.
+    # The wheels set BOOTSTRAPPED in a Python that has their library path. Child processes
+    # inherit it, so it may come from another environment's wheels.
     foreign = ("CMAKE_PREFIX_PATH", "DESTDIR", "PYTHONHOME", "PYTHONPATH", BOOTSTRAPPED)
     kept = {name: value for name, value in os.environ.items() if name not in foreign}
     return {**kept, "AMENT_PREFIX_PATH": str(PREFIX)}

@@ -15,10 +15,11 @@ from tests.kit.bag import write_bag
 from . import crowd, figures, report, routes
 from .bags import bag_tracks
 from .checks import checks
-from .experiment import ROOT, Experiment, Settings
+from .experiment import ROOT, Experiment
 from .fleet import Carrier
 from .large import LargeExperiment
 from .measures import STAGES, quantiles, savings, steps
+from .outcome import Settings
 from .rules import Near
 
 

@@ -9,8 +9,8 @@ from examples.experiment import paper
 from tests.e2e.common.expected import FUSION
 
 from . import fleet
-from .experiment import Outcome
 from .measures import steps
+from .outcome import Outcome
 from .participants import EGO_DATA
 from .routes import VEHICLES
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import yaml
 
-from tests.e2e.common.running import CLUSTER
+from tests.e2e.common.expected import CLUSTER
 
 from .checks import Check, check_nodes, differ
-from .experiment import Formed, Outcome
+from .outcome import Formed, Outcome
 from .routes import MIDDLES
 from .rules import RULES, Event, Near, Pose, events_of
 

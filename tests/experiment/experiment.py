@@ -11,27 +11,25 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from examples.experiment import paper
 from tests.e2e.common.answers import limited_world
+from tests.e2e.common.expected import CLUSTER
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import CLUSTER
 from tests.e2e.common.staterepo import StateRepo, demandops, environment
 from tests.e2e.rig import launch
-from tests.e2e.rig.cluster import Gitops, Rig
+from tests.e2e.rig.cluster import Rig
 from tests.kit.ros import reserved
 
 from . import fleet, routes
 from .broker import Broker
-from .fleet import Carrier
 from .observers import CloudObserver, EdgeObserver
+from .outcome import Formed, Outcome, Settings
 from .participants import POSE, Plan
-from .process_runner import ProcessRunner, RunningPod
-from .routes import Way
-from .rules import Event, Near, Pose, causes, events_of, poses_in, predicted
+from .process_runner import ProcessRunner
+from .rules import Event, Near, causes, events_of, poses_in, predicted
 from .standins.image import image
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,72 +37,6 @@ _PATIENCE_S = 120.0
 _STAND_S = 0.5
 """How long before something happens the vehicles stand, if they have to."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What to play: routes by a seed, or the tracks of a bag."""
-
-    gitops: Gitops = "flux"
-    connections: Carrier = "mqtt"
-    seed: int = 0
-    gap: float = 10.0
-    short: bool = False
-    vanish: str = ""
-    bag: str = ""
-    large: int = 0
-    tracks: tuple[Way, ...] = ()
-
-    def routes(self) -> tuple[Way, ...]:
-        """Return who drives where."""
-        if self.tracks:
-            return self.tracks
-        if self.large:
-            return routes.many(self.seed, self.large)
-        found = routes.one(self.seed, self.gap) if self.short else routes.four(self.seed, self.gap)
-        return routes.vanishing(found, self.vanish) if self.vanish else found
-
-
-@dataclass(frozen=True)
-class Formed:
-    """A demand that the detector formed: its commit, its stages, and what was booked after it."""
-
-    commit: str
-    vehicle: str
-    joins: bool
-    stages: dict[str, float]
-    books: dict[str, list[str]] | None  # None: nobody looked
-
-    def __str__(self) -> str:
-        return f"{self.vehicle} {'joins' if self.joins else 'leaves'}"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """All that was seen. Times are seconds since 1970."""
-
-    settings: Settings
-    routes: tuple[Way, ...]
-    near: Near
-    set_off: float
-    over: float
-    held: float
-    poses: list[Pose]
-    events: list[Event]
-    formed: list[Formed]
-    pods: list[RunningPod]
-    node_ids: dict[str, str]
-    inputs: list[tuple[float, frozenset[str]]]
-    fused: list[tuple[float, float, int]]
-    tracks: list[tuple[float, list[tuple[float, float]]]]
-    arrivals: dict[str, list[float]]
-    early: int
-    published: dict[str, dict[str, int]]
-    carried: dict[str, int]
-    left: frozenset[str]
-    before: frozenset[str]
-    crossings: tuple[Near, ...] = ()
-    """All intersections, if there are more."""
 
 
 Say = Callable[[str], object]
@@ -214,7 +146,7 @@ class Experiment:
             if not self._reaches(lambda n=number: self._is_settled(n, first_commit), _PATIENCE_S):
                 self._say(f"'{event}' did not have all its consequences; the drive goes on")
         self._wait("the last demands", lambda: self._released(first_commit, len(happens)))
-        self._wait("the last pods", self._is_as_before)
+        self._wait_until_as_before(_PATIENCE_S)
         time.sleep(2.0)  # messages that should not come had time to come
         over, left = time.time(), self._world.domain.lines()
         self._end(self._detector)
@@ -295,8 +227,15 @@ class Experiment:
         pods = [line for line in self._world.domain.lines() if line.startswith("pod of ")]
         return all(line.endswith(", ready") for line in pods)
 
-    def _is_as_before(self) -> bool:
-        return self._world.domain.lines() == self._before
+    def _lines(self) -> frozenset[str]:
+        return self._world.domain.lines()
+
+    def _wait_until_as_before(self, seconds: float) -> None:
+        """Wait until the clusters have what they had before the first demand."""
+        if not self._reaches(lambda: self._lines() == self._before, seconds):
+            lines = self._lines()
+            stays, lacks = sorted(lines - self._before), sorted(self._before - lines)
+            raise AssertionError(f"after {seconds:.0f} s too much: {stays}, missing: {lacks}")
 
     def _books(self, commit: str) -> dict[str, list[str]]:
         """Return who requests what after a commit, without the initial deployment."""

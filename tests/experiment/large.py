@@ -16,15 +16,16 @@ from pathlib import Path
 import yaml
 
 from tests.e2e.common.access import documented_roles, limited
+from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import CLUSTER
 from tests.e2e.flux.world import World
 from tests.e2e.rig.cluster import Rig
 from tests.kit.ros import reserved
 
 from . import crowd
-from .experiment import Experiment, Formed, Outcome, Say, Settings
+from .experiment import Experiment, Say
 from .observers import CloudObserver
+from .outcome import Formed, Outcome, Settings
 from .participants import Plan
 from .process_runner import ProcessRunner
 from .rules import poses_in
@@ -81,7 +82,9 @@ class LargeExperiment(Experiment):
         self._wait("the second cluster's bootstrap file", lambda: self._exists(bootstrap))
         access, self._watches = {}, []
         for name, rig in self._rigs.items():
-            namespace = world.bootstrap(name, rig).namespace
+            domain = world.bootstrap(name, rig)
+            domain.wait_lines(WITHOUT_DEMANDS)  # also what Kubernetes adds to a namespace, later
+            namespace = domain.namespace
             rights = limited(
                 rig.kube, rig.kubeconfig, self._made(f"access-{name}"), documented_roles("flux")
             )
@@ -125,7 +128,7 @@ class LargeExperiment(Experiment):
         poses = poses_in(self._folder / "poses.jsonl")
         events = crowd.events(poses, passing, time.time())
         self._wait("the last demands", lambda: len(self._commits(first)) >= len(events), 300)
-        self._wait("the last pods", lambda: self._lines() == self._before, 300)
+        self._wait_until_as_before(300)
         over = time.time()
         self._end(self._detector)
         self._participants.send_signal(signal.SIGTERM)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from . import fleet
-from .experiment import Formed, Outcome
-from .process_runner import RunningPod
+from .outcome import Formed, Outcome
 from .rules import Event
+from .running_pod import RunningPod
 
 STAGES = ("demand", "commit", "pods", "fused")
 

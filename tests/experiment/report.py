@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from html import escape
 
 from .checks import Check
-from .experiment import Outcome
 from .measures import STAGES, quantiles, running, savings, steps
+from .outcome import Outcome
 from .participants import EGO_DATA
 from .routes import FAR_M
 

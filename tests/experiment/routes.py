@@ -11,6 +11,7 @@ import random
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Protocol
 
 RADIUS_M = 84.0
@@ -191,13 +192,21 @@ def many(seed: int, count: int) -> tuple[Route, ...]:
 
 
 def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
-    """Return the routes, with a vehicle that falls silent in the middle."""
-    return tuple(
-        replace(route, vanishes=(route.enters + route.leaves) / 2)
-        if route.vehicle == vehicle
-        else route
+    """Return the routes, with a vehicle that falls silent while it is near.
+
+    It does so in the middle of the longest time in which nothing else happens: while the vehicles
+    stand because of another event, it would not.
+    """
+    (lost,) = (route for route in routes if route.vehicle == vehicle)
+    moments = sorted(
+        moment
         for route in routes
+        for moment in (route.enters, route.leaves)
+        if lost.enters <= moment <= lost.leaves
     )
+    before, after = max(pairwise(moments), key=lambda pair: pair[1] - pair[0])
+    silent = replace(lost, vanishes=(before + after) / 2)
+    return tuple(silent if route is lost else route for route in routes)
 
 
 def _shuffled(chance: random.Random) -> list[str]:

@@ -12,11 +12,11 @@ import pytest
 from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
 from tests.experiment import fleet, report, routes
 from tests.experiment.checks import checks
-from tests.experiment.experiment import Formed, Outcome, Settings
 from tests.experiment.measures import savings, steps
+from tests.experiment.outcome import Formed, Outcome, Settings
 from tests.experiment.participants import EGO_DATA
-from tests.experiment.process_runner import Container, RunningPod
 from tests.experiment.rules import Near, events_of
+from tests.experiment.running_pod import Container, RunningPod
 
 from .test_routes import drive
 

@@ -10,7 +10,7 @@ from demandops.detection.rules import rule_file
 from demandops.detection.rules.rule_file import RuleFile
 
 from tests.experiment import crowd, report, routes
-from tests.experiment.experiment import Formed, Outcome, Settings
+from tests.experiment.outcome import Formed, Outcome, Settings
 from tests.experiment.rules import Near, predicted
 
 COUNT, OVER = 12, 60.0

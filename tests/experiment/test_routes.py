@@ -14,9 +14,9 @@ from rosbags.rosbag2 import StoragePlugin
 from examples.experiment import paper
 from tests.experiment import fleet, routes
 from tests.experiment.bags import bag_tracks
-from tests.experiment.process_runner import path_in_pod, program_of, quantity
 from tests.experiment.routes import Way
 from tests.experiment.rules import Event, Near, Pose, causes, events_of, predicted
+from tests.experiment.running_pod import path_in_pod, program_of, quantity
 from tests.kit.bag import write_bag
 
 NEAR = Near.read()
@@ -62,6 +62,16 @@ def test_vehicles_drive_in_from_one_road_and_out_on_another() -> None:
         assert route.distance(route.enters) == pytest.approx(84)
         assert route.distance((route.enters + route.leaves) / 2) == pytest.approx(0)
         assert route.distance(0) == route.distance(1000) == routes.FAR_M
+
+
+@pytest.mark.parametrize("vehicle", routes.VEHICLES)
+def test_a_vehicle_vanishes_while_nothing_else_happens(vehicle: str) -> None:
+    """Seed 5 let vehicle02 vanish 7 ms before another one came; the vehicles stood for both."""
+    for seed in range(30):
+        silent = routes.vanishing(routes.four(seed, GAP_S), vehicle)
+        (moment,) = (route.vanishes for route in silent if route.vehicle == vehicle)
+        others = [at for route in silent for at in (route.enters, route.leaves)]
+        assert min(abs(moment - at) for at in others) > 1
 
 
 def test_a_vehicle_that_falls_silent_leaves_after_the_time_out() -> None:

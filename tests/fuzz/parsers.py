@@ -44,7 +44,7 @@ from demandops.ledger.ledger import Ledger
 from demandops.migration import imported_goals, reference_files, reference_map
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.ticket import ticket_from_journal
-from demandops.staterepo.git import address as addresses
+from demandops.staterepo.git import open_repository as addresses
 from demandops.staterepo.history import commit_log, revisions
 from demandops.staterepo.write import journal
 from demandops_interfaces.action import Demand

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from demandops.cli.contexts import ContextsFile
 from demandops.cli.repo.schema import SCHEMAS
-from demandops.cluster.access import AccessFile
+from demandops.cluster.clusters_file import AccessFile
 from demandops.detection.rules.rule_file import RuleFile
 from demandops.migration.reference_map import ReferenceMap
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +34,9 @@ spec:
     kind: GitRepository
     name: "demandops"
 """
-NO_HELM = "charts not rendered: helm is missing\n"
+NO_HELM = (
+    "charts not rendered: helm is missing; install it and put it on PATH, or name it in HELM_BIN\n"
+)
 LINK: dict[str, object] = {"id": "a/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
 LINK |= {"topics": [{"source": "/a"}]}
 Check = Callable[..., tuple[int, str, str]]
@@ -249,6 +252,17 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
     assert "'object-detection-fusion' is in use, but appdefs/object-detection-fusion is gone" in err
 
 
+def test_a_first_bootstrap_is_told_and_not_printed(checkout: Path, check: Check) -> None:
+    assert run(["new", "node", "v9", "--type=vehicle", "--cluster=c9", f"-C{checkout}"]) == 0
+    code, out, errors = check()
+    assert code == 0
+    assert (
+        "warning: bootstrap/c9.yaml: is new with the merge, and no controller applies it" in errors
+    )
+    assert "  write  bootstrap/c9.yaml (new, " in out
+    assert "kind: Namespace" not in out
+
+
 def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check: Check) -> None:
     policy = checkout / "policy" / "access-domains.yaml"
     kinds = "ConfigMap, Deployment, HorizontalPodAutoscaler, Secret"
@@ -256,7 +270,7 @@ def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check
     code, _, errors = check()
     assert code == 0
     charts = "appdefs/object-detection-fusion/charts"
-    assert [line.split(": ")[1] for line in errors.splitlines()] == [
+    assert [re.sub(r":\d+$", "", line.split(": ")[1]) for line in errors.splitlines()] == [
         "appdefs/charts/ros-service/templates/_serviceaccount.yaml",
         *[f"{charts}/object-fusion/templates/watcher-rbac.yaml"] * 2,
         "bootstrap/c-its.yaml",

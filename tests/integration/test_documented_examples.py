@@ -73,6 +73,7 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
     assert decision.warnings == ()
 
 
+_NO_NODE = "no-node: applications[0].place: no node fits: "
 _EDGE = "nodes:\n- {id: edge, type: edge, cluster: c-its,"
 
 
@@ -95,7 +96,7 @@ def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
     goal["applications"][0]["place"]["capabilities"].append("fpga")
     with pytest.raises(Refused) as refused:
         repo.decide(goal)
-    assert refused.value.text_with_codes() == said("no-node:")
+    assert refused.value.text_with_codes() == said(f"{_NO_NODE}'edge-north' lacks the c")
 
 
 def test_a_service_of_the_documentation_gets_the_node_that_it_says() -> None:
@@ -109,6 +110,44 @@ def test_a_service_of_the_documentation_gets_the_node_that_it_says() -> None:
     files = {"inventory/nodes.yaml": yaml.safe_dump(inventory), appdef: yaml.safe_dump(definition)}
     decision = MemoryRepo(files).send(demand())
     assert decision.placed == (block("placement.md", "service 'object-fusion'").strip(),)
+
+
+def test_the_properties_of_the_documentation_are_compared() -> None:
+    nodes = yaml.safe_load(configuration()["inventory/nodes.yaml"])
+    listed = yaml.safe_load(block("placement.md", f"{_EDGE} properties"))["nodes"]
+    others = [one for one in nodes["nodes"] if one["id"] == "vehicle00"]
+    asked, of_service = (
+        yaml.safe_load(block("placement.md", f"place: {start}"))
+        for start in ("{role: edge, prop", "{prop")
+    )
+    appdef = "appdefs/object-detection-fusion/appdef.yaml"
+    definition = yaml.safe_load(configuration()[appdef])
+    definition["services"]["object-fusion"] |= of_service
+    files = {"inventory/nodes.yaml": yaml.safe_dump(nodes | {"nodes": others + listed})}
+    repo = MemoryRepo(files | {appdef: yaml.safe_dump(definition)} | brokers("edge", "edge-north"))
+    goal = demand()
+    (app,) = goal["applications"]
+    del app["node"]
+    decision = repo.decide(goal | {"applications": [app | asked]})
+    told = [text.partition(",")[0].partition(" is ")[2] for text in decision.placed]
+    assert told == ["placed on 'edge'"] * 2
+    said = block("placement.md", f"{_NO_NODE}'edge' lacks the p")
+    wrong = ("memoryGiB>=64", "memoryGib>=8", "ros>=8")
+    apps = [
+        app | {"id": f"app{number}", "place": {"role": "edge", "properties": [text]}}
+        for number, text in enumerate(wrong)
+    ]
+    with pytest.raises(Refused) as refused:
+        repo.decide(goal | {"applications": apps})
+    assert refused.value.text_with_codes() == said.strip()
+
+
+def test_the_named_node_of_a_service_of_the_documentation() -> None:
+    goal = demand()
+    goal["applications"] = yaml.safe_load(block("placement.md", "applications:\n"))["applications"]
+    books = as_data(bookkeeping(decided(state(), goal).state), "")
+    on = {entry["service"]: entry["node"] for entry in books["services"].values()}
+    assert on == {"object-detection": "edge", "object-fusion": "cloud"}
 
 
 def test_the_capacity_of_the_documentation_is_kept() -> None:

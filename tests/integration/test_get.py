@@ -88,7 +88,7 @@ def test_a_demand_tells_what_it_holds(demandops: Run, fleet: GitRepo) -> None:
         [],
     )
     told = demandops("get", "leases", "--state-repo", fleet.path).out
-    assert "600 s  in 9m" in told
+    assert "10m   in 9m" in told
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,10 @@ def test_a_lease_that_is_over_and_not_booked_yet(
 
 def test_a_node_that_claims_use_and_a_drained_one(demandops: Run, fleet: GitRepo) -> None:
     nodes = fleet.files()["inventory/nodes.yaml"]
-    fleet.commit(
-        {"inventory/nodes.yaml": nodes.replace("id: cloud", "id: cloud\n    drained: true")}
-    )
+    more = "id: cloud\n    drained: true\n    properties: {gpu: true}"
+    fleet.commit({"inventory/nodes.yaml": nodes.replace("id: cloud", more)})
+    wide = demandops("get", "nodes", "-o", "wide", "--state-repo", fleet.path)
+    assert "gpu: true" in wide.out
     ran = demandops("get", "nodes", "--state-repo", fleet.path)
     rows = {line.split()[0]: line.split() for line in ran.out.splitlines()}
     assert rows["cloud"][4] == "drained"
@@ -347,8 +348,10 @@ class TestStatus:
         )
         ran = demandops("status", "--wait", "--timeout", "1s", *where, "--clusters", file)
         assert ran.code == 1
-        waiting, told = ran.err.splitlines()
+        waiting, away, told = ran.err.splitlines()
         assert waiting.startswith("waiting: releases not healthy yet: ")
+        assert waiting.endswith("clusters that cannot be read: c-its")
+        assert away.startswith("warning: cluster 'c-its' cannot be read: MaxRetryError: ")
         assert told.replace("not well", "waiting") == waiting
 
     def test_an_input_that_no_longer_arrives(self, demandops: Run, fleet: GitRepo) -> None:

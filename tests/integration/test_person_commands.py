@@ -83,6 +83,27 @@ class TestOverride:
         assert "warning: overrides/calm.yaml matches nothing that is demanded now\n" in ran.err
         assert "    hold: true\n" in ran.out
 
+    def test_who_is_unknown_to_git_is_told_how_to_change_that(
+        self, demandops: Run, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for name in ("GIT_AUTHOR_NAME", "GIT_AUTHOR_EMAIL"):
+            monkeypatch.delenv(name)
+        ran = demandops(
+            "override",
+            "create",
+            "calm",
+            "--node",
+            "edge",
+            "--hold",
+            "-m",
+            "x",
+            "--state-repo",
+            joined.path,
+        )
+        assert ran.code == 0
+        assert "warning: git does not know who you are, so this is done in the name " in ran.err
+        assert 'git config --global user.name "Your Name"' in ran.err
+
     def test_it_may_be_proposed(
         self, demandops: Run, joined: GitRepo, where: tuple[str, str], person: Person
     ) -> None:
@@ -104,7 +125,7 @@ class TestOverride:
             ((), "give the reason: -m TEXT"),
             (("-m", "why"), "select what it applies to, for example --node edge"),
             (("-m", "why", "--node", "edge"), "has no effect; give at least one of values"),
-            (("-m", "why", "--node", "edge", "--hold", "--deny"), "deny prevents it from running"),
+            (("-m", "why", "--node", "edge", "--hold", "--deny"), "with deny nothing runs"),
             (("-m", "why", "--node", "edge", "--hold", "--expires", "soon"), "'soon' is not a"),
         ):
             ran = demandops("override", "create", "calm", *options, *where)

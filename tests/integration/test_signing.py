@@ -103,6 +103,7 @@ def test_a_key_that_an_agent_holds(book: Run, state: Any, agent: None, tmp_path:
 
 
 def test_every_command_that_writes_signs(
+    git_environment: None,
     demandops: Run,
     book: Run,
     state: Any,
@@ -174,7 +175,7 @@ class TestProposals:
         assert git_says(state, listed(key), tmp_path, self.branch(state)).returncode == 0
 
     def test_rolling_back_while_one_waits(
-        self, demandops: Run, book: Run, state: Any, key: Path
+        self, git_environment: None, demandops: Run, book: Run, state: Any, key: Path
     ) -> None:
         assert book("a").code == 0
         waiting, before = self.branch(state), state.tip

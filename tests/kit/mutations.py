@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import jsonschema_rs
 from demandops.errors import Fault
 
+from tests.kit.chance import TIMES
+
 Place = tuple[str | int, ...]
 Schema = dict[str, Any]
 
@@ -60,18 +62,23 @@ class Mutation(NamedTuple):
 
 
 def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
-    """Yield the document with each mistake at each place; ``limits`` replace whole numbers."""
-    for place in places(document):
+    """Yield the document with the mistakes of each place; ``limits`` replace whole numbers.
+
+    A place gets one value of a wrong type and one control character; places take turns at which
+    (with ``DEMANDOPS_EXAMPLES`` each gets all).
+    """
+    for turn, place in enumerate(places(document)):
         value = _at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
+        if not isinstance(value, str):
+            wrong["text"] = "x"
+        wrong = _one(wrong, turn)
         if isinstance(value, bool):
             wrong["the opposite"] = not value
         elif isinstance(value, int):
             wrong |= {f"{limit}": limit for limit in limits}
-        if isinstance(value, str):
-            wrong |= {"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}
-        else:
-            wrong["text"] = "x"
+        elif isinstance(value, str):
+            wrong |= _one({"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}, turn)
         for kind, new in (wrong | _OF_TYPE[type(value)]).items():
             if new != value or type(new) is not type(value):
                 yield Mutation(place, kind, _replaced(document, place, new), value, place)
@@ -92,6 +99,12 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
                 renamed = {k if k != place[-1] else own: v for k, v in holder.items()}
                 changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], own)
                 yield Mutation(place, "the program's own name", changed, value, now)
+
+
+def _one(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
+    """Return one of the mistakes, or all of them where more examples are wanted."""
+    kinds = [*mistakes] if TIMES > 1 else [[*mistakes][turn % len(mistakes)]]
+    return {kind: mistakes[kind] for kind in kinds}
 
 
 def places(document: Any, place: Place = ()) -> Iterator[Place]:

@@ -9,7 +9,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import yaml
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.service import Generator
 from demandops.staterepo.reader import Reader
 from demandops.web.follower import Follower

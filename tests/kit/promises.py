@@ -136,6 +136,7 @@ def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], froze
             }
             what = {"type": held.appdef, "node": held.node, "inputs": inputs}
             what["parameters"] = dict(held.parameters)
+            what |= {"version": held.version} if held.version else {}
         else:
             topics = {route.source: route.target for route in held.topics}
             what = {"source": held.source, "target": held.target, "topics": topics}

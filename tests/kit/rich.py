@@ -85,6 +85,7 @@ nodes:
     types: {/vehicles/vehicle00/ego_data: perception_msgs/msg/EgoData}
     bridged: {edge: [/clock]}
     capabilities: [lidar]
+    properties: {memoryGiB: 7.5, ros: jazzy, heated: true}
     position: {x: 12.5, y: -3.0}
     drained: false
     capacity: {cpu: "8", memory: 16Gi, example.org/gpu: "1"}
@@ -92,9 +93,10 @@ nodes:
     type: edge
     cluster: c-its
     capabilities: [gpu]
+    properties: {memoryGiB: 32, ros: jazzy}
     accessDomains:
       - {name: backend, zenoh: {endpoint: "tcp/edge:7448"}, wan: {host: 192.0.2.2}}
-  - {id: cloud, type: cloud, cluster: depot}
+  - {id: cloud, type: cloud, cluster: depot, properties: {memoryGiB: 64, ros: jazzy}}
 """
 _BROKERS = """
 apiVersion: demandops/v1
@@ -240,7 +242,11 @@ services:
     values: values/object-fusion.yaml.j2
   object-tracking:
     prefix: ot
-    place: {role: edge, labels: {node_id: edge}, capabilities: [gpu]}
+    place:
+      role: edge
+      labels: {node_id: edge}
+      capabilities: [gpu]
+      properties: {memoryGiB: {min: 8, max: 64}, ros: jazzy}
     inputs: {ego_data: ego_data, object_list: object-detection.object_list}
     outputs:
       raw_objects: "/{instance}_untracked"
@@ -359,7 +365,12 @@ applications:
       - {output: object-fusion.raw_objects, node: vehicle00, topic: /raw}
   - id: second
     type: object-detection-fusion
-    place: {role: edge, labels: [node_id=edge], capabilities: [gpu]}
+    place:
+      role: edge
+      labels: [node_id=edge]
+      capabilities: [gpu]
+      properties: ["memoryGiB>=8", ros=jazzy]
+    services: {object-fusion: cloud}
     inputs: {point_cloud: [{topic: /points, source: vehicle00}]}
     parameters_json: {rate: "7"}
 connections:

@@ -264,6 +264,7 @@ def _subjects(goal: Goal) -> dict[Subject, dict[str, Any]]:
         }
         what = {"type": app["type"], "node": app["node"], "inputs": inputs}
         what["parameters"] = dict(app.get("parameters", {}))
+        what |= {"version": app["version"]} if app.get("version") else {}
         found["applications", app["id"]] = what
     for connection in goal.get("connections", []):
         found["connections", connection["id"]] = {

@@ -27,6 +27,10 @@ class Waiting:
     who: frozenset[str]
     goal: Goal
 
+    def __deepcopy__(self, memo: object) -> Waiting:
+        """Return itself, because nobody changes a goal."""
+        return self
+
     def turn(self, demand: str) -> tuple[int, str, str]:
         """Return its place among those that wait."""
         return -self.priority, self.since, demand

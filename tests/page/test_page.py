@@ -73,7 +73,7 @@ def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
     cause = page.locator(".cause").first
     expect(cause).to_contain_text("object-detection on edge for vehicle00 fails")
     expect(cause).to_contain_text("manifest unknown")
-    expect(cause.locator("time")).to_have_text(re.compile(r"^1\d min ago$"))
+    expect(cause.locator("time")).to_have_text(re.compile(r"^1\dm ago$"))
     expect(cause.locator("dd").first).to_contain_text(
         "robotkube-object-detection:2025-04: push the image"
     )

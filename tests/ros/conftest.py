@@ -13,6 +13,7 @@ from tests.kit import sync
 from tests.kit.generator import wait_until
 from tests.kit.repo import POLICY, GitRepo, init, read, tip
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
+from tests.kit.warm_commands import WarmCommands
 
 APPDEFS = Path(__file__).parents[1] / "appdefs"
 
@@ -24,18 +25,31 @@ def ros_domain() -> Iterator[int]:
         yield domain
 
 
+@pytest.fixture(scope="session")
+def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
+    made = WarmCommands(tmp_path_factory.mktemp("warm"))
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def serve(
-    tmp_path: Path, data_home: Path, ros_domain: int, new_repo: Callable[[str], Path]
-) -> Iterator[Serve]:
-    """Start nodes, and end those that a test leaves running."""
-    servers = Servers(tmp_path, ros_domain)
+def servers(
+    tmp_path: Path, data_home: Path, ros_domain: int, warm: WarmCommands
+) -> Iterator[Servers]:
+    """Start commands that work with ROS, and end those that a test leaves running."""
+    made = Servers(tmp_path, ros_domain, warm)
+    yield made
+    made.kill()
+
+
+@pytest.fixture
+def serve(servers: Servers, new_repo: Callable[[str], Path]) -> Serve:
+    """Start nodes."""
 
     def start(state_repo: str | Path | None = None, *args: str) -> Served:
         return servers.start(str(state_repo or new_repo("state.git")), *args)
 
-    yield start
-    servers.kill()
+    return start
 
 
 @pytest.fixture
@@ -50,7 +64,7 @@ def client(ros_domain: int) -> Iterator[Client]:
 
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A node that serves many tests, each with ids of its own.
+    """A node that serves many tests, each with ids of its own, started as people start it.
 
     Its state repo has a third type of application and a rule.
     """

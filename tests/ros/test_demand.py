@@ -126,6 +126,21 @@ def test_a_node_is_chosen_by_the_place_in_the_message(
     services = shared.bookkeeping()["services"].values()
     assert "cloud" in {entry["node"] for entry in services if entry["service"] == "recorder"}
     assert vehicle.release("placed").outcome == "released"
+    with pytest.raises(DemandError, match="no node has the property 'memoryGiB'"):
+        vehicle.put("placed", [item | {"place": {"properties": ["memoryGiB>=8"]}}])
+
+
+def test_a_service_runs_on_the_node_that_the_message_names(
+    shared: Served, vehicle: DemandClient
+) -> None:
+    apart = RECORDER | {"id": "apart", "services": {"recorder": "cloud"}}
+    assert vehicle.put("apart", [apart]).outcome == "booked"
+    services = shared.bookkeeping()["services"].values()
+    on = {one["service"]: one["node"] for one in services if one["applications"] == ["apart"]}
+    assert (on["recorder"], on["driver"]) == ("cloud", "vehicle00")
+    with pytest.raises(DemandError, match=r"services\.recorder: "):
+        vehicle.put("apart", [RECORDER | {"id": "apart", "services": {"recorder": ""}}])
+    assert vehicle.release("apart").outcome == "released"
 
 
 def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: DemandClient) -> None:

@@ -121,6 +121,7 @@ class Fleet:
 
 @pytest.fixture
 def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
+    """Start commands as people do: a detector that starts faster still hears older bookkeeping."""
     started = Servers(tmp_path, ros_domain)
     yield started
     started.kill()

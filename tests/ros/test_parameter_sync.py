@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from demandops_ros.parameter_sync.parameter_file import parameters_of
 from rclpy.parameter import Parameter
 
 from tests.kit.http import Answer, Call, kubeconfig, serving
-from tests.kit.ros import Client
+from tests.kit.ros import Client, Served, Servers
 
 TARGET = "of_edge_fusion"
 FILE = """
@@ -63,38 +64,34 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
         made.changes.put(0)
 
 
-Start = Callable[..., "subprocess.Popen[bytes]"]
+StartFusion = Callable[[], "subprocess.Popen[bytes]"]
 
 
 @pytest.fixture
-def start(tmp_path: Path, ros_domain: int) -> Iterator[Start]:
-    """Start a Python module with a log; its end is the test's."""
+def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
+    """Start the stand-in of the fusion; its end is the test's."""
     environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain), "PYTHONFAULTHANDLER": "1"}
+    names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
+    topics = [f"{name}_topic:=/{name}" for name in names]
+    arguments = ["object_fusion", "fusion_function_launch.py", f"node_name:={TARGET}", *topics]
+    command = [sys.executable, "-m", "tests.experiment.standins", "launch", *arguments]
     with ExitStack() as stack:
 
-        def run(module: str, *arguments: str) -> subprocess.Popen[bytes]:
-            log = stack.enter_context((tmp_path / f"{module}.log").open("ab"))
-            command = [sys.executable, "-m", module, *arguments]
+        def start() -> subprocess.Popen[bytes]:
+            log = stack.enter_context((tmp_path / "fusion.log").open("ab"))
             process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
             stack.callback(lambda: (process.kill(), process.wait(10)))
             return process
 
-        yield run
+        yield start
 
 
-def start_sync(start: Start, folder: Path) -> subprocess.Popen[bytes]:
+def start_sync(servers: Servers, folder: Path) -> Served:
     given = {"configmap_name": "of-params", "namespace": "perception", "target_ros_node": TARGET}
     parameters = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
     config = str(folder / "kubeconfig")
     options = ["parameter-sync", "--kubeconfig", config, "--ros-args", *parameters]
-    return start("demandops.cli.main", *options)
-
-
-def start_fusion(start: Start) -> subprocess.Popen[bytes]:
-    names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
-    topics = [f"{name}_topic:=/{name}" for name in names]
-    arguments = ["object_fusion", "fusion_function_launch.py", f"node_name:={TARGET}", *topics]
-    return start("tests.experiment.standins", "launch", *arguments)
+    return servers.run("", *options)
 
 
 def read_by_the_fusion(client: Client) -> set[str]:
@@ -106,16 +103,20 @@ def read_by_the_fusion(client: Client) -> set[str]:
 
 
 def test_a_node_follows_without_a_restart_and_after_one(
-    cluster: Cluster, start: Start, client: Client, tmp_path: Path
+    cluster: Cluster,
+    start_fusion: StartFusion,
+    servers: Servers,
+    client: Client,
+    tmp_path: Path,
 ) -> None:
     cluster.hold("/a", "/b")
-    fusion = start_fusion(start)
-    sync = start_sync(start, tmp_path)
+    fusion = start_fusion()
+    sync = start_sync(servers, tmp_path)
     client.wait(lambda: read_by_the_fusion(client) == {"/a", "/b"})
     cluster.hold("/b", "/c")
     client.wait(lambda: read_by_the_fusion(client) == {"/b", "/c"})
     assert cluster.reads <= 3  # it watches: it does not read again and again
-    log = tmp_path / "demandops.cli.main.log"
+    log = sync.log
     cluster.hold(text="of_edge_fusion: 5")
     fault = f"{FILE_NAME}: of_edge_fusion.ros__parameters: must be a mapping"
     client.wait(lambda: f"{fault}; {TARGET} keeps its parameters" in log.read_text())
@@ -124,10 +125,9 @@ def test_a_node_follows_without_a_restart_and_after_one(
     times = log.read_text().count(DONE)
     assert fusion.poll() is None
     fusion.kill()
-    start_fusion(start)
+    start_fusion()
     client.wait(lambda: log.read_text().count(DONE) > times)
-    sync.terminate()
-    assert sync.wait(10) == 0, log.read_text()
+    assert sync.stop(signal.SIGTERM) == 0, log.read_text()
 
 
 def test_parameters_have_dotted_names_and_a_node_overrides_all_nodes() -> None:
@@ -150,15 +150,16 @@ def test_a_file_that_gives_a_node_nothing_is_refused(text: str, message: str) ->
     assert str(refused.value) == message
 
 
-def test_a_kubeconfig_that_is_none_is_refused(start: Start, tmp_path: Path) -> None:
+def test_a_kubeconfig_that_is_none_is_refused(servers: Servers, tmp_path: Path) -> None:
     (tmp_path / "kubeconfig").write_text("kind: Config")
-    assert start_sync(start, tmp_path).wait(30) == 1
-    log = (tmp_path / "demandops.cli.main.log").read_text()
-    assert f"error: {tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con" in log
+    refused = start_sync(servers, tmp_path)
+    assert refused.process.wait(30) == 1
+    refused.wait_for(
+        f"error: {tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con"
+    )
 
 
-def test_what_is_not_set_is_named(start: Start, tmp_path: Path) -> None:
-    process = start("demandops.cli.main", "parameter-sync")
-    assert process.wait(30) == 2
-    log = (tmp_path / "demandops.cli.main.log").read_text()
-    assert "parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE" in log
+def test_what_is_not_set_is_named(servers: Servers) -> None:
+    refused = servers.run("", "parameter-sync")
+    assert refused.process.wait(30) == 2
+    refused.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")

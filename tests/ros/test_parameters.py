@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import rclpy
 from demandops.config.load import load
-from demandops_ros import parameters, reference_parameters
+from demandops_ros import node_parameters, reference_parameters
 from rcl_interfaces.srv import DescribeParameters
 
 from tests.kit.config import configuration
@@ -125,10 +125,10 @@ def test_the_parameter_file_of_the_package_leaves_options_alone() -> None:
     file = Path(reference_parameters.__file__).parents[1] / "ros_package" / "config" / "params.yaml"
     rclpy.init(args=["--ros-args", "--params-file", str(file)])
     try:
-        read = parameters.read({"state_repo": "fleet.git", "fetch_interval": "5s"})
+        read = node_parameters.read({"state_repo": "fleet.git", "fetch_interval": "5s"})
     finally:
         rclpy.try_shutdown()
-    assert read == parameters.DEFAULTS | {"state_repo": "fleet.git", "fetch_interval": "5s"}
+    assert read == node_parameters.DEFAULTS | {"state_repo": "fleet.git", "fetch_interval": "5s"}
 
 
 def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: int) -> None:
@@ -142,7 +142,9 @@ def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: i
         assert client.call({"id": "a", "apps": [application()]}).status == "succeeded"
         service = client.node.create_client(DescribeParameters, "/demandops/describe_parameters")
         client.wait(service.service_is_ready)
-        future = service.call_async(DescribeParameters.Request(names=list(parameters.DEFAULTS)))
+        future = service.call_async(
+            DescribeParameters.Request(names=list(node_parameters.DEFAULTS))
+        )
         client.wait(future.done)
         described = {one.name: one for one in future.result().descriptors}
     finally:

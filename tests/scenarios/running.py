@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import yaml
 from demandops.config.base_model import FrozenModel, parse_file
+from demandops.config.durations import seconds_of
 from demandops.config.load import load
-from demandops.config.policy import seconds_of
 from demandops.decision import Decision, State, decide, rendered_files
 from demandops.demand.demand_request import Expire
 from demandops.errors import Fault, Refused

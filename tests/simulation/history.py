@@ -16,14 +16,16 @@ from demandops.staterepo.git.repository import MAIN
 from tests.kit import repo
 from tests.kit.promises import Maker, name_of
 from tests.kit.repo import POLICY, GitRepo
+from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, MAY, NEXT, TALLY
 from tests.model.leases import Goal
-from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
+from tests.simulation.oracle import KEPT_REPLICAS, PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
 STEPS = 30
 MEMORY = "/dev/shm"
 NODES = "inventory/nodes.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
+VERSIONS = "registry/versions.yaml"
 _RULES = [
     {"name": "visitors", "requesters": [f"{VISITOR}*"], "approval": "required"},
     {"name": "residents", "requesters": ["vehicle*", "station*"]},
@@ -37,6 +39,33 @@ select:
 replicas: 2
 """
 _LONGEST_LEASE_S = 90
+_TALLY = f"""apiVersion: demandops/v1
+kind: ApplicationDefinition
+name: {TALLY}
+description: Counts vehicles
+versions: separate
+inputs:
+  ego_data: {{description: State of a vehicle, type: perception_msgs/msg/EgoData}}
+services:
+  counter:
+    prefix: ta
+    description: Counts vehicles
+    inputs: {{ego_data: ego_data}}
+    chart: object-fusion
+    images: [object-fusion]
+    values: values/counter.yaml.j2
+    scaling: {{max: 3, per: {{topics: 1}}, downAfter: 120s}}
+"""
+_COUNTER = """replicas: {{ replicas }}
+image: {tag: {{ images["object-fusion"].tag }}}
+inputs: {egoData: {{ topics.ego_data }}, objectList: []}
+fusion:
+  nodeName: {{ release | ros_name }}
+  rawObjectListsTopic: /raw
+  fusedObjectListsTopic: /fused
+  fusedTrajectoriesTopic: /trajectories
+watcher: {nodeName: {{ (release | ros_name) ~ "_Watcher" }}}
+"""
 
 
 @lru_cache(maxsize=1)
@@ -55,10 +84,38 @@ def template() -> Path:
         for id in sorted(PLACES)
     ]
     appdef["services"]["object-fusion"]["requests"] = {"slots": 1}
+    city = sorted(name for name, nodes in MAY.items() if FURTHER in nodes)
+    policy["domains"].append(
+        {
+            "name": "city",
+            "namespace": "city",
+            "nodes": ["nothing-else"],
+            "ros": {"domainId": 42},
+            "rules": [{"name": "control", "requesters": city}],
+            "leases": {"slack": f"{SLACK_S}s"},
+        }
+    )
+    further = [{"name": "city"}]
+    nodes["nodes"].append(
+        {"id": HALL, "type": "hall", "cluster": "c-its", "accessDomains": further}
+    )
     changed = {POLICY: policy, NODES: nodes, APPDEF: appdef}
-    GitRepo(path).commit({name: yaml.safe_dump(data) for name, data in changed.items()})
+    texts = {name: yaml.safe_dump(data) for name, data in changed.items()}
+    folder = f"appdefs/{TALLY}"
+    texts |= {f"{folder}/appdef.yaml": _TALLY, f"{folder}/values/counter.yaml.j2": _COUNTER}
+    GitRepo(path).commit(texts | {VERSIONS: _versions(NEXT)})
     repo.git(path, "repack", "-adq")
     return path
+
+
+def _versions(testing: str) -> str:
+    entry = {
+        "default": DEFAULT,
+        "channels": {"testing": testing},
+        "versions": {DEFAULT: {}, NEXT: {"images": {"object-fusion": {"tag": NEXT}}}},
+    }
+    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
+    return yaml.safe_dump(head | {"applications": {TALLY: entry}})
 
 
 class History:
@@ -70,12 +127,21 @@ class History:
         self._maker = Maker(self.chance)
         self._latest = 0.0
         self._sent: list[Goal] = []
+        self._often, self._edited_often = self.chance.choice(
+            [
+                (self._tallied, self._come_down),
+                (self._tallied, self._move_channel),
+                (self._placed, self._drain),
+                (self._visitor, self._edit_generated),
+                (self._maker.any, self._delete_claim),
+            ]
+        )
 
     def run(self, steps: int) -> None:
         """Let things happen, then heal everything and check the end."""
         things = (
-            [self.demand] * 15 + [self.wait] * 4 + [self.edit] * 3 + [self.decide] * 2
-            + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
+            [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
+            + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
         )  # fmt: skip
         self.turns.sleep(1)
         for _ in range(steps):
@@ -98,7 +164,7 @@ class History:
         self.turns.sleep(2 * LONGEST_WAIT_S)
         self.world.set_clocks(self._latest - self.turns.offset)
         self.turns.sleep(60)
-        self.oracle.check()
+        self._drain()
         for _ in range(3):
             while self._branches():
                 self.decide()
@@ -109,16 +175,31 @@ class History:
     # ---- what happens ----
 
     def demand(self) -> None:
+        self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
+
+    def rush(self) -> None:
+        """Give a place back, and at once ask for places."""
+        held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
+        goals = [self._placed(), self._placed()]
+        for claim in held[:1]:
+            names = {"demand": claim.demand, "requesters": [*claim.requesters]}
+            goals.insert(0, {"kind": "Demand", "operation": "release", **names})
+        self._send(goals)
+
+    def _send(self, goals: list[Goal]) -> None:
+        """Send demands to one machine; while it does something else, they become one batch."""
         ready = [machine for machine in self.world.machines if machine.generator]
-        if not ready:
-            return
-        machine = self.chance.choice(ready)
-        for _ in range(self.chance.choice([1, 1, 1, 2, 4])):
-            self._sent.append(self._goal())
-            self.oracle.ask(machine, self._sent[-1])
+        machine = self.chance.choice(ready) if ready else None
+        for goal in goals if machine else ():
+            self._sent.append(goal)
+            self.oracle.ask(machine, goal)
 
     def _goal(self) -> Goal:
-        kind = self.chance.randrange(10)
+        kind = self.chance.randrange(18)
+        if kind > 10:
+            return self._often()
+        if kind == 10:
+            return self._tallied()
         if kind == 0:
             return self._visitor()
         if kind == 1 and self._sent:  # as who waited in vain for an answer
@@ -128,6 +209,32 @@ class History:
         if kind < 5:
             return self._placed()
         return self._maker.any()
+
+    def _tallied(self) -> Goal:
+        """Return a demand for an instance on a node in two access domains."""
+        topics = self.chance.sample(range(4), self.chance.randrange(1, 5))
+        inputs = {"ego_data": [{"topic": f"/e{one}", "source": "vehicle00"} for one in topics]}
+        known = [one for one in self._sent if one.get("demand", "").startswith("tally")]
+        puts = [one for one in known if one["operation"] == "put"]
+        if puts and self.chance.randrange(3):  # else each would hold something else
+            (app,) = puts[-1]["applications"]
+            return puts[-1] | {"applications": [app | {"inputs": inputs}]}
+        names = ["traffic", "vehicle01", "vehicle01", "vehicle01", "vehicle00"]
+        who = sorted({self.chance.choice(names), self.chance.choice(names)})
+        made = {"kind": "Demand", "demand": f"tally{self.chance.randrange(2)}", "requesters": who}
+        if puts and not self.chance.randrange(3):
+            return made | {"operation": self.chance.choice(["release", "renew"])}
+        app = {
+            "id": self.chance.choice(["hall0", "hall0", "hall0", "hall1", f"hall0@{NEXT}"]),
+            "type": TALLY,
+            "node": self.chance.choice([HALL, FIRST, FURTHER, FURTHER]),
+            "version": self.chance.choice(["", "", DEFAULT, NEXT, "testing"]),
+            "connect": "none",
+            "inputs": inputs,
+        }
+        made |= {"operation": "put", "applications": [app], "connections": []}
+        lease = self.chance.choice([None, None, None, 90])
+        return made | ({"lease": lease} if lease else {})
 
     def _placed(self) -> Goal:
         """Return a demand whose node the generator chooses, if one has room."""
@@ -209,10 +316,12 @@ class History:
             self._inventory,
             self._drain,
             self._stop_waiting,
+            self._come_down,
+            self._move_channel,
             self._delete_claim,
             self._delete_claim,
         )
-        self.chance.choice((*edits, self._edit_generated))()
+        self.chance.choice((*edits, self._edit_generated, *[self._edited_often] * 4))()
 
     def _commit(self, changed: dict[str, str | None]) -> str:
         who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
@@ -232,9 +341,11 @@ class History:
         self._commit({NODES: yaml.safe_dump(data)})
 
     def _drain(self) -> None:
-        """Take a node out of service, or back in."""
+        """Take a node out of service, mostly one in use, or back in."""
         self.oracle.check()
-        data, name = yaml.safe_load(self._files(NODES)[NODES]), self.chance.choice(sorted(PLACES))
+        data, books = yaml.safe_load(self._files(NODES)[NODES]), self.oracle.books
+        used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
+        name = self.chance.choice(used or sorted(PLACES))
         (node,) = (one for one in data["nodes"] if one["id"] == name)
         drained = node["drained"] = not node.get("drained", False)
         commit = self._commit({NODES: yaml.safe_dump(data)})
@@ -248,6 +359,22 @@ class History:
             demand = yaml.safe_load(text)["demand"]
             commit = self._commit({path: None})
             self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
+
+    def _come_down(self) -> None:
+        """Delete the record of replicas that a service keeps."""
+        self.oracle.check()
+        if found := sorted(self._files(KEPT_REPLICAS).items()):
+            path, text = self.chance.choice(found)
+            record = yaml.safe_load(text)
+            instance = record["application"], record["node"]
+            commit = self._commit({path: None})
+            self.oracle.edits[commit] = lambda books: books.kept.pop(instance)
+
+    def _move_channel(self) -> None:
+        self.oracle.check()
+        version = self.chance.choice([DEFAULT, NEXT])
+        commit = self._commit({VERSIONS: _versions(version)})
+        self.oracle.edits[commit] = lambda books: setattr(books, "testing", version)
 
     def _delete_claim(self) -> None:
         self.oracle.check()

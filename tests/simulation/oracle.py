@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import dataclass
-from datetime import timezone
+from datetime import datetime, timedelta, timezone
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import pygit2
-import yaml
 from demandops.demand.claim import Claim
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
@@ -20,14 +21,16 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.repository import MAIN
 from demandops.staterepo.history.commit_log import PROPOSAL, entry_of
 
+from tests.kit import plain_yaml
 from tests.kit.promises import claims_of, name_of
+from tests.model.instances import FURTHER, KEPT_FOR, NEXT, Instance, Instances
 from tests.model.leases import Goal, Subject
-from tests.model.places import Places
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30
 PLACES = frozenset({"rack0", "rack1"})
 """The nodes of which each has room for one application that names no node."""
+KEPT_REPLICAS = "ledger/replicas"
 VISITOR = "visitor"
 """Begins the names of those whose demands need approval."""
 
@@ -63,18 +66,19 @@ class Oracle:
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
-        self.edits: dict[str, Callable[[Places], object]] = {}
+        self.edits: dict[str, Callable[[Instances], object]] = {}
         """What people's commits change of what is booked."""
         self.counts = Counter[str]()
         self._seen = world.tip
-        self._books = Places(SLACK_S, nodes=PLACES)
+        self.books = Instances(SLACK_S, nodes=PLACES)
         self._pushed_at = world.turns.monotonic()
         """When the last tip of main that was looked at was pushed, or seen."""
-        self._models = [deepcopy(self._books)]
+        self._models = [deepcopy(self.books)]
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
         self._claims: dict[Any, Any] = {}
+        self._records: dict[Instance, dict[int, datetime]] = {}
         world.on_start = self._check_resumed
         world.on_push = lambda: self._guard(self._follow_main)
 
@@ -127,41 +131,79 @@ class Oracle:
     def _book(self, commit: pygit2.Commit, by: tuple[Machine, float, float] | None) -> None:
         self.counts["commits"] += 1
         claims = claims_of(self.claims(str(commit.id)).values())
-        self._books.told = {
+        records = _records_in(commit)
+        self.books.told = {
             subject: what["node"] for (_, subject), (what, _) in claims.items() if "node" in what
         }
         if str(commit.id) in self.edits:
-            self.edits[str(commit.id)](self._books)
+            self.edits[str(commit.id)](self.books)
         for operation, is_proposed in self._operations(commit):
             assert operation not in self._place, f"{operation} is booked twice"
             self._place[operation] = len(self._models)
             asked = self.asked.get(operation)
             if asked is None:
                 assert by is not None
+                before = self.books.running()
                 self._own_work(claims, *by)
+                self.books.keep(before, self._time_of_own_work(commit, records))
                 continue
             if not asked.needs_approval:
                 self._assert_in_order(asked)
             time = self.world.turns.monotonic() if is_proposed else asked.time
-            outcome = self._take(self._books, asked, time)
+            outcome = self._take(self.books, asked, time)
             assert outcome != "refused", f"{operation} is booked, but the model refuses it"
             self.counts["waited"] += outcome == "waiting"
-        expected = self._books.claims()
+        expected = self.books.claims()
         assert claims == expected, f"after {commit.message}\n{claims}\nbut expected\n{expected}"
-        told, waiting = self._books.waiting_files(), self._waiting_on(commit)
+        told, waiting = self.books.waiting_files(), self._waiting_on(commit)
         assert waiting == told, f"{waiting} wait, but expected {told}"
-        self._books.told = {}
-        self._claims = claims
-        self._models.append(deepcopy(self._books))
+        self._compare_instances(commit, records)
+        self.books.told = {}
+        self._claims, self._records = claims, records
+        self._models.append(deepcopy(self.books))
 
-    def _take(self, books: Places, asked: Asked, time: float) -> str:
+    def _compare_instances(
+        self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
+    ) -> None:
+        """Fail unless each instance runs as it should, with what it keeps."""
+        entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
+        self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
+        for one in self.books.kept.keys() | records.keys():
+            self.books.come_down(one, records.get(one, {}), now)
+        if entry.by_generator:
+            running = self.books.running()
+            expected = sorted(
+                (
+                    "city" if one[1] == FURTHER else "perception",
+                    one[0].partition("@")[2],
+                    sorted(topic for _, topic in topics),
+                    self.books.replicas(one),
+                )
+                for one, topics in running.items()
+            )
+            found = sorted(_counters(commit))
+            assert found == expected, f"after {commit.message}\n{found} run, not {expected}"
+
+    def _time_of_own_work(
+        self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
+    ) -> datetime:
+        """Return when a generator did something by itself, as a new record says if there is one."""
+        known = {end for steps in self._records.values() for end in steps.values()}
+        told = {end for steps in records.values() for end in steps.values()} - known
+        made = _made(commit)
+        for end in told:
+            if abs(end - KEPT_FOR - made) <= timedelta(seconds=1):
+                return end - KEPT_FOR
+        return made
+
+    def _take(self, books: Instances, asked: Asked, time: float) -> str:
         received = asked.ticket.received.astimezone(timezone.utc).isoformat(timespec="microseconds")
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
         """Return who waits in a commit, since when and how urgently."""
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
-        found = [yaml.safe_load(text) for text in texts]
+        found = [plain_yaml.load(text) for text in texts]
         return {
             one["demand"]: (one["priority"], str(one["since"]), frozenset(one["requesters"]))
             for one in found
@@ -174,9 +216,9 @@ class Oracle:
         let_in = {demand for demand, _ in claims.keys() - both}
         self.counts.update(let_in=len(let_in), moved=len(moved))
         for demand in let_in:
-            self._books.has_room(demand, self._pushed_at)  # type: ignore[arg-type]
+            self.books.has_room(demand, self._pushed_at)  # type: ignore[arg-type]
         for demand, subject in moved:
-            self._books.moved(demand, subject)
+            self.books.moved(demand, subject)
         if gone := self._claims.keys() - both:
             self._end_leases(gone, machine, started, time)
         assert moved or gone or let_in, "an operation that nobody asked for"
@@ -202,13 +244,13 @@ class Oracle:
 
     def _end_leases(self, gone: Any, machine: Machine, started: float, time: float) -> None:
         for demand, subject in gone:
-            held, jump = self._books.held[demand][subject], self.world.last_jump
+            held, jump = self.books.held[demand][subject], self.world.last_jump
             assert held.promised is not None and held.seconds is not None, f"{demand}: no lease"
             # after a jump every lease gets its full term, from those who saw the jump
             full_term = jump + held.seconds if started < jump else jump
             least = held.promised if jump < 0 else min(held.promised, full_term)
             assert time >= least, f"the lease of {demand} ended {least - time} s early"
-        self._books.gone(gone)
+        self.books.gone(gone)
 
     def _assert_in_order(self, asked: Asked) -> None:
         for subject in asked.subjects:
@@ -244,8 +286,8 @@ class Oracle:
         outcome = asked.ticket.future.result().outcome
         if outcome == "unchanged":
             self._assert_possible(asked, "unchanged")
-            if self._take(deepcopy(self._books), asked, asked.time) == "unchanged":
-                self._take(self._books, asked, asked.time)
+            if self._take(deepcopy(self.books), asked, asked.time) == "unchanged":
+                self._take(self.books, asked, asked.time)
         elif outcome == "waiting" and place is None:
             self._assert_possible(asked, "waits")
         elif asked.needs_approval and place is None:  # taken back, or main had its claims already
@@ -264,7 +306,7 @@ class Oracle:
         assert outcome in said, f"{told}, but the model says {said}"
 
     def _possible(self, asked: Asked) -> set[str]:
-        states = [*self._models[asked.place :], self._books]
+        states = [*self._models[asked.place :], self.books]
         return {self._take(deepcopy(state), asked, asked.time) for state in states}
 
     # ---- machines ----
@@ -304,14 +346,48 @@ class Oracle:
             error = asked.is_answered and asked.ticket.future.exception()
             told = f"{operation} is booked, but was answered {error}"
             assert not error or operation not in self._place, told
+        assert not self.books.kept, f"did not come down: {self.books.kept}"
         leased = [name_of(claim) for claim in self.claims().values() if claim.lease]
         assert not leased, f"leases did not end: {leased}"
-        free, drained = self._books.free(), self._books.drained
+        free, drained = self.books.free(), self.books.drained
         on = {node for what, _ in self._claims.values() if (node := what.get("node"))}
-        assert not free or not self._books.waiting, f"{self._books.waiting} wait, {free} are free"
+        assert not free or not self.books.waiting, f"{self.books.waiting} wait, {free} are free"
         assert not free or not on & drained, f"{on & drained} were not emptied, {free} are free"
         (verdict,) = verification.verify(self.world.remote, [tip])
         assert verdict.holds, verdict
+
+
+def _made(commit: pygit2.Commit) -> datetime:
+    return datetime.fromtimestamp(commit.commit_time, timezone.utc)
+
+
+def _records_in(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
+    """Return the replicas that services keep, and until when."""
+    return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
+
+
+@lru_cache(maxsize=1024)
+def _record(text: str) -> tuple[Instance, dict[int, datetime]]:
+    record = plain_yaml.load(text)
+    ends = ((one["replicas"], str(one["until"])) for one in record["keeps"])
+    return (record["application"], record["node"]), {
+        replicas: datetime.fromisoformat(until.replace("Z", "+00:00")) for replicas, until in ends
+    }
+
+
+def _counters(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
+    """Yield namespace, version, topics and replicas of each instance as it is rendered."""
+    for path, text in trees.texts(commit.tree, ["clusters"]).items():
+        if Path(path).name.startswith("ta-"):
+            yield _counter(text)
+
+
+@lru_cache(maxsize=1024)
+def _counter(text: str) -> tuple[str, str, list[str], int]:
+    release = plain_yaml.load(text)
+    values, tag = release["spec"]["values"], release["spec"]["values"]["image"]["tag"]
+    version, topics = tag if tag == NEXT else "", sorted(values["inputs"]["egoData"])
+    return release["metadata"]["namespace"], version, topics, values["replicas"]
 
 
 def _node(claim: tuple[dict[str, Any], frozenset[str]]) -> object:

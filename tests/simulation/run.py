@@ -58,7 +58,16 @@ def main() -> int:
 
 def told(counts: Counter[str]) -> str:
     """Return counts as a person reads them."""
-    names = ("histories", "demands", "commits", "waited", "let_in", "moved", "failures")
+    names = (
+        "histories",
+        "demands",
+        "commits",
+        "waited",
+        "let_in",
+        "moved",
+        "scaled_down",
+        "failures",
+    )
     return ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in names)
 
 

@@ -7,14 +7,19 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
+from demandops.config.appdef.scaling import Scaling
+from demandops.config.config import Config
 from demandops.decision import Decision
+from demandops.demand import chosen_domain, separate_instance
 from demandops.demand.lease import Lease
 from demandops.ledger import claim_file
 from demandops.ledger.recent_shutdowns import RecentShutdowns
+from demandops.plan import scale_down
 from demandops.plan.nodes.capacity import Room
 from demandops.plan.nodes.choice import Choice
 from demandops.service import Receipt
@@ -22,7 +27,7 @@ from demandops.service.approvals.approvals import Approvals
 from demandops.service.evaluation import Evaluator
 from demandops.service.timing import waiting_turns
 from demandops.service.timing.draining import Draining
-from demandops.service.timing.expiry import LeaseExpiry
+from demandops.service.timing.expiry import LeaseExpiry, ScaleDown
 from demandops.service.timing.waiting_turns import WaitingTurns
 from demandops.service.worker import Worker
 from demandops.staterepo.git.remote_repository import RemoteRepository
@@ -176,23 +181,75 @@ def count_no_room(patch: Patch) -> None:
     patch(Room, "is_full", lambda *_: False)
 
 
+def let_others_overtake_in_a_batch(patch: Patch) -> None:
+    patch(WaitingTurns, "follow", lambda *_: None)
+
+
+def come_down_at_once(patch: Patch) -> None:
+    patch(scale_down, "_steps", lambda *_: ())
+
+
+def come_down_early(patch: Patch) -> None:
+    patch(Scaling, "kept_for", property(lambda _: timedelta(seconds=60)))
+
+
+def never_come_down(patch: Patch) -> None:
+    patch(ScaleDown, "is_due", lambda *_: False)
+    patch(ScaleDown, "end_due", lambda *_: None)
+
+
+def share_one_instance(patch: Patch) -> None:
+    patch(separate_instance, "_separated", lambda app, config: app)
+
+
+def move_instances_with_the_channel(patch: Patch) -> None:
+    separated = separate_instance._separated
+
+    def by_name(app: Any, config: Any) -> Any:
+        made = separated(app, config)
+        return replace(made, version=app.version)
+
+    patch(separate_instance, "_separated", by_name)
+
+
+def take_the_first_domain(patch: Patch) -> None:
+    patch(Config, "nodes_of", lambda config, node: (node,))
+
+
+def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
+    chosen = chosen_domain._chosen
+    patch(
+        chosen_domain,
+        "_chosen",
+        lambda one, booked, *more: chosen(one, None, *more),
+    )
+
+
 FAULTS: dict[Callable[[Patch], None], int] = {
     acknowledge_before_publishing: 3,
     forget_the_journal: 3,
     leave_the_journal_in_memory: 15,
-    skip_the_search_for_operations: 9,
-    take_a_repeat_for_another_shutdown: 5,
+    skip_the_search_for_operations: 3,
+    take_a_repeat_for_another_shutdown: 16,
     end_leases_by_the_wall_clock: 10,
     follow_nothing: 9,
     push_on_any_tip: 8,
-    lose_renewals: 4,
+    lose_renewals: 7,
     book_again_what_was_approved: 9,
     bring_back_what_was_deleted: 2,
-    let_the_last_in_first: 11,
-    forget_those_that_wait: 5,
-    leave_drained_nodes_full: 14,
-    place_on_drained_nodes: 5,
-    count_no_room: 0,
+    let_the_last_in_first: 13,
+    forget_those_that_wait: 6,
+    leave_drained_nodes_full: 0,
+    place_on_drained_nodes: 13,
+    count_no_room: 6,
+    let_others_overtake_in_a_batch: 16,
+    come_down_at_once: 1,
+    come_down_early: 1,
+    never_come_down: 1,
+    share_one_instance: 1,
+    move_instances_with_the_channel: 4,
+    take_the_first_domain: 1,
+    forget_what_is_booked_in_a_domain: 20,
 }
 """Each with a seed that found it at once when this was written; others are tried if it does not."""
 

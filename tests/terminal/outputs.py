@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
+from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import click
 import pytest
 import yaml
-from demandops.cli.main import run
+from demandops.cli.main import COMMANDS as COMMAND_NAMES
+from demandops.cli.main import cli, load, run
 from demandops.runtime import REAL
 
 from tests.kit.goals import EXPERIMENT, put
-from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, init
+from tests.kit.reference import Reference
+from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, git, init
 from tests.kit.terminal import terminal
 
 FOLDER = Path(__file__).parent / "expected"
+HELP = FOLDER / "help.txt"
 NOW = datetime(2026, 11, 23, 8, 0, tzinfo=timezone.utc)
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 
@@ -46,6 +53,7 @@ COMMANDS = (
     "suspend --connection vehicle00/edge -m why --expires 2h --dry-run",
     "upgrade --dry-run",
     "verify main~2..main",
+    "why e904285d",
     "why edge",
     "why fusion",
     "why more",
@@ -54,28 +62,38 @@ COMMANDS = (
 )
 """None of them changes the fleet."""
 
+CHANGING = (
+    "approve visit --yes --state-repo fleet.git",
+    "check clone",
+    "completion bash",
+    "config list",
+    "config set cloud --state-repo https://git.example/cloud.git",
+    "import reference/mqtt_bookkeeping.yml --map map.yaml --state-repo fleet.git",
+    "init new.git --bare",
+    "new application tracking --input camera=sensor_msgs/msg/Image -C clone "
+    "--service tracker=tracking/tracker.launch.py --image ghcr.io/me/tracking:1.0",
+    "override end more -m Done --state-repo fleet.git",
+    "reject visit --yes --state-repo fleet.git",
+    "version",
+    "watch --state-repo fleet.git",
+)
+"""Each of them runs in a copy of the fleet."""
+
 NOT_SHOWN = {
-    "approve": "prints one line",
-    "check": "its report has a test of its own, tests/integration/pull-request.md",
-    "completion": "prints what click generates",
-    "config": "prints paths of the machine",
     "demand": "needs a running node",
     "detect": "prints nothing but its log",
-    "import": "prints what request prints",
-    "init": "prints paths of the machine",
-    "new": "prints the files that it lays down",
     "parameter-sync": "prints nothing but its log",
-    "reject": "prints one line",
     "serve": "prints nothing but its log",
-    "version": "depends on the machine",
-    "watch": "shows the tables of get, log and status",
     "web": "prints an address",
 }
-"""The commands without a file here, and why."""
+"""The commands of which only the help has a file here, and why."""
 
 _HEX = re.compile(
     r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<=after commit )[0-9a-f]{12}"
 )
+
+
+_CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
@@ -94,6 +112,10 @@ def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     (folder / "patrol.yaml").write_text(yaml.safe_dump(patrol))
     visit = put("visit", "vehicle02", node="edge", connect="none")
     (folder / "visit.yaml").write_text(yaml.safe_dump(visit))
+    with patch.context() as own:
+        own.setenv("XDG_CONFIG_HOME", str(folder / "contexts"))
+        for name in ("fleet", "spare"):
+            run(["config", "set", name, "--state-repo", f"https://git.example/its/{name}.git"])
     run(["config", "set", "fleet", "--state-repo", "fleet.git"])
     for file in (*map(str, EXPERIMENT[:4]), "patrol.yaml"):
         clock[0] += timedelta(minutes=1)
@@ -111,18 +133,57 @@ def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     )
     _done("request visit.yaml")
     clock[0] = NOW
+    git(folder, "clone", "-q", "fleet.git", "clone")
+    more = folder / "clone" / "overrides" / "more.yaml"
+    more.write_text(more.read_text().replace("replicas: 2", "replicas: 3"))
+    reference = Reference()
+    reference.send(yaml.safe_load(EXPERIMENT[0].read_text()))
+    reference.write(folder / "reference")
 
 
 def _done(command: str) -> None:
     assert run(shlex.split(command)) == 0, command
 
 
-def printed(command: str, patch: pytest.MonkeyPatch) -> str:
+def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
     """Return what a command prints, without colors and with equal commit ids."""
-    patch.setenv("NO_COLOR", "1")
-    with terminal(patch, columns=80) as screen:
-        run(shlex.split(command))
-    return same_ids(screen.text)
+    with patch.context() as own, TemporaryDirectory() as folder:
+        own.setenv("NO_COLOR", "1")
+        if command in CHANGING:
+            own.chdir(shutil.copytree(Path.cwd(), Path(folder, "fleet")))
+            own.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
+            own.setenv("HELM_BIN", "no-helm")
+        if command.startswith("config "):  # its table has no paths of this machine
+            own.setenv("XDG_CONFIG_HOME", str(Path.cwd() / "contexts"))
+        if command.startswith("watch"):
+            own.setattr(REAL, "sleep", _interrupt)
+        with terminal(own, columns, lines=40 if command.startswith("watch") else 1000) as screen:
+            run(shlex.split(command))
+        text = "\n".join(map(str.rstrip, _CONTROL.sub("", screen.text).split("\n")))
+        text = text.replace(str(Path.cwd()), "/home/petra")
+    if command == "version":
+        text = re.sub(r"\d[\w.+-]*", "1.2.3", text)
+    return same_ids(text)
+
+
+def _interrupt(seconds: float) -> None:
+    raise KeyboardInterrupt
+
+
+def helps() -> str:
+    """Return the help of all commands at 80 columns, one below the other."""
+    root = click.Context(cli, info_name="demandops", terminal_width=80, **cli.context_settings)
+    return "\n".join(
+        text for name in sorted(COMMAND_NAMES) for text in _help(load(name), name, root)
+    )
+
+
+def _help(command: click.Command, name: str, parent: click.Context) -> Iterator[str]:
+    context = click.Context(command, info_name=name, parent=parent)
+    yield f"$ {context.command_path} --help\n{command.get_help(context)}\n"
+    if isinstance(command, click.Group):
+        for each in sorted(command.commands):
+            yield from _help(command.commands[each], each, context)
 
 
 def same_ids(text: str) -> str:
@@ -132,4 +193,5 @@ def same_ids(text: str) -> str:
 
 def file_of(command: str) -> Path:
     """Return the file with the expected output of a command."""
-    return FOLDER / (re.sub(r"[^a-z0-9]+", "-", command.lower()).strip("-") + ".txt")
+    words = command.split(" -C ", maxsplit=1)[0].replace(" --state-repo fleet.git", "")
+    return FOLDER / (re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-") + ".txt")

@@ -45,7 +45,7 @@ def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) ->
     assert not after.strip(), "nothing is demanded"
 
 
-def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c(
+def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c_or_a_time_has_passed(
     state: GitRepo, tmp_path: Path
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -60,4 +60,8 @@ def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c(
             talk.read_until("asking the clusters, 1 s")
             talk.type(CTRL_C)
             assert talk.end() == 130, talk.text
-    assert talk.text.endswith("\ninterrupted\n")
+        assert talk.text.endswith("\ninterrupted\n")
+        with Dialogue(*asked, "--request-timeout", "1s") as talk:
+            assert talk.end() == 1, talk.text
+    assert "warning: cluster 'c-its' cannot be read: it did not answer within 1s\n" in talk.text
+    assert "not well: clusters that cannot be read: c-its\n" in talk.text

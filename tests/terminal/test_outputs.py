@@ -13,10 +13,13 @@ from demandops.cli import main
 
 from tests.kit.cli import Run
 from tests.terminal.outputs import (
+    CHANGING,
     COMMANDS,
     FOLDER,
+    HELP,
     NOT_SHOWN,
     file_of,
+    helps,
     make_fleet,
     printed,
     same_ids,
@@ -43,7 +46,7 @@ def _home(data_home: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", [*COMMANDS, *CHANGING])
 def test_it_prints_what_it_printed(command: str, patch: pytest.MonkeyPatch) -> None:
     assert printed(command, patch) == file_of(command).read_text(), "make golden; review the diff"
 
@@ -59,16 +62,29 @@ def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch)
         assert max(map(len, lines)) <= 80
 
 
+@pytest.mark.parametrize("command", CHANGING[:-1])
+def test_no_name_is_cut_where_something_changes(command: str, patch: pytest.MonkeyPatch) -> None:
+    """``watch``, the last one, cuts at the height of the terminal."""
+    whole = {*words(printed(command, patch, columns=1000))}
+    assert {*words(file_of(command).read_text())} <= whole
+
+
 def words(text: str) -> list[str]:
     """Return the words of a text, without the commas between them."""
     return [word.strip(",") for word in text.split()]
 
 
+def test_help_is_as_it_was_and_fits() -> None:
+    assert helps() == HELP.read_text(), "make golden; review the diff"
+    assert max(map(len, HELP.read_text().splitlines())) <= 80
+
+
 def test_every_command_is_shown_or_says_why_not() -> None:
-    shown = {command.split()[0] for command in COMMANDS}
+    every = (*COMMANDS, *CHANGING)
+    shown = {command.split()[0] for command in every}
     assert shown | NOT_SHOWN.keys() == main.COMMANDS.keys()
     assert shown & NOT_SHOWN.keys() == set()
-    assert {path.name for path in FOLDER.iterdir()} == {file_of(each).name for each in COMMANDS}
+    assert {*FOLDER.iterdir()} == {HELP, *map(file_of, every)}
 
 
 def schema_of(command: str) -> str:

@@ -9,7 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.terminal.outputs import COMMANDS, FOLDER, file_of, make_fleet, printed
+from tests.terminal.outputs import (
+    CHANGING,
+    COMMANDS,
+    FOLDER,
+    HELP,
+    file_of,
+    helps,
+    make_fleet,
+    printed,
+)
 
 
 def main() -> None:
@@ -19,10 +28,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("DEMANDOPS_DATA_HOME", str(Path(folder) / "home"))
         make_fleet(Path(folder), patch)
-        for command in COMMANDS:
+        HELP.write_text(helps())
+        for command in (*COMMANDS, *CHANGING):
             file_of(command).write_text(printed(command, patch))
         os.chdir(FOLDER)
-    print(f"terminal: {len(COMMANDS)} files")
+    print(f"terminal: {len(COMMANDS) + len(CHANGING) + 1} files")
 
 
 if __name__ == "__main__":

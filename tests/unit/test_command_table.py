@@ -73,13 +73,13 @@ def test_every_command_has_examples_that_parse(
             parse(main.cli, words)
 
 
-def parse(command: click.Command, words: list[str]) -> None:
+def parse(command: click.Command, words: list[str], parent: click.Context | None = None) -> None:
     """Parse a command line as the program does, down to the command that would run."""
-    ctx = command.make_context("demandops", words)
+    ctx = command.make_context("demandops", words, parent=parent)
     if isinstance(command, click.Group):
         _, found, rest = command.resolve_command(ctx, [*ctx._protected_args, *ctx.args])
         assert found is not None, words
-        parse(found, rest)
+        parse(found, rest, ctx)
 
 
 def test_short_helps_fit_a_terminal() -> None:

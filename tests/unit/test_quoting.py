@@ -35,7 +35,7 @@ TEXTS = st.one_of(st.text(), st.text("\n\t\x1b\u202e\u200b\u00ad\u3164\ufe0f'\"\
 
 
 @given(TEXTS)
-@examples(300)
+@examples(150)
 def test_a_quoted_text_is_one_visible_line_of_bounded_length(text: str) -> None:
     for quote in (one_line(text), quoted(text), one_line(text, 5)):
         assert is_visible(quote)

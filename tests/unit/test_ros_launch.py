@@ -30,7 +30,7 @@ def test_the_launch_file_takes_the_arguments_of_the_reference_s() -> None:
 
 
 def test_the_parameter_file_has_the_defaults() -> None:
-    parameters = pytest.importorskip("demandops_ros.parameters")
+    parameters = pytest.importorskip("demandops_ros.node_parameters")
     data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / "params.yaml").read_text())
     named = data["/**"]["ros__parameters"]
     assert named == {name: parameters.DEFAULTS[name] for name in named}

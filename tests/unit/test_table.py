@@ -60,7 +60,7 @@ def test_an_empty_table_says_so() -> None:
 
 
 @given(st.lists(st.tuples(WORDS, WORDS, st.lists(WORDS)), max_size=4), st.integers(1, 90))
-@examples(200)
+@examples(80)
 def test_no_word_is_ever_cut(rows: list[tuple[str, str, list[str]]], width: int) -> None:
     """Of the first column, which always stays; the rest fits beside it, or is left out."""
     columns = (Column("Name", wraps=True), Column("State", 1, wraps=True), Column("Since", 2))

@@ -1,7 +1,7 @@
 """Charts in folders of the state repo: the libraries that they depend on, and their default values.
 
-Pure: a chart's files are given as texts by path. Flux and Argo CD read a library where
-``repository: file://…`` of ``Chart.yaml`` says; so does this module.
+Pure: a chart's files are given as texts by path. Like Flux and Argo CD, this module reads a library
+from the folder that ``repository: file://…`` in ``Chart.yaml`` names.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _EXACT = re.compile(r"\d+\.\d+\.\d+")
 class Dependency:
     """An entry of a chart's ``dependencies``.
 
-    ``folder`` is its path in the state repo, unless it comes from elsewhere. ``imports`` names the
-    ``exports`` that become values of the chart.
+    ``folder`` is the library's path in the state repo; None if the library is elsewhere.
+    ``imports`` names the library's ``exports`` that become values of the chart.
     """
 
     index: int
@@ -53,10 +53,10 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
-    """Return a chart's default values, merged over those that it imports by Helm's rules.
+    """Return a chart's own default values, merged by Helm's rules over the values that it imports.
 
     Raises:
-        InvalidInput: a ``values.yaml`` cannot be read.
+        InvalidInput: if a ``values.yaml`` cannot be read.
     """
     imported: dict[str, Any] = {}
     for dependency in dependencies(folder, files):
@@ -144,7 +144,7 @@ def _values(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 def _mapping(text: str) -> dict[str, Any]:
     try:
         return _read(text)
-    except InvalidInput:  # a fault of its own
+    except InvalidInput:  # another check reports this
         return {}
 
 

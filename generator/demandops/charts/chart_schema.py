@@ -1,7 +1,7 @@
 """The ``values.schema.json`` of a chart: its own values, and those of the library that it imports.
 
-Helm and the generator follow no reference out of a schema. So this module puts what the library's
-schema says into the chart's schema.
+Helm and the generator follow no reference out of a schema. So this module copies the library's
+schema into the chart's schema.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ def composed(
             name: _described(copy.deepcopy(one), name, told)
             for name, one in sorted(properties.items())
         }
-        # Helm puts the library's own values here.
+        # Helm adds these keys for the library's own values and the global values.
         | {name: {"type": "object"} for name in (LIBRARY, "global")},
         "definitions": definitions,
     }
 
 
 def own_properties(schema: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the properties of a chart's schema that are not those of the library."""
+    """Return the properties of a chart's schema that differ from the library's schema."""
     shared = {
         name: _plain(copy.deepcopy(one))
         for name, one in library["definitions"][EXPORT]["properties"].items()

@@ -74,7 +74,7 @@ def read() -> ContextsFile:
 
 
 def parsed(data: dict[str, Any]) -> ContextsFile:
-    """Return data as contexts; raise if it is not valid."""
+    """Return data as contexts; raise if the data are not valid."""
     return parse(ContextsFile, data, str(path()))
 
 

@@ -104,7 +104,7 @@ def subject_data(subject: Subject) -> Json:
 
 
 def lease_data(lease: Lease | None) -> Json | None:
-    """Return a lease as JSON data; one that has not started has no end."""
+    """Return a lease as JSON data; it has no end before its start."""
     if lease is None:
         return None
     return {

@@ -49,7 +49,7 @@ SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~",
 
 
 def terminal_width() -> int | None:
-    """Return the width of the terminal, or None if the output is not for one."""
+    """Return the width of the terminal, or None if the output goes elsewhere."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
@@ -113,7 +113,7 @@ at_option = click.option(
 
 def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
     """Parse an option that is a duration; return its seconds."""
-    from demandops.config.policy import seconds_of  # noqa: PLC0415 - --help must be fast
+    from demandops.config.durations import seconds_of  # noqa: PLC0415 - --help must be fast
 
     try:
         return seconds_of(text)
@@ -131,17 +131,25 @@ def version_lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def show_slow(text: str) -> None:
-    """Show on a terminal what takes long, in place of the last text; an empty text clears that."""
+    """Show on a terminal what takes long, in place of the last text; an empty text clears it."""
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[2K{lines(text)}")
         sys.stderr.flush()
 
 
 @contextmanager
-def busy(title: str) -> Iterator[None]:
-    """Show the title and the elapsed seconds on a terminal, if the block takes a second."""
+def busy(title: str) -> Iterator[Callable[[str], None]]:
+    """Show the title and the elapsed seconds on a terminal, if the block takes a second.
+
+    Yield a function that replaces the title.
+    """
+    shown_title = [title]
+
+    def say(text: str) -> None:
+        shown_title[0] = text
+
     if not sys.stderr.isatty():
-        yield
+        yield say
         return
     ended, shown = REAL.event(), REAL.event()
 
@@ -150,11 +158,11 @@ def busy(title: str) -> Iterator[None]:
         while not ended.wait(1):
             seconds += 1
             shown.set()
-            show_slow(f"{title}, {seconds} s")
+            show_slow(f"{shown_title[0]}, {seconds} s")
 
     thread = REAL.start_thread("busy", tick)
     try:
-        yield
+        yield say
     finally:
         ended.set()
         thread.join()

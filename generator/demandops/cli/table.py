@@ -94,7 +94,7 @@ class Table:
         return max([cell_len(self.columns[at].title), *lengths])
 
     def _least(self, rows: list[list[list[str]]], at: int) -> int:
-        """Return the width that a column needs so that no word of it is cut."""
+        """Return the width that a column needs so that no word in the column is cut."""
         natural = self._natural(rows, at)
         if not self.columns[at].wraps:
             return natural

@@ -16,8 +16,8 @@ import click
 from click.core import ParameterSource
 
 from demandops.quoting import quoted
-from demandops.staterepo.git.address import is_url
 from demandops.staterepo.git.checkout import checkout_around, origin_of
+from demandops.staterepo.git.open_repository import is_url
 
 if TYPE_CHECKING:
     from demandops.cli.contexts import Context
@@ -85,9 +85,9 @@ def _writable() -> str | None:
 
 
 def hint_to_pull() -> list[str]:
-    """Return a line for a command that wrote to the remote of the checkout it was run in.
+    """Return a hint to pull, for a command that pushed to the remote of the current checkout.
 
-    The checkout does not have the commit, and commands that read show what is checked out.
+    The checkout lacks the new commit, and other commands read only the checkout.
     """
     behind = click.get_current_context().meta.get(_BEHIND)
     return ["to see it in this checkout: git pull"] if behind else []

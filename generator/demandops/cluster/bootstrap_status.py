@@ -14,7 +14,7 @@ from demandops.render.gitops.paths import bootstrap_path
 
 @dataclass(frozen=True, slots=True)
 class OldBootstrap:
-    """A cluster without the state repo's current bootstrap file, and how to apply that."""
+    """A cluster without the current bootstrap file, and the command that applies the file."""
 
     cluster: str
     file: str
@@ -35,11 +35,11 @@ def old_bootstraps(
     caches: Mapping[str, ObjectCache],
     read: Callable[[str], str | None],
 ) -> list[OldBootstrap]:
-    """Return the clusters without the current bootstrap file, as far as they can be read.
+    """Return the clusters without the current bootstrap file; skip domains that cannot be read.
 
     Args:
         domains: the access domains on each cluster.
-        caches: the objects of the clusters, which were read.
+        caches: the objects that were read from each cluster.
         read: returns the text of a file of the state repo, None if there is none.
     """
     found = []

@@ -1,4 +1,4 @@
-"""A watch on one ConfigMap: it passes on the data at once, and again when they change."""
+"""A watch on one ConfigMap, which passes on the data at once and after each change."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from demandops.cluster.access import ClusterAccess, own_cluster_api
+from demandops.cluster.clusters_file import ClusterAccess, own_cluster_api
 from demandops.errors import InvalidInput
 from demandops.quoting import one_line
 from demandops.runtime import REAL, Runtime
@@ -22,7 +22,7 @@ OnData = Callable[[Mapping[str, str]], object]
 
 
 class ConfigMapWatch:
-    """Reads a ConfigMap and follows it. It needs the right to list and watch this object only."""
+    """Reads and follows a ConfigMap; the only right it needs is to list and watch this object."""
 
     def __init__(
         self,
@@ -36,7 +36,8 @@ class ConfigMapWatch:
 
         Args:
             namespace: the ConfigMap's namespace.
-            name: its name. It need not exist yet; if it is deleted, the last data stay valid.
+            name: the ConfigMap's name. The ConfigMap need not exist yet. If it is deleted, the last
+                data stay valid.
             on_data: called with the data, from the thread of the watch.
             kubeconfig: how to reach the cluster; without one, this process must be a pod there.
             runtime: provides the threads.
@@ -53,7 +54,7 @@ class ConfigMapWatch:
         runtime.keep_running("config-map", self._run)
 
     def close(self) -> None:
-        """Stop the watch; ``on_data`` is not called again after a call that is under way."""
+        """Stop the watch; ``on_data`` may still be in a call, but is not called again."""
         self._closed.set()
 
     def _run(self) -> None:

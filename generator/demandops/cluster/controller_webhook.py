@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from urllib.parse import quote, urlsplit
 
 from demandops import http_call
-from demandops.cluster.access import NoAccess
+from demandops.cluster.clusters_file import NoAccess
 from demandops.http_call import NoAnswer
 from demandops.settings import MAIN_BRANCH
 
@@ -46,7 +46,7 @@ def call_argocd(
         paths: the changed files; with ``None``, Argo CD refreshes all Applications of the repo.
 
     Raises:
-        NoAccess: if the repo's URL names no host, by which Argo CD identifies the repo.
+        NoAccess: if the repo's URL names no host; Argo CD needs the host to identify the repo.
         NoAnswer: if the controller does not answer, rejects the call or redirects it.
     """
     event = {
@@ -63,7 +63,7 @@ def call_argocd(
 def web_address(repo: str) -> str:
     """Return the address of a repository's web page, without user and password.
 
-    Argo CD compares its host and path with those of each source's URL; it ignores scheme and port.
+    Argo CD compares this address with each source's URL by host and path, not by scheme and port.
 
     Raises:
         NoAccess: if the URL names no host.

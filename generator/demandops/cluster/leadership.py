@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from demandops.cluster.access import own_cluster_api
+from demandops.cluster.clusters_file import own_cluster_api
 from demandops.errors import InvalidInput, Unsound
 from demandops.quoting import quoted
 from demandops.runtime import REAL, Runtime
@@ -33,7 +33,7 @@ _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-
 
 
 class Leadership:
-    """The part of this process in the choice of the leader."""
+    """Makes this process compete for the Lease and, as the leader, renew it."""
 
     def __init__(
         self,
@@ -141,7 +141,7 @@ class Leadership:
         return lease
 
     def _write(self, lease: dict[str, Any], holder: str) -> None:
-        """Replace the Lease that was read; the server refuses it if it has changed since."""
+        """Replace the Lease that was read; the server refuses if the Lease has changed since."""
         old, now = lease.get("spec") or {}, f"{self._runtime.now():%Y-%m-%dT%H:%M:%S.%fZ}"
         spec = old | {
             "holderIdentity": holder,
@@ -156,7 +156,7 @@ class Leadership:
         )
 
     def _tell(self, level: int, text: str) -> None:
-        """Log a text, unless the last one was the same."""
+        """Log a text, unless the last logged text was the same."""
         if text != self._told:
             log.log(level, "%s", text)
         self._told = text

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, Health, Key, ObjectSelector
 from demandops.runtime import REAL, Runtime
@@ -47,6 +47,7 @@ class ObjectCache:
         self._watched: set[ObjectSelector] = set()
         self._known: set[ObjectSelector] = set()
         self._errors: dict[ObjectSelector, str] = {}
+        self._unread = "it has not been read yet"
         self._closed = runtime.event()
         self._client: Any = None
 
@@ -72,11 +73,11 @@ class ObjectCache:
                 if selector in self._errors:
                     return self._errors[selector]
                 if selector not in self._known:
-                    return "it has not been read yet"
+                    return self._unread
         return ""
 
     def unread(self, domain: ClusterDomain) -> Health | None:
-        """Return the health of a domain whose objects are unknown now; None if they are known."""
+        """Return a health that says why a domain's objects are unknown; None if they are known."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
@@ -94,11 +95,16 @@ class ObjectCache:
                     return
                 self._errors[selector] = _reason(selector, error)
 
+    def give_up(self, reason: str) -> None:
+        """Stop waiting for objects that are still unread; ``reason`` says why they are unknown."""
+        with self._lock:
+            self._unread = reason
+
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
         """Read objects again, in the given order, because one watch may lag behind another.
 
         Raises:
-            Exception: by the library, if the cluster does not answer.
+            Exception: from the library, if the cluster does not answer.
         """
         for selector in wanted:
             self._read(selector)
@@ -107,7 +113,7 @@ class ObjectCache:
         """Return a Deployment's pods, read now.
 
         Raises:
-            Exception: by the library, if the cluster does not answer.
+            Exception: from the library, if the cluster does not answer.
         """
         from kubernetes import client  # noqa: PLC0415 - half a second; only when used
 
@@ -200,7 +206,7 @@ class ObjectCache:
 
 
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    """Return the arguments that select objects; one object alone needs fewer rights."""
+    """Return the arguments that select objects; to select a single object needs fewer rights."""
     names = ("group", "version", "plural")
     request = {
         **dict(zip(names, _KINDS[selector.kind], strict=True)),
@@ -215,7 +221,7 @@ def _is_answer(error: Exception) -> bool:
 
 
 def _reason(selector: ObjectSelector, error: Exception) -> str:
-    if _is_answer(error):  # an answer is about these objects; without one the cluster is away
+    if _is_answer(error):  # without an answer, the whole cluster is unreachable
         plural = _KINDS[selector.kind][2]
         reason = getattr(error, "reason", None) or type(error).__name__
         return f"{plural} in {selector.namespace}: {reason}"

@@ -1,7 +1,7 @@
 """Wakes Flux or Argo CD after a push, so that it fetches at once and not at its next interval.
 
-Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs that, and the
-controller fetches at its next interval.
+Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure,
+and the controller fetches at its next interval.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from demandops.cluster import controller_webhook
-from demandops.cluster.access import ClusterAccess, NoAccess
+from demandops.cluster.clusters_file import ClusterAccess, NoAccess
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
@@ -86,7 +86,7 @@ class ReconcileTrigger:
                 missed, pause = set(), None
 
     def _wake_all(self, names: Iterable[str], logged: bool) -> set[str]:
-        """Wake clusters; return those that could not be woken, and log them unless ``logged``."""
+        """Wake clusters; return those that failed, and log them unless they are ``logged``."""
         missed = set()
         for name in sorted(names):
             if self._config is None:
@@ -136,7 +136,7 @@ class ReconcileTrigger:
 
 
 def _reason(error: Exception) -> str:
-    """Return why a cluster was not woken, without URLs or other secrets."""
+    """Return why a cluster was not woken; the text has no URLs or secrets."""
     told = isinstance(error, NoAccess | NoAnswer | InvalidInput)
     return str(error) if told else type(error).__name__
 

@@ -32,7 +32,7 @@ class ReleaseStatus:
 
     @property
     def state(self) -> State | Literal["unknown"]:
-        """The state of the release; ``unknown`` if the cluster tells nothing."""
+        """The state of the release; ``unknown`` if the cluster reports nothing."""
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
@@ -52,8 +52,9 @@ def statuses(
 ) -> list[ReleaseStatus]:
     """Return the status of each release at a commit, from the caches of the clusters.
 
-    With ``changed``, a release counts as applied if its cluster has applied an earlier commit with
-    the same file. So a new commit does not hide the health of releases that it does not change.
+    With ``changed``, a release counts as applied if its cluster has applied an earlier commit in
+    which the release's file is the same. So a new commit does not hide the health of unchanged
+    releases.
     """
     changed = cache(changed)
     known = _Known(history)
@@ -87,7 +88,7 @@ def _is_among(paths: Collection[str], target: Target) -> bool:
 
 
 class _Known:
-    """A history that remembers its answers, because all releases of a domain ask the same."""
+    """A history that remembers its answers, because a domain's releases ask the same questions."""
 
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)

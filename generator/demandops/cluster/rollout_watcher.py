@@ -1,7 +1,7 @@
 """Follows releases on their clusters until they reach the requested level.
 
-One thread evaluates the rollouts whenever a watch reports a change. A cluster that is away delays
-only the rollouts on it.
+One thread evaluates the rollouts whenever a watch reports a change. An unreachable cluster delays
+only its own rollouts.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import (
     ClusterDomain,
@@ -154,7 +154,7 @@ class RolloutWatcher:
                 self._in_background(rollout, partial(self._time_out, health=health))
 
     def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
-        """Run work in a thread of its own, because the cluster that it queries may not answer."""
+        """Run work in a separate thread, because it queries a cluster, which may not answer."""
         rollout.busy = True
 
         def run() -> None:

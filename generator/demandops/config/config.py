@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from demandops import naming
 from demandops.config.appdef import ApplicationDefinition, Service, ServiceDefinition, Services
 from demandops.config.inventory import Broker, Cluster, Node, id_in_domain
+from demandops.config.node_property import Kind, kind_of
 from demandops.config.override import OVERRIDES_ROOT, Override
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import (
@@ -60,7 +61,7 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return the place of a collection's entries as a message names it; ``files`` have entries."""
+    """Return how a message names the files of a collection; ``files`` are those with entries."""
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
@@ -102,6 +103,12 @@ class Config:
     """Part of a topic's name → the nodes whose ids become this part."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     """The nodes of each type, sorted by id; an empty name stands for all."""
+    nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
+        init=False, compare=False, repr=False
+    )
+    """The nodes with a capability, or with a label's key and value, sorted by id."""
+    property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
+    """The type of each property, as most nodes that have it say, and the first of these."""
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The nodes that are drained, sorted."""
     limits_capacity: bool = field(init=False, compare=False, repr=False)
@@ -116,7 +123,7 @@ class Config:
     """Appdef → version or channel → the version's contents; an empty name is the default."""
 
     def __post_init__(self) -> None:
-        """Set the fields that are derived from the others."""
+        """Set the fields that are derived from other fields."""
         found: dict[str, tuple[str, ...]] = {}
         for id in self.nodes:
             part = naming.topic_part(id)
@@ -128,6 +135,20 @@ class Config:
                 by_role.setdefault(role, []).append(node)
         by_role_sorted = {role: tuple(nodes) for role, nodes in by_role.items()}
         object.__setattr__(self, "nodes_by_role", by_role_sorted)
+        with_trait: dict[tuple[str, ...], list[Node]] = {}
+        for _, node in sorted(self.nodes.items()):
+            for trait in {*((name,) for name in node.capabilities), *node.labels().items()}:
+                with_trait.setdefault(trait, []).append(node)
+        found_with = {trait: tuple(nodes) for trait, nodes in with_trait.items()}
+        object.__setattr__(self, "nodes_with", found_with)
+        having: dict[str, dict[Kind, list[str]]] = {}
+        for id, node in self.nodes.items():
+            for name, value in node.properties.items():
+                kind = kind_of(value) or "text"
+                having.setdefault(name, {}).setdefault(kind, []).append(id)
+        most = {name: max(of.items(), key=lambda one: len(one[1])) for name, of in having.items()}
+        kinds = {name: (kind, ids[0]) for name, (kind, ids) in most.items()}
+        object.__setattr__(self, "property_kinds", kinds)
         drained = tuple(sorted(id for id, node in self.nodes.items() if node.drained))
         object.__setattr__(self, "drained_nodes", drained)
         limited = any(node.capacity is not None for node in self.nodes.values())
@@ -173,7 +194,7 @@ class Config:
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return the place of a collection's entries as a message names it."""
+        """Return how a message names the files of a collection."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:

@@ -37,7 +37,7 @@ class ConfigReader:
         self.faults.append(fault(field, message).within(file))
 
     def read_file(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file as ``model``; if it is missing or invalid, add the faults."""
+        """Return a file as ``model``; if the file is missing or invalid, collect the faults."""
         text = self.files.get(file)
         if text is None:
             self.add_fault(file, "", "is missing; `demandops init` creates an example")
@@ -55,12 +55,12 @@ class ConfigReader:
     def read_items(
         self, collection: str, whole: type[BaseModel], field: str, item: type[Model], key: str = ""
     ) -> dict[str, Model]:
-        """Return the valid items of a collection, by name; add the faults of invalid ones.
+        """Return the valid items of a collection, by name; collect the faults of invalid ones.
 
         Args:
             collection: one of :data:`demandops.config.config.COLLECTIONS`.
-            whole: the model of its files.
-            field: their field that has the items, a list or a mapping.
+            whole: the model of the collection's files.
+            field: the field of these files that has the items, a list or a mapping.
             item: the model of an item.
             key: the field with an item's name; empty if ``field`` is a mapping.
         """
@@ -90,10 +90,10 @@ class ConfigReader:
     def add_twice(
         self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
     ) -> None:
-        """Add the faults of an entry that stands twice, at the places ``first`` and ``second``.
+        """Add the faults of an entry that appears twice, at the places ``first`` and ``second``.
 
-        A place is (file, field). Both files get a fault, so that whichever a person changed is
-        held back.
+        A place is (file, field). Both files get a fault, so the file that a person changed is
+        held back, whichever it is.
         """
         dot_key = f".{key}" if key else ""
         if first[0] == second[0]:

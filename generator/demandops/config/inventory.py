@@ -1,7 +1,8 @@
 """The inventory: nodes, clusters and brokers.
 
-A node is a vehicle, a roadside station, an edge or a cloud server, or what else runs services. It
-belongs to one cluster and one access domain. A node selector identifies it in its cluster.
+A node is a vehicle, a roadside station, an edge or a cloud server, or anything else that runs
+services. It belongs to one cluster and one access domain. A node selector identifies it in its
+cluster.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from demandops.config.base_model import (
     readable_by,
     without,
 )
+from demandops.config.node_property import PropertyName, PropertyValue
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 from demandops.quoting import quoted
 
@@ -71,7 +73,7 @@ class Zenoh(CamelModel):
         return self
 
     def listening(self) -> tuple[str, ...]:
-        """Return the endpoints that the bridge listens on; none if no bridge can connect to it."""
+        """Return the endpoints that the bridge listens on; none if no other bridge can connect."""
         if self.listen or not self.endpoint:
             return self.listen
         protocol, _, address = self.endpoint.partition("/")
@@ -228,9 +230,9 @@ class FurtherDomain(CamelModel):
 class Node(CamelModel):
     """A C-ITS entity that runs services.
 
-    ``type`` is its role, any word; ``capabilities`` are words for what it has. A demand may ask for
-    them and name no node (:mod:`demandops.plan.nodes.placement`); it then gets none that is
-    ``drained``.
+    ``type`` is its role, any word; ``capabilities`` are words for what it has, ``properties`` its
+    typed values. A demand may ask for them and name no node
+    (:mod:`demandops.plan.nodes.placement`); it then gets none that is ``drained``.
     Services request no more than ``capacity`` there (:mod:`demandops.plan.nodes.capacity`).
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
     If the access domain has a ROS domain, that replaces the one of ``ros``.
@@ -257,6 +259,7 @@ class Node(CamelModel):
     types: dict[Topic, MessageType] = Field(default_factory=dict)
     bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
     capabilities: Items[Word] = ()
+    properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
     position: Position | None = None
     drained: bool = False
     capacity: Resources | None = None

@@ -17,6 +17,7 @@ from demandops.config.appdef import (
     Services,
     resolved_services,
 )
+from demandops.config.checks.cross_check import cross_check
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -31,7 +32,6 @@ from demandops.config.config import (
     collection_of,
 )
 from demandops.config.config_reader import ConfigReader
-from demandops.config.cross_check import cross_check
 from demandops.config.inventory import (
     Broker,
     BrokersFile,
@@ -169,7 +169,7 @@ def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]
 
 
 def _refuse_unread(reader: ConfigReader) -> None:
-    """Add a fault for each file that looks like configuration but is none."""
+    """Add a fault for each file that looks like configuration but is not read."""
     folders = {collection.partition("/")[0] for collection in COLLECTIONS}
     for path in sorted(reader.files):
         folder, *rest = path.split("/")
@@ -217,7 +217,7 @@ def _resolve(
     definitions: Mapping[str, ServiceDefinition],
     reader: ConfigReader,
 ) -> Services:
-    """Return the services of an appdef; none if it, or a definition that it uses, is not valid."""
+    """Return the services of an appdef; none if the appdef or a definition it uses is invalid."""
     files = {f"appdefs/{name}/service.yaml" for name in appdef.uses.keys() - definitions.keys()}
     if files & reader.files.keys():
         return {}
@@ -254,7 +254,7 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
 
 
 def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:
-    """Return the node in the ROS domain of its access domain, if that has one."""
+    """Return the node with the ROS domain of its access domain, if the access domain has one."""
     if domain is None or domain.ros is None:
         return node
     ros = node.ros.model_copy(update={"domain_id": domain.ros.domain_id})
@@ -267,7 +267,7 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return nodes, the domain of each, and the host of each ``<id>@<domain>`` that it adds."""
+    """Return nodes, the domain of each, and the host of each added ``<id>@<domain>``."""
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
     for node in [one for one in nodes.values() if one.access_domains]:
         file, place = reader.place_of(NODES_FILE, node.id)
@@ -282,7 +282,7 @@ def _in_further_domains(
                 reader.add_fault(file, where, message)
             elif domain is first or id in nodes:
                 message = f"'{node.id}' is in '{further.name}' already, or '{id}' is a node"
-                reader.add_fault(file, f"{where}.name", f"{message}; remove one of the two")
+                reader.add_fault(file, f"{where}.name", f"{message}; remove this, or the other")
             elif domain is not None:
                 number = _in_ros_domain(node, domain).ros.domain_id
                 other = ros.setdefault(number, domain.name)

@@ -1,7 +1,8 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
 This module has the model and the rules for one override. Conflicts between two are in
-:mod:`demandops.config.override_conflicts`, effects on releases and claims in ``plan/overrides``.
+:mod:`demandops.config.checks.override_conflicts`, effects on releases and claims in
+``plan/overrides``.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from demandops.config.base_model import (
 from demandops.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.config.policy import matches
 from demandops.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, sentences
 from demandops.identifiers import id_problem
 from demandops.quoting import quoted
 
@@ -102,7 +103,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Refuse an override in which a field has no value: it would do less than it seems to."""
+    """Refuse an override with a field without a value: it would do less than it seems to."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
@@ -167,7 +168,7 @@ class OverrideFile(FileModel):
         _filled_in(self)
         problems = [*_contradictions(self.effects()), *self._misplaced()]
         if problems:
-            raise ValueError("; ".join(problems))
+            raise ValueError(sentences(problems))
         return self
 
     def _misplaced(self) -> Iterable[str]:
@@ -182,18 +183,18 @@ class OverrideFile(FileModel):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
                 yield (
-                    f"select[{index}].connections: {wrong[0]} changes services, and connections "
-                    "have none; remove one of the two"
+                    f"select[{index}].connections: '{wrong[0]}' is for services, but this selects "
+                    f"connections; remove 'connections', or {wrong[0]}"
                 )
             if selector.requesters and "node" in effects:
                 yield (
-                    f"select[{index}].requesters: node moves a service for everybody who requests "
-                    "it; select by applications, appdefs, services, nodes or labels"
+                    f"select[{index}].requesters: 'node' moves a service for every requester; "
+                    "select by applications, appdefs, services, nodes or labels"
                 )
             if selector.services and "keep" in effects:
                 yield (
-                    f"select[{index}].services: keep is for applications and connections; select "
-                    "those"
+                    f"select[{index}].services: 'keep' applies to applications and connections "
+                    "only; select those"
                 )
 
     def selects_clients(self) -> bool:
@@ -278,13 +279,11 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
         yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
     if "deny" in effects and len(effects) > 1:
         others = " and ".join(name for name in effects if name != "deny")
-        yield f"deny prevents it from running, so {others} cannot apply; remove one of them"
+        yield f"with deny nothing runs, so {others} cannot apply; remove deny, or remove {others}"
     frozen = [name for name in effects if name in _SHAPING]
     if "hold" in effects and frozen:
-        yield (
-            f"hold freezes the release, so {' and '.join(frozen)} cannot change it; remove one "
-            "of them"
-        )
+        names = " and ".join(frozen)
+        yield f"hold freezes the release, so {names} cannot apply; remove hold, or remove {names}"
 
 
 def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON

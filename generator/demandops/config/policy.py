@@ -6,7 +6,6 @@ apply to demands for these nodes.
 
 from __future__ import annotations
 
-import re
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
 
@@ -23,36 +22,17 @@ from demandops.config.base_model import (
     Text,
     readable_by,
 )
+from demandops.config.durations import seconds_of
 from demandops.config.inventory import Credentials, NodeId, RosDomainId
 from demandops.errors import suggestion
 from demandops.quoting import quoted
-
-_DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
-_UNITS_S = (86_400, 3_600, 60, 1)
-_YEAR_S = 366 * 86_400
-
-
-def seconds_of(text: str) -> int:
-    """Return the seconds of a duration like ``1h30m``.
-
-    Raises:
-        ValueError: if the text is not a duration.
-    """
-    match = _DURATION.fullmatch(text)
-    if not text or match is None:
-        raise ValueError(f"{quoted(text)} is not a duration; write one like 90s, 10m, 1h30m or 2d")
-    seconds = sum(int(part) * unit for part, unit in zip(match.groups("0"), _UNITS_S, strict=True))
-    if seconds > _YEAR_S:
-        raise ValueError(f"'{text}' is longer than a year; choose a shorter duration")
-    return seconds
-
 
 Duration = Annotated[str, readable_by(seconds_of)]
 Patterns = Annotated[tuple[Text, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Return whether a name matches one of ``patterns``; only ``*`` and ``?`` are special."""
+    """Return whether a name matches any of ``patterns``; only ``*`` and ``?`` are special."""
     return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
 
 
@@ -85,7 +65,7 @@ class Quotas(CamelModel):
 
 
 class LeasePolicy(CamelModel):
-    """How long a demand's claims last without a renewal.
+    """The time that a demand's claims stay booked without a renewal.
 
     Demands that request no lease get ``default``; without it their claims last forever. With
     ``deployment_requests`` that includes the reference's ``DeploymentRequest``, whose clients must
@@ -237,7 +217,7 @@ class AccessDomain(CamelModel):
         if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
             raise ValueError(
                 "kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; remove "
-                "one of them"
+                "NetworkPolicy from kinds, or remove network"
             )
         return self
 

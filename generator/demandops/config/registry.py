@@ -24,7 +24,7 @@ from demandops.config.base_model import (
     Word,
 )
 from demandops.config.inventory import Rmw
-from demandops.errors import suggestion
+from demandops.errors import sentences, suggestion
 
 ChartVersion = Annotated[
     str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
@@ -88,7 +88,7 @@ class Chart(ChartSource):
         return (self, *self.channels.values())
 
     def at(self, version: str) -> ChartSource | None:
-        """Return a channel or version (empty: the default), or ``None`` if it is unknown."""
+        """Return a channel or version (empty: the default); ``None`` if the name is unknown."""
         if not version:
             return self
         if version in self.channels:
@@ -114,7 +114,7 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        """Return the image with its host, if it names one, replaced by ``registry``."""
+        """Return the image with ``registry`` in place of its host, if the image names a host."""
         host, _, path = self.repository.partition("/")
         named = path and ("." in host or ":" in host or host == "localhost")
         repository = f"{registry}/{path if named else self.repository}"
@@ -199,7 +199,7 @@ class VersionList(CamelModel):
             if version not in self.versions
         ]
         if problems:
-            raise ValueError("; ".join(problems))
+            raise ValueError(sentences(problems))
         return self
 
 

@@ -53,7 +53,7 @@ class Connection:
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic, or ``None``; the connection must be a claim's."""
+        """Return the route of a source topic, or ``None``; only for a connection of a claim."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
         return found[0] if found and found[0].source == source else None
@@ -63,7 +63,7 @@ class Connection:
         return node in (self.source, self.target, self.broker)
 
     def booked(self) -> Connection:
-        """Return the connection as a claim holds it."""
+        """Return the connection in the form of a claim: routes sorted, without duplicates."""
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
@@ -72,7 +72,7 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed`` of a shutdown means this connection; empty fields fit any."""
+        """Return whether a shutdown's ``listed`` means this connection; empty fields match any."""
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -81,7 +81,7 @@ class Connection:
         )
 
     def told_apart_by(self) -> tuple[str, ...]:
-        """Return the values by which a shutdown tells this connection from others of its id."""
+        """Return the values by which a shutdown distinguishes connections with the same id."""
         return (self.source, self.target, self.known_type.word)
 
     def topic_keys(self) -> Iterator[TopicKey]:
@@ -90,19 +90,19 @@ class Connection:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each topic of ``listed`` as text, and the key of the same topic here, if any."""
+        """Yield each topic of ``listed`` as text, with the key of the same own topic, if any."""
         assert isinstance(listed, Connection)  # noqa: S101 - see is_meant_by
         known = {*self.topic_keys()}
         for key in listed.topic_keys():
             yield f"topic {key[0]}", [key] if key in known else []
 
     def without_topics(self, gone: Container[TopicKey]) -> Connection | None:
-        """Return the connection without these topics; ``None`` if it has no others."""
+        """Return the connection without these topics; ``None`` if no topic is left."""
         left = tuple(route for route in self.topics if (route.source,) not in gone)
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return the connection without a node, with no broker; ``None`` if the node is an end."""
+        """Return the connection without the broker ``node``; ``None`` if the node is an end."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:

@@ -32,8 +32,8 @@ Side = Literal["source", "target"]
 class ClientKey:
     """The identity of a client.
 
-    ``id`` is the connection that it is a ``side`` of. Without a side it is the node whose
-    connections of this type share the client.
+    With a ``side``, ``id`` is the connection of which the client is one end. Without a side, ``id``
+    is the node whose connections of this type share the client.
     """
 
     type: ConnectionType
@@ -80,7 +80,7 @@ class Client(ABC):
         return configuration
 
     def settings(self, config: Config) -> ClientSettings:
-        """Return how the client runs, with the patches of overrides.
+        """Return the settings with which the client runs, patched by overrides.
 
         Raises:
             InvalidInput: naming the override whose patch gives no valid settings.
@@ -91,7 +91,7 @@ class Client(ABC):
         return found
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
-        """Return the environment that the program needs, beside that of its settings."""
+        """Return the environment that the program needs in addition to that of its settings."""
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
@@ -131,7 +131,7 @@ def message_type(route: Route, sender: str, config: Config) -> str:
 
 
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault: inventory or registry lack an entry that the type needs."""
+"""The code of the fault that inventory or registry lack an entry that the type needs."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 
@@ -140,7 +140,7 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return a connection, or ``None`` if it is not claimed with this type.
+        """Return a connection, or ``None`` if no claim has the connection with this type.
 
         Raises:
             Refused: if the type cannot carry it.
@@ -160,13 +160,15 @@ class ConnectionType(ABC):
     image: ClassVar[str]
     """The name of the clients' image in the registry."""
     options: ClassVar[frozenset[str]]
-    """The options of a route that the type supports; each type supports type and direction."""
+    """The options of a route that the type supports, apart from message type and direction."""
     renames: ClassVar[bool] = False
     """Whether a topic may have another name at the target."""
     takes_broker: ClassVar[bool] = False
     """Whether a demand may name a broker."""
     speaks_dds: ClassVar[bool] = True
     """Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware."""
+    needs_types: ClassVar[bool] = False
+    """Whether the clients must know the message type of each topic."""
 
     def __repr__(self) -> str:
         """Return the type's name."""
@@ -189,7 +191,7 @@ class ConnectionType(ABC):
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield why the inventory does not let the type link two ends.
 
-        It skips unknown nodes; :mod:`demandops.demand.admission` reports them.
+        Unknown nodes are skipped; :mod:`demandops.demand.admission` reports them.
         """
 
     def route_faults(
@@ -206,7 +208,7 @@ class ConnectionType(ABC):
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return (field of an access rule, needed value) for all but the connection's nodes."""
+        """Return (field of an access rule, needed value) for what is needed besides the nodes."""
         return []
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:

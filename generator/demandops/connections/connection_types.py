@@ -15,7 +15,7 @@ from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
-from demandops.errors import Fault, fault
+from demandops.errors import Fault, fault, sentences
 from demandops.identifiers import topic_problem
 
 CONNECTION_TYPES: tuple[ConnectionType, ...] = (ZENOH, MQTT, ROS)
@@ -76,7 +76,7 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
         field = "" if reason.field in ("type", "broker") else f"{reason.field} "
         text = f"{field}{reason.message}"
         reasons.append(text if text.startswith(kind.name) else f"{kind.name}: {text}")
-    message = f"no connection type is given, and none can carry it. {'; '.join(reasons)}"
+    message = f"no connection type is given, and none fits. {sentences(reasons)}"
     return fault("type", message, code=UNSUPPORTED)
 
 
@@ -100,7 +100,7 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
                 able = listed(known for known in CONNECTION_TYPES if not known.speaks_dds)
                 yield fault(
                     end,
-                    f"'{node}' runs rmw_zenoh_cpp, and {kind.name} clients speak DDS; use type "
+                    f"'{node}' runs rmw_zenoh_cpp, but type {kind.name} needs DDS; use type "
                     f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}",
                     code=UNSUPPORTED,
                 )

@@ -85,7 +85,7 @@ class Mqtt(ConnectionType):
             )
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection with the broker that it gets instead of the named one."""
+        """Return the connection with the broker that it gets, and a note if another was named."""
         broker = choose_broker(connection, config)
         if not connection.broker or broker is None or broker.node == connection.broker:
             return connection, ""
@@ -124,7 +124,7 @@ MQTT = Mqtt()
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
     """Return a connection's broker as the reference chooses it, or ``None``.
 
-    That is the only broker there is; else the named one, the target's or the source's.
+    If there is only one broker, it is chosen; else the named one, the target's or the source's.
     """
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))

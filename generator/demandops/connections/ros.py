@@ -39,6 +39,7 @@ class Ros(ConnectionType):
     number = 0
     image = "dds-router"
     options = frozenset({"reliability", "durability", "queue", "rate"})
+    needs_types = True
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield a fault if neither end has a reachable address."""
@@ -105,7 +106,7 @@ ROS = Ros()
 
 
 def _listener(connection: Connection, config: Config) -> Node | None:
-    """Return the end that the other connects to: the target if it has a wan address."""
+    """Return the end that listens: the target if it has a wan address, else the source."""
     for id in (connection.target, connection.source):
         node = config.nodes.get(id)
         if node is not None and node.wan is not None:
@@ -114,13 +115,13 @@ def _listener(connection: Connection, config: Config) -> Node | None:
 
 
 def _port(connection: str, wan: Wan) -> int:
-    """Return the port of a connection's routers; it depends on the connection id only."""
+    """Return a connection's port; it depends only on the connection id and the port range."""
     return wan.first_port + _number(connection) % (wan.last_port - wan.first_port + 1)
 
 
 @lru_cache(maxsize=65_536)
 def _number(connection: str) -> int:
-    """Return a number for a connection id, from a cache, because ids are compared often."""
+    """Return a number for a connection id; it is cached, because ports are compared often."""
     return int(naming.digest("port", connection), 16)
 
 
@@ -141,7 +142,7 @@ class RosEnd(End):
         """Return the configuration of one end's router.
 
         A topic passes only from the end that reads it to the end that writes it. Most topics come
-        from the source. The general routes cover them, so that a new one needs no restart.
+        from the source. The general routes cover these, so that a new one needs no restart.
         """
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []

@@ -1,7 +1,7 @@
 """Routes: one topic of a connection, with its names, direction and options.
 
 Requests and claims contain :class:`Route`, and clients are configured from it. This module knows
-the valid options; each connection type knows which it supports.
+the valid options; each connection type knows which of them it supports.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class RouteOptions(FrozenModel):
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
-    """Yield the faults of one connection's routes, except those that depend on its type."""
+    """Yield the faults of a connection's routes that do not depend on the connection's type."""
     targets: dict[str, Route] = {}
     carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):
@@ -151,7 +151,7 @@ def _shown(value: object) -> str:
 
 
 def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
-    """Return routes sorted by source topic, each once; a message type fills in a missing one."""
+    """Return routes by source topic, each once; a route with a message type is preferred."""
     merged: dict[str, Route] = {}
     for route in routes:
         first = merged.get(route.source)

@@ -1,4 +1,4 @@
-"""Zenoh connections: each node has one zenoh-bridge-ros2dds for all of them.
+"""Zenoh connections: each node has one zenoh-bridge-ros2dds for all its connections.
 
 Two bridges on one host and ROS domain do not work. The configuration is that of
 eclipse-zenoh/zenoh-plugin-ros2dds 1.10, which reads it only at its start.
@@ -37,7 +37,7 @@ class Zenoh(ConnectionType):
     options = frozenset({"rate"})
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield a fault for each further bridge on a host that has one."""
+        """Yield a fault for each further bridge on the same host and ROS domain."""
         hosts: dict[tuple[object, ...], str] = {}
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
@@ -131,8 +131,8 @@ ZENOH = Zenoh()
 def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
     """Return the endpoints that a bridge connects to: its routers, and some of its peers.
 
-    If two peers can reach each other, only the one whose id sorts first connects. So there is one
-    link between them.
+    If two peers can reach each other, only the peer whose id sorts first connects. So the two
+    have one link.
     """
     if node.zenoh is None:
         message = (
@@ -154,7 +154,7 @@ class Bridge(Client):
     """The desired state of a node's Zenoh bridge.
 
     The bridge reads ``publishers`` from the node's ROS graph and publishes ``subscribers``
-    there. ``rates`` limits the messages per second of a topic that it reads.
+    there. ``rates`` limits the messages per second of topics that the bridge reads.
     """
 
     publishers: tuple[str, ...]

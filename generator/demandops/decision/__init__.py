@@ -1,4 +1,4 @@
-"""The decision on one demand: all stages before it as one pure function."""
+"""The decision on one demand: the stages from goal to rendered files as one pure function."""
 
 from demandops.decision.admitted_request import admit, form_faults
 from demandops.decision.claim_edit import changeset_of_edit, faults_of_edit

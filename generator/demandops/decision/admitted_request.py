@@ -31,14 +31,20 @@ Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 """Yields a fault if a request comes too soon after others of its requesters."""
 
 
-def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> DemandRequest:
+def admitted(
+    state: State,
+    goal: object,
+    now: datetime,
+    throttle: Throttle,
+    trial: placement.Trial | None = None,
+) -> DemandRequest:
     """Return the request of a goal; if only room is lacking, the request to wait for room.
 
     Raises:
-        Refused: if the demand can neither be booked nor wait. One that holds claims never waits.
+        Refused: if the demand can neither be booked nor wait. A demand with claims never waits.
     """
     try:
-        return admit(state, goal, throttle)
+        return admit(state, goal, throttle, trial)
     except Refused as refused:
         if any(found.code != NO_ROOM for found in refused.faults):
             raise
@@ -60,9 +66,14 @@ def admitted(state: State, goal: object, now: datetime, throttle: Throttle) -> D
 
 
 def admit(
-    state: State, goal: object, throttle: Throttle = lambda request, config: ()
+    state: State,
+    goal: object,
+    throttle: Throttle = lambda request, config: (),
+    trial: placement.Trial | None = None,
 ) -> DemandRequest:
     """Return the request of a goal, checked against the configuration and the throttle.
+
+    With a ``trial``, nodes with which the request cannot be booked are passed over.
 
     Raises:
         Refused: with every fault, of form and of content.
@@ -78,19 +89,15 @@ def admit(
         parsed = separate_instance.with_separate_instances(parsed, config)
         parsed, unclear = chosen_domain.with_chosen_domains(parsed, config, ledger.held)
         request = output_topics.with_further_topics(parsed, ledger, config)
-        request, not_placed = placement.with_chosen_nodes(request, state, state.usage())
-        request = permission.with_lease_terms(request, config)
-        request = implied_connections.with_implied_connections(request, ledger, config)
+        request, not_placed = placement.with_chosen_nodes(request, state, state.usage(), trial)
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
         _refuse_large(wired, config)
         wired, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
-        request, not_placed = placement.with_chosen_nodes(wired, state, state.usage())
-        request = permission.with_lease_terms(request, config)
-        request = output_topics.with_further_topics(request, ledger, config)
-    request = admission.with_chosen_types(request, config, ledger.connection)
+        request, not_placed = placement.with_chosen_nodes(wired, state, state.usage(), trial)
+    request = completed(request, state)
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [
@@ -112,6 +119,26 @@ def admit(
     if faults:
         raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject_of(found.field)))
     return request
+
+
+def completed(request: DemandRequest, state: State) -> DemandRequest:
+    """Return a request completed by leases, connections and their types; its nodes are chosen."""
+    config, ledger = state.config, state.ledger
+    request = permission.with_lease_terms(request, config)
+    if request.is_reference:
+        request = output_topics.with_further_topics(request, ledger, config)
+    else:
+        request = implied_connections.with_implied_connections(request, ledger, config)
+    return admission.with_chosen_types(request, config, ledger.connection)
+
+
+def leaves_nodes_open(state: State, goal: object) -> bool:
+    """Return whether the generator chooses a node for a goal."""
+    if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
+        request: DemandRequest | None = demand_goal.parse(goal)[0]
+    else:
+        request = deployment_request_goal.parse(goal, state.config.appdef_by_wire_type)[0]
+    return request is not None and request.adds_claims and placement.is_placed(request, state)
 
 
 def _refuse_large(request: DemandRequest, config: Config) -> None:

@@ -29,14 +29,14 @@ from demandops.subject import Subject
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes to rendered files that follow when a person changes claims."""
+    """Return the changes to rendered files after a person changed claims."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
     return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
 
 
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
-    """Yield why claims that a person wrote are refused, each located in the claim's file.
+    """Yield the faults of claims that a person wrote, each located in the claim's file.
 
     A claim must be valid, permitted, within the quotas and capacities, and without a topic clash,
     as if a demand asked for it. An edit that only takes requesters away is always allowed, like a

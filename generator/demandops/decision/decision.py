@@ -1,27 +1,36 @@
 """The decision on one demand: from the goal to the files of a commit.
 
-It composes the stages before it into a pure function: parse, admit, book, plan, render. It reads
-the state repo only through ``read`` and writes nothing. So a dry run, a replay on a moved remote
+It is one pure function of these stages: parse, admit, book, plan, render. It reads the state repo
+only through ``read`` and writes nothing. So a dry run, a replay on a moved remote
 and the real run are the same call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from typing import Literal
 
 from demandops.config.config import Config
-from demandops.decision.admitted_request import Throttle, admitted
+from demandops.decision.admitted_request import (
+    Throttle,
+    admit,
+    admitted,
+    completed,
+    leaves_nodes_open,
+)
 from demandops.decision.decision_notes import notes_on
 from demandops.decision.state import State
 from demandops.demand import (
+    admission,
     demand_goal,
     permission,
 )
 from demandops.demand.demand_request import Decommission, DemandRequest
-from demandops.errors import Refused
+from demandops.errors import Fault, Refused
 from demandops.ledger.apply import apply
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.kept_replicas import Instance
@@ -39,7 +48,7 @@ from demandops.plan.overrides.claim_overrides import (
     without_kept_claims,
 )
 from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import affected_keys
+from demandops.plan.release_keys import ReleaseKey, affected_keys
 from demandops.render.changes import changeset
 from demandops.render.changes.changeset import FileReader, ReleaseChange
 
@@ -88,7 +97,8 @@ class Decision:
     def lease_s(self) -> int | None:
         """The shortest lease of the demand, in seconds; ``None`` if it has no lease.
 
-        For a waiting demand it is the lease that it may get, so that its client keeps renewing.
+        For a waiting demand it is the shortest lease that the demand may get, so that the client
+        keeps renewing it.
         """
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:
@@ -127,8 +137,59 @@ def decide(
         Refused: with every fault, by the goal's fields. Nothing may be written then.
         InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
+    if isinstance(goal, DemandRequest):
+        return _decided(state, goal, now, read, on_stage)
+    limits, told = list[Fault](), set[Stage]()
+
+    def noted(request: DemandRequest, config: Config) -> list[Fault]:
+        limits[:] = throttle(request, config)
+        return limits
+
+    def once(stage: Stage) -> None:
+        if stage not in told:
+            told.add(stage)
+            on_stage(stage)
+
+    try:
+        return _decided(state, admitted(state, goal, now, noted), now, read, once)
+    except Refused as refused:
+        by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
+        if not by_node or not leaves_nodes_open(state, goal):
+            raise
+        # look for a node that avoids the refusal; other demands do not pay for this search
+        with suppress(Refused):
+            request = admit(state, goal, throttle, partial(_can_be_booked, state, now))
+            return _decided(state, request, now, read, once)
+        raise
+
+
+_BY_NODE = frozenset(
+    ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
+)
+"""The codes of refusals that another node may avoid."""
+
+
+def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:
+    """Return whether a request whose nodes are chosen can be booked."""
+    request, config = completed(request, state), state.config
+    if any((*admission.faults(request, config), *permission.faults(request, config))):
+        return False
+    try:
+        _booked(state, request, now)
+    except Refused:
+        return False
+    return True
+
+
+def _decided(
+    state: State,
+    request: DemandRequest,
+    now: datetime,
+    read: FileReader,
+    on_stage: Callable[[Stage], None],
+) -> Decision:
+    """Return the decision on an admitted request; see :func:`decide`."""
     config = state.config
-    request = goal if isinstance(goal, DemandRequest) else admitted(state, goal, now, throttle)
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage())
     if isinstance(request, Restoration):
@@ -137,16 +198,8 @@ def decide(
         if faults:
             raise Refused(faults)
     on_stage("admitted")
-    ledger, changes = _book(state, request, now)
-    after = replace(state, ledger=ledger)
-    keys = affected_keys(state, after, changes.claims)
-    ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
-    after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
-    clashes = list(topic_clash.faults(request, state, after, keys))
-    for change in changes.claims if isinstance(request, Restoration) else ():
-        clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
-    if clashes:
-        raise Refused(clashes)
+    after, changes, keys = _booked(state, request, now)
+    ledger = after.ledger
     rendered = changeset.build_changeset(
         state, after, changes, keys, state.engine, read, state.plans
     )
@@ -186,10 +239,32 @@ def decide(
     )
 
 
+def _booked(
+    state: State, request: DemandRequest, now: datetime
+) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
+    """Return the state with a request booked, the changes, and the releases that may change.
+
+    Raises:
+        Refused: if existing claims, an override, a quota or a topic forbid it.
+    """
+    ledger, changes = _book(state, request, now)
+    after = replace(state, ledger=ledger)
+    keys = affected_keys(state, after, changes.claims)
+    ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
+    after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
+    clashes = list(topic_clash.faults(request, state, after, keys))
+    for change in changes.claims if isinstance(request, Restoration) else ():
+        clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
+    if clashes:
+        raise Refused(clashes)
+    return after, changes, keys
+
+
 def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger with a request booked, and the changes.
 
-    Its claims replace kept ones. Overrides may keep claims that it releases.
+    Claims of the request replace claims that overrides kept. Overrides may keep claims that the
+    request releases.
 
     Raises:
         Refused: if existing claims, an override or a quota forbid it.

@@ -1,4 +1,4 @@
-"""What a requester is told about a decision beside its outcome."""
+"""Notes for the requester on a decision, in addition to its outcome."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from demandops.plan.overrides.claim_overrides import (
 from demandops.plan.planner import is_bridged
 from demandops.plan.release import Release, ServiceKey, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
+from demandops.plan.views import misspelled_topics
 from demandops.render.changes.changeset import Changeset
 
 
 def notes_on(
     request: DemandRequest, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    """Yield what the requester should know of a demand, once it is booked and rendered."""
+    """Yield notes for the requester of a demand that is booked and rendered."""
     yield from separate_instance.notes(request)
     yield from _connection_warnings(request, after)
+    yield from misspelled_topics.notes(request, after)
     yield from rendered.blocked
     yield from _repeat(changes)
     if isinstance(request, Drain):

@@ -28,7 +28,7 @@ class State(World):
     """The world at one commit, with the engine that renders its configuration's templates.
 
     ``plans`` are the releases that earlier decisions on this configuration planned. A copy made
-    with ``replace`` has none: only :func:`decide` knows which of them are still right.
+    with ``replace`` has no plans: only :func:`decide` knows which plans are still valid.
     """
 
     engine: Engine
@@ -43,7 +43,7 @@ class State(World):
         return cls(config, ledger, Engine(config.files))
 
     def usage(self) -> Usage:
-        """Return what services request of each node; only the first call counts them all."""
+        """Return what services request of each node; only the first call counts all services."""
         if self._usage is None:
             object.__setattr__(self, "_usage", capacity.whole_usage(self))
         assert self._usage is not None  # noqa: S101 - set above

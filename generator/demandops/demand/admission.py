@@ -63,7 +63,7 @@ def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
         items += len(one.requesters) if request.is_reference else 0
         if isinstance(held, Application):
             items += len(held.all_inputs()) + len(held.deliver)
-            items += held.place.size if held.place else 0
+            items += len(held.named) + (held.place.size if held.place else 0)
         else:
             items += len(held.topics)
         if isinstance(held, Application) and held.parameters:
@@ -174,6 +174,7 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
                 f"of nodes in {service.file}",
                 code="no-node",
             )
+    yield from _named_services(app, appdef.name, config)
     versions = config.versions_of(appdef.name)
     yield from _instance(app, appdef, versions)
     if app.version and app.version not in versions:
@@ -182,6 +183,24 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
             f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
             f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
         )
+
+
+def _named_services(app: Application, appdef: str, config: Config) -> Iterator[Fault]:
+    """Yield a fault for each named service that is unknown or gets no node of its own."""
+    services = config.services[appdef]
+    for name in app.named:
+        service = services.get(name)
+        if service is None:
+            known = suggestion(name, [one.name for one in services.values() if one.is_placeable])
+            yield fault(f"services.{name}", f"{appdef} has no such service{known}")
+        elif not service.is_placeable:
+            message = (
+                f"{name} runs at its sources, or for applications of other types too, so no "
+                "demand names its node; leave it out"
+            )
+            yield fault(f"services.{name}", message)
+        elif not app.services.get(name):
+            yield from _id(f"services.{name}", "")
 
 
 def _instance(

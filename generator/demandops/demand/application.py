@@ -17,7 +17,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 class InputTopic(NamedTuple):
     """An input topic of an application, and the node that publishes it.
 
-    ``further`` says that another topic of the node was its usual one when this one was booked
+    ``further``: when this topic was booked, another one was the usual topic of the node
     (:mod:`demandops.plan.output_topics`).
     """
 
@@ -28,24 +28,24 @@ class InputTopic(NamedTuple):
 
     @property
     def part(self) -> str:
-        """The source as part of a topic name; for a further topic, with the topic."""
+        """The source as part of a topic name; a further topic adds its own name."""
         return self.part_in("")
 
     def part_in(self, version: str) -> str:
-        """Return :attr:`part` in the separate instance of ``version``, if that is not empty."""
+        """Return :attr:`part` for the separate instance of ``version``, if given."""
         return naming.topic_part(self.source, self.told_apart_by(self.further, version))
 
     def told_apart_by(self, further: bool, version: str) -> str:
-        """Return what tells names for one source apart: a further topic, and a version, if any."""
+        """Return the text that distinguishes names of one source: further topic and version."""
         if not further:
             return version
         return f"{self.topic} {version}" if version else self.topic
 
 
 class Delivery(NamedTuple):
-    """An output (``<service>.<output>``) that is brought to a node; ``topic`` is its name there.
+    """An output (``<service>.<output>``) that is brought to a node.
 
-    Without ``topic`` it keeps its name.
+    Without ``topic`` the output keeps its name.
     """
 
     output: str
@@ -55,16 +55,20 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What the node of an application must have: its type, labels as pairs, capabilities."""
+    """What the node of an application must have: its type, labels as pairs, capabilities.
+
+    ``properties`` are texts like ``memoryGiB>=8`` (:mod:`demandops.config.node_property`).
+    """
 
     role: str = ""
     labels: tuple[tuple[str, str], ...] = ()
     capabilities: tuple[str, ...] = ()
+    properties: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
-        """How many labels and capabilities the requirement has."""
-        return len(self.labels) + len(self.capabilities)
+        """How many labels, capabilities and properties the requirement has."""
+        return len(self.labels) + len(self.capabilities) + len(self.properties)
 
     def united(self, other: Requirement) -> Requirement:
         """Return the requirement that includes both requirements."""
@@ -72,6 +76,7 @@ class Requirement:
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
             tuple(sorted({*self.capabilities, *other.capabilities})),
+            tuple(sorted({*self.properties, *other.properties})),
         )
 
 
@@ -81,10 +86,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
     are sorted by topic (:meth:`booked`). ``place`` is what its node must have; it is ``None`` if
-    the demand names the node. ``separate`` says that this version runs beside others, and that the
-    id names it (:mod:`demandops.demand.separate_instance`). ``services`` has the nodes of the
-    services that the generator placed one by one, ``moved`` the nodes to which overrides move
-    services.
+    the demand names the node. ``separate`` says that this version runs at the same time as others,
+    and that the id ends in it (:mod:`demandops.demand.separate_instance`). ``services`` maps each
+    service that is placed alone to its node. ``named`` lists the services whose node the demand
+    names; the generator chose the other nodes. ``moved`` maps each service that an override moves
+    to its node.
     """
 
     id: str
@@ -98,6 +104,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     separate: bool = False
     services: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     moved: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    named: tuple[str, ...] = ()
     _further: dict[tuple[str, str], list[InputTopic]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
@@ -117,7 +124,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def own_version(self) -> str:
-        """The version that its services and topics have in their names; empty if not separate."""
+        """The version in the names of the services and topics; empty if not separate."""
         return self.version if self.separate else ""
 
     @property
@@ -131,11 +138,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
-        """Return every (role, topic)."""
+        """Return every input as (role, topic)."""
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs in a role that are ``topic`` of ``source``."""
+        """Return the inputs of a role with this source and this topic."""
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
@@ -144,10 +151,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the inputs of a role for which topic names contain ``part``, except usual topics.
+        """Return the further inputs of a role with this part of topic names (:attr:`part`).
 
-        In a separate instance, usual topics are among them too. The parts are computed once,
-        because each service for a further topic asks for one.
+        A separate instance returns usual inputs too. The parts are computed once, because each
+        service for a further topic looks one up.
         """
         if not self._further:
             for known, topic in self.all_inputs():
@@ -162,7 +169,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return delivered or node in self.needed_nodes()
 
     def needed_nodes(self) -> set[str]:
-        """Return the nodes at which services may run: its own and those of its inputs."""
+        """Return the nodes at which services may run: the application's nodes and its sources."""
         sources = (topic.source for _, topic in self.all_inputs())
         return {*self.chosen_nodes, *self.moved.values(), *sources}
 
@@ -175,7 +182,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def chosen_nodes(self) -> set[str]:
-        """The application's node, and those of the services that are placed one by one."""
+        """The application's node, and the nodes of services that are placed one by one."""
         return {self.node, *self.services.values()}
 
     def decided_like(self, other: Application) -> bool:
@@ -184,20 +191,23 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return one == two
 
     def placed_as(self, first: Application) -> Application:
-        """Return the application on the nodes of ``first``, the application in the first claim."""
+        """Return the application moved to the nodes of ``first``.
+
+        ``first`` is the application in the first claim.
+        """
         if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
             return self
         return replace(self, node=first.node, services=first.services, moved=first.moved)
 
     def booked(self) -> Application:
-        """Return the application as a claim holds it: inputs sorted, each once."""
+        """Return the application in the form of a claim: inputs sorted, without duplicates."""
         inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
         place = self.place and self.place.united(self.place)
         deliver = tuple(sorted({*self.deliver}))
         return replace(self, deliver=deliver, place=place).with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
-        """Return the application with other inputs, without roles that have no topic."""
+        """Return the application with its inputs replaced; leave out roles without topics."""
         kept = {role: topics for role, topics in inputs.items() if topics}
         return replace(self, inputs=MappingProxyType(kept))
 
@@ -212,7 +222,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed`` of a shutdown means this application; no node fits any."""
+        """Return whether a shutdown's ``listed`` means this application; no node matches any."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -220,7 +230,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def told_apart_by(self) -> tuple[str, ...]:
-        """Return the values by which a shutdown tells this application from others of its id."""
+        """Return the values by which a shutdown distinguishes applications with the same id."""
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
@@ -231,7 +241,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each input of ``listed`` as text, and the keys of the inputs here that it means."""
+        """Yield each input of ``listed`` as text, with the keys of own inputs that it matches."""
         assert isinstance(listed, Application)  # noqa: S101 - see is_meant_by
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():
@@ -242,7 +252,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield f"{role} {topic.topic} of {topic.source}", keys
 
     def without_topics(self, gone: Container[TopicKey]) -> Application | None:
-        """Return the application without these inputs; ``None`` if it has no others."""
+        """Return the application without these inputs; ``None`` if no input is left."""
         left = {
             role: tuple(one for one in topics if (role, one.topic, one.source) not in gone)
             for role, topics in self.inputs.items()
@@ -252,7 +262,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def without_node(self, node: str) -> Application | None:
         """Return the application without inputs from a node and deliveries to it.
 
-        Return ``None`` if it has no other inputs, or runs there.
+        Return ``None`` if no input is left, or if a service runs on the node.
         """
         if node in self.chosen_nodes or node in self.moved.values():
             return None

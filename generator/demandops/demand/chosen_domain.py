@@ -1,15 +1,17 @@
-"""The access domain of a demand for a node that is in several.
+"""The choice of an access domain if a demand names a node that is in several.
 
 In each further domain the node has a name of its own, ``<node>@<domain>``, which a demand may give
 wherever it names a node. ``<node>@<first domain>`` is the node itself. If a demand names only the
-node for an application or for an end of a connection, the domain follows from what is booked
-already, or else from the rules: it is the only one that lets the requesters use the node.
+node for an application, one of its services or an end of a connection, the domain follows from what
+is booked already, or else from the rules: it is the only domain in which the requesters may use the
+node.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from demandops.config.config import Config
 from demandops.config.inventory import id_in_domain
@@ -28,7 +30,7 @@ Booked = Callable[[Subject], "Held | None"]
 def with_chosen_domains(
     request: AnyRequest, config: Config, booked: Booked
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with each node's access domain, and a fault where several are possible."""
+    """Return the request with an access domain for each node, and a fault for unclear ones."""
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
@@ -43,7 +45,9 @@ def with_chosen_domains(
 
 def _with_ends(held: Held, ends: Mapping[str, str]) -> Held:
     if isinstance(held, Application):
-        return replace(held, node=ends.get("node", held.node))
+        services = {name: ends.get(_field(name), node) for name, node in held.services.items()}
+        node = ends.get("node", held.node)
+        return replace(held, node=node, services=MappingProxyType(services))
     source, target = ends.get("source", held.source), ends.get("target", held.target)
     return replace(held, source=source, target=target)
 
@@ -64,17 +68,31 @@ def _with_first_names(held: Held, config: Config) -> Held:
         for role, topics in held.inputs.items()
     }
     deliver = tuple(one._replace(node=first(one.node)) for one in held.deliver)
-    return replace(held, node=first(held.node), deliver=deliver).with_inputs(inputs)
+    services = MappingProxyType({name: first(node) for name, node in held.services.items()})
+    held = replace(held, node=first(held.node), services=services, deliver=deliver)
+    return held.with_inputs(inputs)
+
+
+def _named(held: Held) -> Iterator[tuple[str, str]]:
+    """Yield (field, node) for each node whose domain may follow from the rules."""
+    if isinstance(held, Connection):
+        yield from (("source", held.source), ("target", held.target))
+    else:
+        yield "node", held.node
+        yield from ((_field(name), node) for name, node in held.services.items())
+
+
+def _field(service: str) -> str:
+    return f"services.{service}"
 
 
 def _chosen(
     one: Demanded, booked: Held | None, config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
     """Yield (field, ``<node>@<domain>``) for each field whose node is in several domains."""
-    held = one.held
-    is_application = isinstance(held, Application)
-    for field in ("node",) if is_application else ("source", "target"):
-        node, current = getattr(held, field), getattr(booked, field, "")
+    held, known = one.held, dict(_named(booked)) if booked else {}
+    for field, node in _named(held):
+        current = known.get(field, "")
         choices = config.nodes_of(node)
         if len(choices) < 2:
             continue

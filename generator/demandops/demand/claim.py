@@ -29,8 +29,9 @@ class ClaimKey:
 class Claim:
     """One demand's hold on an application or a connection.
 
-    ``joined`` is true if a goal of the reference's action booked it: only goals of that action shut
-    it down. ``partial`` has the topics that only some of the ``requesters`` hold, each with these.
+    ``joined`` is true if a goal of the reference's action booked the claim: only goals of that
+    action shut it down. ``partial`` maps each topic that only some of the ``requesters`` hold to
+    these requesters.
     """
 
     held: Application | Connection
@@ -93,7 +94,7 @@ class Claim:
     def with_holders(
         self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
     ) -> Claim:
-        """Return the claim on ``held``; its requesters are those that hold a topic.
+        """Return the claim with ``held``, and with the requesters that hold a topic of it.
 
         Args:
             held: what is left of the application or the connection.
@@ -104,7 +105,7 @@ class Claim:
         return replace(self, held=held, requesters=requesters, partial=partial)
 
     def extending(self, current: Claim) -> Claim:
-        """Return the claim with the holds of the ``current`` claim of its demand added."""
+        """Return the claim extended by the ``current`` claim of the same demand."""
         held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
         holders = dict.fromkeys(held.topic_keys(), self.requesters)
         listed = {*self.held.topic_keys()}
@@ -114,9 +115,9 @@ class Claim:
     def without_holds(
         self, requester: str, topics: Container[TopicKey] | None = None
     ) -> Claim | None:
-        """Return the claim without a requester's holds on ``topics``, or on all of them.
+        """Return the claim without a requester's holds on ``topics``, or on all topics.
 
-        The claim loses topics that nobody holds any longer. Without requesters it is ``None``.
+        The claim loses topics that nobody holds any longer. Return ``None`` if none is left.
         """
         holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
         for topic in self.held.topic_keys():
@@ -138,7 +139,7 @@ class Claim:
         return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
-        """Return the claim, with the booking time of ``current`` if only their leases differ."""
+        """Return the claim, with the booking time of ``current`` if only the leases differ."""
         if current is None:
             return self
         kept = replace(self, booked=current.booked)

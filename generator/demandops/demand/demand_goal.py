@@ -1,7 +1,7 @@
 """The goal of our own ``Demand`` action as plain data, parsed into a :class:`DemandRequest`.
 
 :func:`parse` takes goals of ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand``.
-Such a goal names its demand, may list any type of application, and replaces the demand's claims.
+The goal names its demand, may list any type of application, and replaces the demand's claims.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from pydantic import Field, PlainValidator
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel
+from demandops.config.durations import seconds_of
 from demandops.config.inventory import Coordinate, Position
-from demandops.config.policy import seconds_of
+from demandops.config.node_property import asked_in
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
@@ -46,11 +47,15 @@ class GoalTopic(FrozenModel):
 
 
 class GoalPlace(FrozenModel):
-    """What the node of an application must have; ``labels`` are ``key=value``."""
+    """What the node of an application must have; ``labels`` are ``key=value``.
+
+    ``properties`` are ``name=value``, ``name>=number`` or ``name<=number``.
+    """
 
     role: str = ""
     labels: list[str] = Field(default_factory=list)
     capabilities: list[str] = Field(default_factory=list)
+    properties: list[str] = Field(default_factory=list)
 
 
 class GoalDelivery(FrozenModel):
@@ -62,7 +67,7 @@ class GoalDelivery(FrozenModel):
 
 
 class GoalPosition(FrozenModel):
-    """The position of a node that has none in the inventory, in metres in its map frame."""
+    """A position for a node that has none in the inventory: metres in the node's map frame."""
 
     node: str = ""
     x: Coordinate = 0.0
@@ -73,13 +78,14 @@ class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
     ``parameters`` maps names to values, ``parameters_json`` to values as JSON text. ``version`` is
-    a version or a channel of the registry. ``connect`` is the connection type for inputs from other
-    nodes that no connection of the demand carries.
+    a version or a channel of the registry. ``connect`` is the connection type for inputs that come
+    from other nodes without a connection of the demand. ``services`` maps service names to nodes.
     """
 
     id: str = ""
     type: str = ""
     node: str = ""
+    services: dict[str, str] = Field(default_factory=dict)
     inputs: dict[str, list[GoalTopic]] = Field(default_factory=dict)
     parameters: dict[str, Any] = Field(default_factory=dict)
     parameters_json: dict[str, str] = Field(default_factory=dict)
@@ -140,7 +146,7 @@ _DEEPEST = 50
 """The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
 _LONGEST_KEY = 128
 """The longest key in a parameter's value: YAML reads 1024 characters, escapes included."""
-_LISTS_OF_TEXT = ("requesters", "labels", "capabilities")
+_LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
@@ -222,8 +228,13 @@ def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requireme
         field = f"{where}.capabilities[{index}]"
         if not capability and field not in told:
             faults.append(fault(field, "is empty; name a capability, or leave it out"))
+    for index, text in enumerate(place.properties):
+        field = f"{where}.properties[{index}]"
+        if asked_in(text) is None and field not in told:
+            message = f"{quoted(text)} is not a property; write name=value, name>=8 or name<=8"
+            faults.append(fault(field, message))
     pairs = tuple((label[0], label[1]) for label in labels if len(label) > 1)
-    return Requirement(place.role, pairs, tuple(place.capabilities))
+    return Requirement(place.role, pairs, tuple(place.capabilities), tuple(place.properties))
 
 
 def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Position]:
@@ -283,6 +294,8 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
             for one in app.deliver
         ),
         place=_requirement(f"{where}.place", app.place, faults),
+        services=MappingProxyType(dict(app.services)),
+        named=tuple(sorted(app.services)),
     )
 
 

@@ -38,7 +38,7 @@ class Demanded:
     connect: str = "none"
     """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
     note: str = ""
-    """How a connection is carried, if not as the request says; the receipt warns of it."""
+    """How a connection differs from the request; the receipt has this as a warning."""
     placed: tuple[str, ...] = ()
     """Where the generator placed the application and its services, and why."""
 
@@ -51,9 +51,9 @@ class Demanded:
 class DemandRequest:
     """A request; it is booked or refused as a whole.
 
-    ``demand`` is the demand's id. The reference's requests carry none; there
+    ``demand`` is the demand's id. The reference's requests have none; for them
     :func:`demandops.demand.claim.demand_id` makes one for each subject. ``own_requesters`` are the
-    requesters of the request itself, also when it lists no subject.
+    requesters of the request itself, even if it lists no subject.
     """
 
     id: str
@@ -83,7 +83,7 @@ AnyRequest = TypeVar("AnyRequest", bound=DemandRequest)
 
 @dataclass(frozen=True, slots=True)
 class Join(DemandRequest):
-    """The reference's goal: its requesters hold more, in addition to their earlier claims."""
+    """The reference's goal: it adds claims to the earlier claims of its requesters."""
 
     operation = "join"
     adds_claims = True
@@ -92,7 +92,7 @@ class Join(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Shutdown(DemandRequest):
-    """The reference's goal with ``shutdown``: its requesters give up holds."""
+    """The reference's goal with ``shutdown``: its requesters give up claims or parts of them."""
 
     operation = "shutdown"
     is_reference = True
@@ -103,7 +103,7 @@ class Put(DemandRequest):
     """Our own goal: its demand then holds exactly the listed applications and connections.
 
     ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that
-    have none in the inventory. ``priority`` is its priority among demands that wait for room.
+    have none in the inventory. ``priority`` ranks the demand among those that wait for room.
     """
 
     lease_s: int | None = None
@@ -139,9 +139,9 @@ class Expire(DemandRequest):
 class Decommission(DemandRequest):
     """An operator's request to remove a node or a requester, named by ``id``, for good.
 
-    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` are the node in each of its access
-    domains. ``by`` is the operator, ``name <email>``, who may give a ``reason``. The request is
-    plain data in the journal only; neither an action nor a demand file contains it.
+    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` has the node's id in each of its
+    access domains. ``by`` is the operator, ``name <email>``, who may give a ``reason``. Only the
+    journal contains the request as plain data; actions and demand files do not.
     """
 
     kinds: frozenset[str] = frozenset()

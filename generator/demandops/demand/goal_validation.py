@@ -68,14 +68,14 @@ def _with_keys_of_text(
 
 
 def is_unicode(text: str) -> bool:
-    """Return whether text has no half of a surrogate pair, which cannot be stored."""
+    """Return whether text can be stored: it has no half of a surrogate pair."""
     return not any("\ud800" <= char <= "\udfff" for char in text)
 
 
 def _blank(
     data: dict[str, Any], location: Sequence[int | str], lists_of_text: Container[str]
 ) -> dict[str, Any]:
-    """Return ``data`` without the value at ``location``; change ``data`` in place.
+    """Remove the value at ``location`` from ``data`` in place, and return ``data``.
 
     A field is removed, so that its default applies. An item of a list is replaced by an empty one,
     so that later items keep their positions.

@@ -1,8 +1,9 @@
-"""Leases: how long a claim lasts without a renewal.
+"""Leases: how long a claim stays booked without a renewal.
 
 The recorded end may lag behind the last renewal by ``slack``, so that not every renewal makes a
 commit. A renewal within the slack changes nothing, and a claim is released only after end and slack
-have passed. So no generator, restarted or not, releases a claim early; it may be late by the slack.
+have passed. So no generator, restarted or not, releases a claim early. A release may be late by the
+slack.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
 class Term:
     """The requested lease and its slack, both in seconds.
 
-    The lease starts when the request is received, or with ``on_approval`` when it is approved.
+    The lease starts when the request is received; with ``on_approval``, at its approval.
     """
 
     seconds: int
@@ -44,7 +45,7 @@ class Lease:
 
     @property
     def has_started(self) -> bool:
-        """Whether the lease has started; a proposed claim's has not."""
+        """Whether the lease has started; the lease of a proposed claim has not."""
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
@@ -58,11 +59,11 @@ class Lease:
         return self.until + timedelta(seconds=self.slack)
 
     def has_ended(self, now: datetime) -> bool:
-        """Return whether the claim may be released, as far as the recorded end tells."""
+        """Return whether the claim may be released according to the recorded end."""
         return self.expires_at < now
 
     def renewed(self, term: Term, now: datetime) -> Lease:
-        """Return the lease after a renewal; the same lease if the slack covers it.
+        """Return the lease after a renewal; it is unchanged if the slack covers the renewal.
 
         The end never moves to an earlier time, because the clock may have been set back.
         """
@@ -76,7 +77,7 @@ class Lease:
 
 
 def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | None:
-    """Return the lease of a claim that is requested again; ``None`` without a term."""
+    """Return the lease of a requested claim, renewed if it has one; ``None`` without a term."""
     if term is None:
         return None
     return current.renewed(term, now) if current else term.lease_from(now)

@@ -11,7 +11,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from demandops.config.config import Config
-from demandops.config.policy import AccessDomain, Rule, matches, seconds_of
+from demandops.config.durations import duration_text, seconds_of
+from demandops.config.policy import AccessDomain, Rule, matches
 from demandops.connections.connection import Connection
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
@@ -65,8 +66,9 @@ def needed_access(
 def _service_nodes(app: Application, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run.
 
-    These are its node, sources of inputs, and the nodes of services that run once for a cluster or
-    are placed one by one. The owner of an override decides on the node to which it moves a service.
+    These are the application's node, sources of inputs, and the nodes of services that run once for
+    a cluster or are placed one by one. A node to which an override moves a service is left out: the
+    override's owner decides on it.
     """
     services = config.services.get(app.appdef, {}).values()
     roles = {role for one in services if one.at_source for role in one.roots}
@@ -114,7 +116,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
 
 
 def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
-    """Return the sentence that says what a rule does not let a requester have."""
+    """Return what a rule does not let a requester have, as a sentence."""
     where = f"access domain '{domain.name}'"
     if kind == PEERS:
         whose = f"rule '{rule.name}' of {where}" if domain.rules else where
@@ -126,7 +128,7 @@ def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: 
 
 
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
-    """Return the first access that a rule does not grant, or ``None`` if it grants all."""
+    """Return the first access that a rule does not grant; ``None`` if the rule grants all."""
     return next(
         ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
     )
@@ -138,14 +140,14 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
         return
     yield fault(
         "lease",
-        f"is {lease_s} s, but leases.longest of access domain '{domain.name}' is {longest}; "
-        "request a shorter lease, and renew it",
+        f"is {duration_text(lease_s)}, but leases.longest of access domain '{domain.name}' is "
+        f"{longest}; request a shorter lease, and renew it",
         code="not-allowed",
     )
 
 
 def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with the lease of each subject, by the policy of its domain."""
+    """Return the request with a lease term for each subject, by the policy of its domain."""
 
     def with_term(one: Demanded) -> Demanded:
         domain = config.domain_of.get(one.held.home)
@@ -177,7 +179,7 @@ def approval_reasons(
 
     Args:
         request: an admitted request.
-        changes: each claim that it changes, before and after the request.
+        changes: each claim that the request changes, before and after it.
         config: the access domains and application definitions.
     """
     if not request.adds_claims:

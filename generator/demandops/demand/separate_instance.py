@@ -1,9 +1,9 @@
-"""Separate instances: an application of another version runs beside the one of the default version.
+"""Separate instances: applications of other versions run at the same time as the default version.
 
-With ``versions: separate`` a demand for another version than the default gets an application of its
-own. Its id names the version (``edge/fusion@1.1.0``), so its services, topics and connections have
-names of their own, and it is removed with its last claim. Services that several definitions share
-run once for all versions.
+With ``versions: separate`` a demand for a version other than the default gets an application of its
+own. This application has the version in its id (``edge/fusion@1.1.0``), so its services, topics and
+connections have names of their own. It is removed with its last claim. Services that several
+definitions share run once for all versions.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from demandops.demand.demand_request import AnyRequest, DemandRequest
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request in which applications of other versions are separate instances."""
+    """Return the request with applications of other versions turned into separate instances."""
     demanded = (
         replace(one, held=_separated(one.held, config))
         if isinstance(one.held, Application) and one.held.version

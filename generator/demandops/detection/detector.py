@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from demandops.config.policy import seconds_of
+from demandops.config.durations import seconds_of
 from demandops.detection.events.detection_state import Event, Key, Observation
 from demandops.detection.events.event_engine import EventEngine
 from demandops.detection.rules.rule_demand import Goal
@@ -19,7 +19,7 @@ from demandops.detection.rules.rule_template import Values
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """The goal that an event wants from now on; ``None`` ends its demand."""
+    """The goal that an event wants from now on; ``None`` ends the event's demand."""
 
     key: Key
     goal: Goal | None
@@ -28,7 +28,7 @@ class Want:
 
 
 class Detector:
-    """The rules in effect, the entities that were seen, and the events that last."""
+    """The rules in effect, the entities that were seen, and the events that have not ended."""
 
     def __init__(self, file: RuleFile, now: float) -> None:
         self.file = file
@@ -53,7 +53,7 @@ class Detector:
         Args:
             booked: a goal for each event; events for which there is no rule any longer are ended.
             now: the time.
-            settle_s: how long their entities may stay unseen until they count as gone.
+            settle_s: how long the events' entities may stay unseen until they count as gone.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
@@ -78,7 +78,7 @@ class Detector:
         self._state = self._state.shifted(seconds)
 
     def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
-        """Replace the rules; return what changes for the events that last.
+        """Replace the rules; return what changes for the events that have not ended.
 
         An event ends if its rule is gone or is no longer for its entities. If the rule demands
         something else now, the event wants that instead.

@@ -48,7 +48,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Entry:
-    """One event. ``held`` is the goal that the node has booked, for sure only if ``is_sure``."""
+    """One event. ``held`` is the goal that the node has booked; ``is_sure`` if that is certain."""
 
     wanted: Goal | None = None
     held: Goal | None = None
@@ -95,7 +95,7 @@ class WantedDemands:
         self._number = 0
 
     def want(self, want: Want) -> None:
-        """Record the goal that an event wants now, or that it wants none any longer."""
+        """Record the goal that an event wants now; ``None`` ends the event's demand."""
         entry = self._entries.setdefault(want.key, _Entry())
         entry.wanted, entry.not_before, entry.refusal = want.goal, -inf, ""
         entry.retry_s, entry.renew_s = want.retry_s, want.renew_s

@@ -38,7 +38,7 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
     Args:
         ledger: the claims before the request.
         request: an admitted request (:mod:`demandops.demand.admission`).
-        now: when the request was received, with time zone; claims that change keep it.
+        now: when the request was received, with time zone; changed claims record it.
 
     Returns:
         The new ledger and what changed. Booking twice changes nothing.

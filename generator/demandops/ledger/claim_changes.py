@@ -1,4 +1,4 @@
-"""What a request changed in the ledger: claims before and after, and what follows from them."""
+"""The changes of a request to the ledger: claims before and after, and other records."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Changes:
 def changes_on(
     before: Ledger, after: Ledger, subjects: Iterable[Subject]
 ) -> tuple[ClaimChange, ...]:
-    """Return the claims on these subjects that differ between two ledgers."""
+    """Return the changes of claims on these subjects between two ledgers."""
     claims = (
         claim
         for subject in subjects
@@ -70,6 +70,6 @@ def changes_on(
 def claim_changes(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> tuple[ClaimChange, ...]:
-    """Return the claims at ``keys`` that differ between two ledgers."""
+    """Return the changes of the claims at ``keys`` between two ledgers."""
     changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
     return tuple(change for change in changes if change.before != change.after)

@@ -2,7 +2,7 @@
 
 The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. ``hh`` spreads the
 folders, because a Git tree with 100,000 entries costs 100 ms a commit. Path segments are slugs with
-a hash of the exact id. The file holds the exact ids, so a moved file is noticed.
+a hash of the exact id. The file contains the exact ids, so a moved file is noticed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only a later version writes; it keeps the nodes of services there."""
+"""Folders that only a later generator writes, for the nodes of services."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
@@ -62,7 +62,7 @@ def _timestamp(text: str) -> str:
 
 
 def parse_timestamp(text: str) -> datetime:
-    """Return a time of a ledger file, in UTC; raise :class:`ValueError` if it is none."""
+    """Return a time of a ledger file, in UTC; raise :class:`ValueError` for other text."""
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
         in_utc = moment.astimezone(timezone.utc)
@@ -101,10 +101,12 @@ class _Place(FrozenModel):
     role: str = ""
     labels: dict[str, str] = Field(default_factory=dict)
     capabilities: tuple[str, ...] = Field(default=(), strict=False)
+    properties: tuple[str, ...] = Field(default=(), strict=False)
 
     def requirement(self) -> Requirement:
         labels = tuple(sorted(self.labels.items()))
-        return Requirement(self.role, labels, tuple(sorted({*self.capabilities})))
+        words = (tuple(sorted({*of})) for of in (self.capabilities, self.properties))
+        return Requirement(self.role, labels, *words)
 
 
 class _Delivery(FrozenModel):
@@ -194,6 +196,7 @@ class _ApplicationFile(_Claim):
     separate: bool = False
     services: dict[str, str] = Field(default_factory=dict)
     moved: dict[str, str] = Field(default_factory=dict)
+    named: tuple[str, ...] = Field(default=(), strict=False)
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for role, topics in self.inputs.items():
@@ -220,6 +223,7 @@ class _ApplicationFile(_Claim):
             self.separate,
             MappingProxyType(self.services),
             MappingProxyType(self.moved),
+            tuple(sorted({*self.named})),
         )
 
 
@@ -292,14 +296,20 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
     deliver = [{k: v for k, v in one._asdict().items() if v} for one in app.deliver]
     data |= {"deliver": deliver} if deliver else {}
     data |= {"services": dict(sorted(app.services.items()))} if app.services else {}
+    data |= {"named": list(app.named)} if app.named else {}
     data |= {"moved": dict(sorted(app.moved.items()))} if app.moved else {}
     return data | {"place": place_data(app.place)} if app.place else data
 
 
 def place_data(place: Requirement) -> dict[str, Any]:
     """Return the requirement on a node as a claim's file has it."""
-    listed = {"labels": dict(place.labels), "capabilities": list(place.capabilities)}
-    return {name: value for name, value in ({"role": place.role} | listed).items() if value}
+    listed = {
+        "role": place.role,
+        "labels": dict(place.labels),
+        "capabilities": list(place.capabilities),
+        "properties": list(place.properties),
+    }
+    return {name: value for name, value in listed.items() if value}
 
 
 def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:
@@ -385,7 +395,7 @@ def read(text: str, path: str) -> Claim:
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return the kind of claim that a path holds, or ``None`` for other files."""
+    """Return the kind of the claim file at a path, or ``None`` for other files."""
     parts = path.split("/")
     if len(parts) != 5 or parts[0] != LEDGER_ROOT or not path.endswith(".yaml"):
         return None

@@ -2,7 +2,7 @@
 
 Only the repo may decide whether an override applies: a replay and ``verify`` must give the same
 bytes as the original run. So the generator commits a marker when an override ends. If a person
-then writes a later end into the override, it is in effect again.
+then writes a later end into the override, the override is in effect again.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Replicas that services keep for a while after the demands for them ended.
 
-A definition may name how long a service keeps them (``scaling.downAfter``). Then the service has
-the most replicas that its demands needed in that time. Each record is one file and names the
-numbers that are above the present need, each with its end: ``ledger/replicas/<hh>/<name>.yaml``.
-A service gets fewer replicas only by the commit that removes a number from the record, not when
-its end passes. So a replay gives the same bytes.
+A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service has
+the highest number of replicas that its demands needed in that time. Each record is one file,
+``ledger/replicas/<hh>/<name>.yaml``. It lists the numbers above the present need, each with its
+end. A service gets fewer replicas only by the commit that removes a number from the record, not
+when the end of the number passes. So a replay gives the same bytes.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ class Kept(NamedTuple):
 
 
 Steps: TypeAlias = "tuple[Kept, ...]"
-"""What one service keeps; each step has fewer replicas, and lasts longer, than the one before."""
+"""What one service keeps: each step has fewer replicas and a later end than the previous one."""
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    """Return the steps that a service keeps after the need of its demands changed.
+    """Return the steps of a service after the need of its demands changed.
 
     Args:
         steps: what the service kept before.
         needed, was_needed: the replicas that its demands need now and needed before.
         now: the time.
-        until: the end of the time for which it keeps the replicas that were needed.
+        until: when the service stops keeping the replicas that were needed before.
     """
     if was_needed > needed:
         steps = (*(one for one in steps if one.replicas > was_needed), Kept(was_needed, until))

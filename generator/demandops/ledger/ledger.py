@@ -1,6 +1,7 @@
 """The ledger: which demand holds which subject, as a set of persistent maps.
 
-A :class:`Ledger` never changes. A new one costs what a request touches, not what is booked.
+A :class:`Ledger` never changes. The cost of a new one depends on the request, not on the ledger's
+size.
 """
 
 from __future__ import annotations
@@ -37,13 +38,13 @@ class Ledger:
     """All claims, and an index of them.
 
     ``claims`` has the claims on each subject, sorted by demand id, because the planner asks for
-    all of them. All claims on a subject agree on its type and nodes. If a person writes one that
-    does not, the first one decides.
+    all of them. All claims on a subject agree on its type and nodes. If a person writes a claim
+    that disagrees, the first claim decides.
     ``index`` maps each entry of :func:`index_entries` to the claims that have it.
-    ``minutes`` are those in which a lease ends, so that the next end is found without a full scan.
-    ``ended`` maps the name of each override that ended to the expiry that it had then.
-    ``shutdowns`` are the recent ones. ``applications_on`` counts the applications that
-    each node was chosen for, as a whole or for a service.
+    ``minutes`` has each minute in which a lease ends, to find the next end without a full scan.
+    ``ended`` maps the name of each ended override to the expiry that it had at its end.
+    ``shutdowns`` are the recent shutdowns. ``applications_on`` counts the applications
+    for which each node was chosen, even if only for one of their services.
     ``kept`` are the replicas that services keep for a while.
     ``waiting`` are the demands that wait for room.
     """
@@ -92,7 +93,7 @@ class Ledger:
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions that claims on an application ask for.
 
-        An empty text stands for claims that ask for no version, or for an unknown one.
+        An empty text means that a claim asks for no version, or for an unknown one.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         found = {word: len(keys) for word, keys in by_version.items() if keys}
@@ -140,9 +141,9 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield the further inputs in ``role`` for which names of topics contain ``part``.
+        """Yield (input, version) for the further inputs in ``role`` with this part of topic names.
 
-        With each comes the version of its application if that is a separate instance, else "".
+        The version is that of the application if it is a separate instance, else empty.
         """
         for claim in self._claims("further", part):
             app = claim.application
@@ -189,11 +190,11 @@ class Ledger:
         return self._claims("definition", appdef)
 
     def claims_at(self, node: str) -> tuple[Claim, ...]:
-        """Return the claims on applications that run on a node or have an input from it, sorted."""
+        """Return the claims on applications that run on, read from or deliver to a node, sorted."""
         return self._claims("node", node)
 
     def applications_at(self, node: str) -> tuple[str, ...]:
-        """Return the applications that run on a node or have an input from it, sorted."""
+        """Return the applications that run on, read from or deliver to a node, sorted."""
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
@@ -219,7 +220,7 @@ class Ledger:
         return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
 
     def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
-        """Return the claims whose lease ended before ``now``, sorted by its end."""
+        """Return the claims whose lease ended before ``now``, sorted by this end."""
         over = (minute for minute in self.minutes if minute <= _minute(now))
         ended = [
             (claim.lease.expires_at, claim)
@@ -262,7 +263,7 @@ class Ledger:
         return found[0] if found and found[0].demand == key.demand else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
-        """Return the ledger with ``claim`` at ``key``, or with no claim there if it is ``None``."""
+        """Return the ledger with ``claim`` at ``key``; with ``None``, without a claim there."""
         held, old = self.claims.get(key.subject) or (), self.get(key)
         if old == claim:
             return self
@@ -324,7 +325,7 @@ class Ledger:
 def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
-    """Return how many applications each node has, after the first claim on one changed."""
+    """Return the counts after the first claim on an application changed."""
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):
         for node in nodes:

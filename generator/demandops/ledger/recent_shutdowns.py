@@ -43,7 +43,7 @@ _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
 @dataclass(frozen=True, slots=True)
 class RecentShutdown:
-    """A shutdown that released something; ``digest`` covers all that it lists."""
+    """A shutdown that released something; ``digest`` covers everything that it lists."""
 
     digest: str
     request: str
@@ -82,7 +82,7 @@ class RecentShutdowns:
         return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        """Return the shutdowns with one at ``digest``, or with none there if it is ``None``."""
+        """Return the shutdowns with ``shutdown`` at ``digest``; with ``None``, with none there."""
         known = self.by_digest.get(digest)
         if known == shutdown:
             return self
@@ -102,9 +102,9 @@ class RecentShutdowns:
     def forget(
         self, now: datetime, requesters: Iterable[str] = ()
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the shutdowns without those to forget, and the digests of the forgotten ones.
+        """Return the shutdowns that are left, and the digests of the forgotten ones.
 
-        It forgets those of ``requesters``, and some that are older than an hour.
+        Shutdowns of ``requesters`` are forgotten, and some that are older than an hour.
         """
         first = _minute(now - _KEPT)
         ended = sorted(one for one in self.by_minute if one < first)

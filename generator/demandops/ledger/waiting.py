@@ -1,8 +1,8 @@
-"""Waiting demands: those that no node has room for, kept until one has.
+"""Waiting demands: no node has room for them, so they are kept until a node has.
 
 A waiting demand holds nothing. When room may be free, the generator decides waiting demands again:
 those of the highest priority first, and among these the one that came first. A demand that still
-does not fit does not hold up the others.
+does not fit does not delay the others.
 
 Each waiting demand is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
 """
@@ -123,5 +123,5 @@ def read_all(files: Mapping[str, str]) -> WaitingDemands:
 
 
 def of_requester(waiting: WaitingDemands, requester: str) -> Iterator[WaitingDemand]:
-    """Yield the demands that wait for a requester alone."""
+    """Yield the waiting demands that have only this requester."""
     return (one for one in waiting.values() if one.requesters == (requester,))

@@ -34,7 +34,7 @@ def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
             continue
         book = files.books.get(name)
         if book is None and any(name.startswith(prefix) for prefix in files.booked) and not spec:
-            continue  # it was deleted: its operator has removed the bookkeeping, but no request
+            continue  # of a deleted resource, the operator keeps only the requests
         if book is None and requests:
             if name.startswith(CONNECTION) and len(requests) > 1:
                 faults.append(_rewritten(name))

@@ -1,8 +1,8 @@
 """The files of the reference's operators, and its custom resources.
 
-Each of its operators keeps two files. The bookkeeping maps a resource to the requesters that hold
-it, and lists each as often as it joined. For a fusion it has a list for each topic. The versioning
-file maps a resource to the requests that reached it, by the version of the resource.
+Each operator keeps two files. The bookkeeping maps a resource to the requesters that hold the
+resource, and lists each requester as often as it joined. For a fusion it has a list for each topic.
+The versioning file maps a resource to the requests that reached it, by the version of the resource.
 
 A file is recognized by its content, so it may have any name.
 """
@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"[0-9]{1,20}")
 _CLOUD = re.compile(r"\bpoint_cloud_topic:=(\S+)")
 
 Hold: TypeAlias = "tuple[str, str]"
-"""A topic and a requester that holds it; in a connection and a detection the topic is ``""``."""
+"""A topic and a requester that holds it; for a connection and a detection the topic is ``""``."""
 
 
 class _Part(BaseModel):
@@ -68,7 +68,7 @@ class _RosTopic(_Part):
 
 
 class _Ros2Mqtt(_Part):
-    """The source's bridge: the topics of the last request, and a field for each one ever listed."""
+    """The source's bridge: the last request's topics, and a field for each topic of any request."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _MqttTopic] = Field(init=False)
@@ -127,7 +127,7 @@ class ObjectDetection(_Part):
 
     @property
     def topic(self) -> str:
-        """The topic of the point cloud, which stands only in the command."""
+        """The topic of the point cloud; only the command names it."""
         found = _CLOUD.search(" ".join(self.command))
         return found[1] if found else ""
 

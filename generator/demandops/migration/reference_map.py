@@ -58,7 +58,7 @@ class MappedTopic(CamelModel):
 
 
 class MappedConnection(CamelModel):
-    """An MQTT connection. Without a ``broker`` the program chooses it."""
+    """An MQTT connection. If ``broker`` is empty, the program chooses a broker."""
 
     id: _Filled
     source: _Filled
@@ -68,7 +68,7 @@ class MappedConnection(CamelModel):
 
 
 class ReferenceMap(FileModel):
-    """The meaning of each resource. ``request`` is the demands' id, which the reference forgets."""
+    """The meaning of each resource. ``request`` is the demands' id, which the reference lacks."""
 
     kind: Literal["ReferenceMap"]
     request: _Filled
@@ -77,12 +77,12 @@ class ReferenceMap(FileModel):
 
 
 def slug(id: str) -> str:
-    """Return an id as it stands in the name of a resource of the reference."""
+    """Return an id in the form that it has in names of the reference's resources."""
     return id.replace("_", "-").replace("/", "-")
 
 
 def is_host(broker: Broker, host: str, port: object) -> bool:
-    """Return whether a broker is at an address; its host may also name the namespace."""
+    """Return whether a broker is at an address; the broker's host may add the namespace."""
     return port == broker.port and f"{broker.host}.".startswith(f"{host}.")
 
 
@@ -91,12 +91,12 @@ def propose(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return a map as plain data, and warnings.
 
-    What is not known is empty, and a person fills it in.
+    A field whose value is not known is empty, and a person fills it in.
 
     Args:
         joins: the joins that are still held, by resource.
         files: has the resources' specs.
-        config: its inventory knows nodes and brokers.
+        config: has the nodes and brokers of the inventory.
     """
     inventory = _Inventory(files, config)
     fusions = [name for name in joins if name.startswith(FUSION)]
@@ -144,7 +144,7 @@ class _Inventory:
         return {"topic": topics[0] if topics else "", "source": source}
 
     def _source(self, topic: str, node: str) -> str:
-        """Return where a topic comes from: over a connection, else from the node that has it."""
+        """Return the source of a connection that brings the topic, else a node that lists it."""
         over = [
             spec.source
             for spec in self._connections.values()

@@ -1,9 +1,9 @@
 """The joins that are still held, from what the reference's operators recorded.
 
-The bookkeeping says who holds what, and how often. The versioning file has the requests that led
-to it. But in the files of connections and detections the first request is not the original one:
-the operator adds later requesters to its list, and removes them. So the counts always come from
-the bookkeeping, and the requests only show which requesters joined together.
+The bookkeeping says who holds what, and how often. The versioning file has the requests that led to
+it. But for connections and detections the operator later changes the first request: it adds
+requesters to the request's list and removes them. So the counts always come from the bookkeeping,
+and the requests only show which requesters joined together.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from demandops.migration.reference_files import Hold, Request
 class Join:
     """Requesters that hold the same topics of a resource, once each.
 
-    ``version`` orders joins over all resources; it is 0 if it is not known.
+    ``version`` orders joins over all resources; 0 means unknown.
     """
 
     version: int
@@ -58,7 +58,7 @@ def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join
 
 
 def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
-    """Take holds from the join of the same requesters, else from the oldest that has them."""
+    """Remove a shutdown's holds from the join of its requesters, else from the oldest with them."""
     named = set(shutdown.requester)
     same_first = sorted(joins, key=lambda join: {who for _, who in join[1]} != named)
     for hold in shutdown.holds().elements():

@@ -1,4 +1,4 @@
-"""The flow of topics through an application: what its services read, and where that is made.
+"""The flow of topics through an application: the topics that services read, and their origin.
 
 An instance of a service depends on one demanded topic, on the topics of one source, or only on its
 application. So the flows of a demand do not depend on other demands.
@@ -36,8 +36,8 @@ class Flow:
     """A topic that is made on one node and needed on another.
 
     ``name`` is the role, or ``<service>.<output>``. ``target`` is the topic's name at the receiver.
-    ``root`` is the demanded topic that needs it; ``delivery`` is the index of its delivery in
-    ``deliver``, if it has one.
+    ``root`` is the demanded topic that needs the flow. If the flow is a delivery, ``delivery`` is
+    its index in ``deliver``. ``type`` is the message type, if the demand names it.
     """
 
     name: str
@@ -47,6 +47,12 @@ class Flow:
     target: str
     root: TopicKey = ()
     delivery: int | None = None
+    type: str = ""
+
+    @property
+    def is_output(self) -> bool:
+        """Whether a service makes the topic; else it is an input of the demand."""
+        return "." in self.name
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
@@ -78,7 +84,7 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
 
 
 def version_of_instance(app: Application, service: Service) -> str:
-    """Return the version in the key of a service's instance; empty unless it is separate."""
+    """Return the version in an instance's key; empty unless the instance is separate."""
     return "" if service.shared else app.own_version
 
 
@@ -92,7 +98,7 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
 
 
 def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
-    """Yield the topics of a role or of ``<service>.<output>`` that an application has."""
+    """Yield an application's topics for ``origin``, which is a role or ``<service>.<output>``."""
     name, _, output = origin.partition(".")
     if not output:
         for one in app.inputs.get(origin, ()):
@@ -123,7 +129,7 @@ def flows(config: Config, app: Application) -> list[Flow]:
                     if one.node != node:
                         root = one.root or (next(part.topic_keys()) if service.roots else ())
                         name = one.topic.topic
-                        flow = Flow(origin, name, one.node, node, name, root)
+                        flow = Flow(origin, name, one.node, node, name, root, type=one.topic.type)
                         found.setdefault((name, one.node, node, name), flow)
     for flow in _deliveries(config, app):
         found.setdefault((flow.topic, flow.sender, flow.receiver, flow.target), flow)
@@ -145,7 +151,7 @@ def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
-    """Yield the node of each instance of a service, and the application with its inputs only."""
+    """Yield each service instance's node, and the application reduced to the instance's inputs."""
     if service.root is not None:
         for one in app.inputs.get(service.root, ()):
             yield node_of(app, service, one.source), app.with_inputs({service.root: (one,)})

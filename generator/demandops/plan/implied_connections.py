@@ -34,11 +34,11 @@ def _input_field(field: str, path: str) -> str:
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request with a connection for each flow that no listed connection carries.
 
-    If a claimed connection carries the flow, the demand joins it. Otherwise it gets a derived
-    connection between the two nodes. An invalid input adds none; admission reports it.
+    If a claimed connection carries the flow, the demand joins it. Otherwise the demand gets a
+    derived connection between the two nodes. An invalid input adds none; admission reports it.
     """
     first: dict[_Ends, Demanded] = {}
-    routes: dict[_Ends, dict[Route, None]] = {}
+    routes: dict[_Ends, dict[tuple[str, str], Route]] = {}
     listed = [one.held for one in request.demanded if isinstance(one.held, Connection)]
     brought = {
         (route.sender_and_receiver(*connection.nodes)[1], route.written_topic)
@@ -65,15 +65,19 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
             ends = (needed.id, *needed.nodes)
             note = _note(needed, one.connect)
             first.setdefault(ends, Demanded(needed, one.requesters, place, one.term, note=note))
-            routes.setdefault(ends, {}).update(dict.fromkeys(needed.topics))
+            known = routes.setdefault(ends, {})
+            for route in needed.topics:
+                names = (route.source, route.target)
+                known[names] = route if route.type else known.get(names, route)
     demanded = []
     for one in request.demanded:
         if isinstance(one.held, Connection):
             more = routes.pop((one.held.id, *one.held.nodes), {})
-            demanded.append(_with_topics(one, (*one.held.topics, *more)) if more else one)
+            topics = (*one.held.topics, *more.values())
+            demanded.append(_with_topics(one, topics) if more else one)
         else:
             demanded.append(one)
-    implied = (_with_topics(first[ends], topics) for ends, topics in routes.items())
+    implied = (_with_topics(first[ends], topics.values()) for ends, topics in routes.items())
     return replace(request, demanded=(*demanded, *implied))
 
 
@@ -130,8 +134,8 @@ def _is_valid(flow: Flow, config: Config) -> bool:
 def carrying(flow: Flow, type: str, ledger: Ledger) -> Connection:
     """Return the connection that carries a flow, with only the flow's topic.
 
-    It is a claimed connection that already carries the flow, else a derived one of ``type``, which
-    may be ``auto``.
+    This is a claimed connection that already carries the flow, else a derived connection of
+    ``type``, which may be ``auto``.
     """
     ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
     for id in ledger.connections_bringing(flow.receiver, flow.target):
@@ -142,4 +146,5 @@ def carrying(flow: Flow, type: str, ledger: Ledger) -> Connection:
                 if same and route.sender_and_receiver(*known.nodes) == ends:
                     return Connection(id, known.type, *known.nodes, "", (route,))
     kind = None if type == "auto" else type_named(type)
-    return Connection(f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (Route(*names),))
+    route = Route(*names, type=flow.type if kind and kind.needs_types else "")
+    return Connection(f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (route,))

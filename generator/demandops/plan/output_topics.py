@@ -40,13 +40,13 @@ def outputs(
 def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
     """Return the text for ``{instance}`` of the service that has ``topic`` as its input.
 
-    ``version`` is that of a separate instance, else empty.
+    ``version`` is the version of a separate instance, else empty.
     """
     return naming.topic_part(topic.source, told_apart_by(config, role, topic, version))
 
 
 def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return what tells names of a service's topics apart if the source is the same."""
+    """Return the text that distinguishes the topic names of a service for the same source."""
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return topic.told_apart_by(further, version)
@@ -70,10 +70,11 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request, in which a mark says which inputs are further topics of a source."""
+    """Return the request with each input marked that is a further topic of its source."""
     if not request.adds_claims:
         return request
-    own = request.demand if isinstance(request, Put) else None  # a put may release what it holds
+    # a put may release topics of its own demand
+    own = request.demand if isinstance(request, Put) else None
     first: dict[tuple[str, str], str] = {}
 
     def is_further(role: str, topic: InputTopic) -> bool:
@@ -103,7 +104,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return the ledger of an earlier format with further topics marked as such.
+    """Return a ledger of an earlier format, changed so that further topics are marked.
 
     The usual topic of a source is the one that was booked first.
     """

@@ -23,7 +23,7 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class LedgerUpdate:
-    """The ledger after overrides changed, and its files to write.
+    """The ledger after a change of overrides or claims, and the ledger files to write.
 
     ``keys`` are the claims that may have changed.
     """
@@ -32,7 +32,7 @@ class LedgerUpdate:
     keys: tuple[ClaimKey, ...]
     files: Mapping[str, str | None]
     stays: tuple[tuple[str, str], ...] = ()
-    """The files of overrides that do not move a service, and why."""
+    """(file, reason) of each override that should move a service, but does not."""
 
 
 def update_ledger(

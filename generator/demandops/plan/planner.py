@@ -47,7 +47,7 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
 
 
 def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
-    """Return a service with the replicas that its demands need, without effects of overrides.
+    """Return a service's release without kept replicas and without the effects of overrides.
 
     Raises:
         Refused: as :func:`plan`.
@@ -108,12 +108,12 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def _as_claimed(world: World, app: Application) -> Application:
-    """Return an application as its first claim has it, which decides its appdef and node."""
+    """Return an application as in its first claim, which decides the appdef and the node."""
     return world.ledger.application(app.id) or app
 
 
 def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
-    """Return the requesters of a service; if topics need it, only those who still hold one."""
+    """Return the requesters of a service; if it runs for topics, only holders of these topics."""
     if not service.roots:
         return requesters_of(claims)
     holders = (
@@ -176,7 +176,8 @@ def demanded_inputs(
 ) -> Iterator[tuple[str, str, TopicKey]]:
     """Yield role and topic of each input that an application gives a service, and its root.
 
-    The root is the demanded topic that the input is or is made from; it may be empty.
+    The root is the demanded topic: the input itself, or what the input is made from. It may be
+    empty.
     """
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
@@ -258,7 +259,7 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
 
 @dataclass(frozen=True, slots=True)
 class _ClaimedConnections:
-    """The connections that the ledger has of one type."""
+    """The claimed connections of one type."""
 
     world: World
     type: ConnectionType
@@ -271,8 +272,8 @@ class _ClaimedConnections:
         """Return a connection, or ``None`` if it is not claimed with this type.
 
         Raises:
-            Refused: if a person wrote a claim that its type cannot carry, or removed what it needs
-                from the inventory.
+            Refused: if a person wrote a claim that the type cannot carry, or removed from the
+                inventory what the connection needs.
         """
         first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
         if first is None or first.type is not self.type:

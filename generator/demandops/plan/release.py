@@ -66,8 +66,8 @@ class ServiceKey:
 class ServiceRelease:
     """The desired state of one service: one Helm release.
 
-    ``chart`` is that of ``version``, unless an override pins another. ``keeps`` says until when it
-    has more replicas than its demands need.
+    ``chart`` is the chart of ``version``, unless an override pins another. ``keeps`` says until
+    when the service has more replicas than its demands need.
     """
 
     key: ServiceKey

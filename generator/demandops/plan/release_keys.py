@@ -27,7 +27,7 @@ ReleaseKey = ServiceKey | ClientKey
 
 
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that the claims on ``subject`` need, except suspended claims.
+    """Yield the keys of the releases that the unsuspended claims on ``subject`` need.
 
     If an application's definition is missing, yield none. With ``strict``, raise ``Refused``
     instead: a deleted definition must not stop running services.
@@ -143,7 +143,7 @@ def affected_keys(
 
 
 def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
-    """Return a claim before and after a change; if only inputs differ, with only these inputs.
+    """Return a claim before and after a change; if only inputs differ, without the equal inputs.
 
     Other requesters count as a difference only if a definition or an override depends on them.
     """
@@ -205,7 +205,7 @@ def services_of(config: Config, name: str) -> Services:
     """Return the services of an application definition.
 
     Raises:
-        Refused: if the state repo has none.
+        Refused: if the state repo has no such definition.
     """
     services = config.services.get(name)
     if services is None:

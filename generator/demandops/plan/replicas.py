@@ -67,7 +67,7 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return the replicas of a service that may keep some, and the step that keeps them, if any."""
+    """Return a service's replicas, at least those that it keeps, and the step that keeps them."""
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None
     kept = min(steps[0].replicas, scaling.most)  # the definition may have been changed since

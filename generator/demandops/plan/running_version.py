@@ -1,4 +1,4 @@
-"""The version that runs: the newest one that is asked for.
+"""The version that runs: the newest version that is asked for.
 
 A claim on an application asks for a version, or else for the default. The application runs the
 newest version asked for. A service that applications share runs the newest version of these
@@ -19,7 +19,7 @@ from demandops.ledger.world import World
 
 
 def running_version(world: World, application: str) -> ApplicationVersion | None:
-    """Return the version that an application runs, or ``None`` if it or its appdef is gone."""
+    """Return the version that an application runs; ``None`` without claims or appdef."""
     app = world.ledger.application(application)
     known = world.config.application_versions.get(app.appdef) if app else None
     return newest_asked(world.ledger, application, known) if known else None
@@ -41,7 +41,7 @@ def same_version(one: ApplicationVersion | None, other: ApplicationVersion | Non
 def version_of_service(
     world: World, service: Service, applications: Iterable[str]
 ) -> ApplicationVersion:
-    """Return the version of a service that these applications share.
+    """Return the version of a service for the applications that share it.
 
     If the applications have several appdefs, the one with the newest chart decides.
 

@@ -1,4 +1,4 @@
-"""When a service gets fewer replicas: at once, or after the time that its definition names.
+"""When a service gets fewer replicas: at once, or after the time in the service's definition.
 
 A decision records what a service keeps when its demands need fewer replicas
 (:mod:`demandops.ledger.kept_replicas`). When that time is over, the generator removes the record in
@@ -23,7 +23,7 @@ from demandops.plan.release_keys import ReleaseKey
 def with_kept_replicas(
     before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
 ) -> tuple[Ledger, tuple[Instance, ...]]:
-    """Return the ledger with the replicas that services keep after a demand, and their instances.
+    """Return the ledger with updated kept replicas, and the instances whose kept replicas changed.
 
     Args:
         before, after: the world before and after the demand.

@@ -2,7 +2,7 @@
 
 Each connection type has a template and a schema in ``templates/connections/<type>/``. The schemas
 are our own and list the fields that each program reads. A program ignores an unknown field or
-crashes on it, which shows only on the node.
+crashes on it, and this shows only when it runs on the node.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def render(client: Client, config: Config, engine: Engine) -> str:
     """Return the manifests of a client as one YAML text.
 
     Raises:
-        InvalidInput: if its configuration has a field that the program does not read.
+        InvalidInput: if the client's configuration has a field that the client does not read.
         Refused: if the registry has no image for the client.
     """
     kind, node = client.type, client.node

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import CodeType
 from typing import Any
 
@@ -28,6 +29,7 @@ from jinja2.runtime import Undefined
 
 from demandops import naming, strict_yaml
 from demandops.errors import InvalidInput, fault
+from demandops.render.template_lines import TemplateLines
 from demandops.render.template_sandbox import Sandbox, budget
 from demandops.settings import data_folder
 
@@ -40,7 +42,7 @@ _TEMPLATE_FAULTS = (
     RecursionError,
     SyntaxError,
     MemoryError,
-)  # errors that a template can cause, so that its author must fix them
+)  # errors that a template causes and that its author must fix
 
 _MAX_LENGTH = 100_000
 """How many characters a values template may have."""
@@ -57,7 +59,7 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the template's text, its path, and a function that says that it is up to date."""
+        """Return the template's text, its path, and a function that reports it as up to date."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]
@@ -76,11 +78,11 @@ class _CompiledTemplates(BytecodeCache):
         self._kept: dict[tuple[str, str], CodeType] = {}
 
     def load_bytecode(self, bucket: Bucket) -> None:
-        """Fill in the template's code, if its path and text are known."""
+        """Give the bucket the kept code of the template with this path and text, or None."""
         bucket.code = self._kept.get((bucket.key, bucket.checksum))
 
     def dump_bytecode(self, bucket: Bucket) -> None:
-        """Keep the template's code; drop old code above the limit, because texts change often."""
+        """Keep the template's code; at the limit drop all other code, as texts change often."""
         if len(self._kept) >= self._LIMIT:
             self._kept.clear()
         if bucket.code:
@@ -146,9 +148,10 @@ class Engine:
     """Renders the program's templates and those of one configuration."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
+        self._files = files
         own, config = FileSystemLoader(data_folder("templates")), _FilesLoader(files)
         self._own = Environment(loader=own, bytecode_cache=_OWN_COMPILED, **_OPTIONS)  # noqa: S701 - YAML, not HTML
-        del self._own.filters["tojson"]  # values become JSON anyway; twice would quote them
+        del self._own.filters["tojson"]  # values become JSON anyway; converting twice adds quotes
         self._own.filters |= _FILTERS
         self._config = Sandbox(_FILTERS, loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
 
@@ -156,56 +159,64 @@ class Engine:
         """Return a rendered template of the program (``flux/release.yaml.j2``)."""
         return self._own.get_template(template).render(**context)
 
-    def data(self, template: str, **context: object) -> dict[str, Any]:
+    def data(
+        self,
+        template: str,
+        check: Callable[[dict[str, Any]], None] = lambda values: None,
+        **context: object,
+    ) -> dict[str, Any]:
         """Return the data that a values template of the configuration renders to.
 
+        Args:
+            template: the path of the template.
+            check: raises InvalidInput for values that do not fit.
+            context: the variables of the template.
+
         Raises:
-            InvalidInput: if the template fails; it names the template and, if known, the line.
+            InvalidInput: if the template fails, or the check; it names the template and, if known,
+                the line.
         """
+        text = ""
         try:
             with budget():
                 compiled: Template = self._config.get_template(template)
             with budget():  # a new budget, so that an earlier compilation makes no difference
                 text = compiled.render(**context)
-            values = strict_yaml.load(text)
+            values = _mapping(text, template)
+            check(values)
         except InvalidInput as error:
-            raise InvalidInput(
-                fault(
-                    f"{problem.field} of the rendered text", f"{problem.message}; fix the template"
-                ).within(template)
-                for problem in error.faults
-            ) from None
+            lines = TemplateLines(self._files[template], text)
+            raise InvalidInput(map(lines.located, error.faults)) from None
         except TemplateNotFound as error:
-            raise InvalidInput(
-                [
-                    fault(
-                        _line(error, template), f"'{error.name}' does not exist; fix the template"
-                    ).within(template)
-                ]
-            ) from None
+            problem, line = f"'{error.name}' does not exist", _line(error, template)
         except TemplateSyntaxError as error:
-            raise InvalidInput(
-                [
-                    fault(f"line {error.lineno}", f"{error.message}; fix the template").within(
-                        template
-                    )
-                ]
-            ) from None
+            problem, line = str(error.message), error.lineno
         except _TEMPLATE_FAULTS as error:
-            raise InvalidInput(
-                [
-                    fault(
-                        _line(error, template),
-                        f"{str(error) or type(error).__name__}; fix the template",
-                    ).within(template)
-                ]
-            ) from None
-        if not isinstance(values, dict):
-            raise InvalidInput([fault("", "must give a mapping of Helm values").within(template)])
-        return values
+            problem, line = str(error) or type(error).__name__, _line(error, template)
+        else:
+            return values
+        raise InvalidInput([fault("", f"{problem}; fix the template", line=line).within(template)])
 
 
-def _line(error: Exception, template: str) -> str:
+def _mapping(text: str, template: str) -> dict[str, Any]:
+    try:
+        values = strict_yaml.load(text)
+    except InvalidInput as error:
+        raise InvalidInput(
+            replace(
+                each,
+                field=f"{each.field} of the rendered text",
+                message=f"{each.message}; fix the template",
+                file=template,
+            )
+            for each in error.faults
+        ) from None
+    if not isinstance(values, dict):
+        raise InvalidInput([fault("", "must give a mapping of Helm values").within(template)])
+    return values
+
+
+def _line(error: Exception, template: str) -> int | None:
     frames = traceback.extract_tb(error.__traceback__)
     lines = [frame.lineno for frame in frames if frame.filename == template]
-    return f"line {lines[-1]}" if lines else ""
+    return lines[-1] if lines else None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from demandops.config.config import Config
@@ -32,8 +33,8 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
         message = "is 0, but an autoscaler keeps at least one replica; deny the service instead"
         raise InvalidInput.at("replicas", message, file=by[-1])
     try:
-        values = engine.data(template, **_context(release, config))
-        check_values(values, release.chart, config, template)
+        check = partial(check_values, chart=release.chart, config=config, template=template)
+        values = engine.data(template, check, **_context(release, config))
     except InvalidInput as error:
         raise InvalidInput(_name_overrides(error, release)) from None
     for file, patch in release.shaping.patches:

@@ -24,7 +24,7 @@ from demandops.config.config import Config
 from demandops.config.override import OVERRIDES_ROOT
 from demandops.config.registry import ChartSource
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.render import values_schema
+from demandops.render import values_validator
 
 KUBERNETES_VERSION = "1.36.0"
 """The Kubernetes release whose schemas check built-in kinds."""
@@ -64,7 +64,7 @@ def check_values(
     if schema is None:
         return
     file = f"{chart.folder}/values.schema.json"
-    validator = values_schema.validator(schema, file)
+    validator = values_validator.validator(schema, file)
     defaults = chart_files.defaults(str(chart.folder), config.files)
     origin = "the override" if template.startswith(f"{OVERRIDES_ROOT}/") else "the template"
     faults = [

@@ -34,7 +34,7 @@ def release_text(release: Release, config: Config, engine: Engine, current: str 
         current: the file's text in the state repo; ``None`` if there is no file.
 
     Raises:
-        Refused, InvalidInput: if it cannot be rendered.
+        Refused, InvalidInput: if the release cannot be rendered.
     """
     shaping = release.shaping
     if not shaping.held:
@@ -78,8 +78,8 @@ def kept_charts(
 ) -> dict[str, str]:
     """Return the chart sources to keep because a held release may still use them.
 
-    The source of a chart that lies in the state repo is not kept: it would fetch the changed chart
-    under the name of the old one.
+    If a chart lies in the state repo, its source is not kept: the old source would fetch the
+    changed chart.
 
     Args:
         files: the generated files as they will be.

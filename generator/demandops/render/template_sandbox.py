@@ -37,7 +37,7 @@ MAX_STEPS = 1_000_000
 MAX_LENGTH = 1_000_000
 """How many characters a text may have. Kubernetes takes no object above 1.5 MB."""
 MAX_SIZE = 100_000
-"""How many parts a value may have: each item, each key and every 16 characters are one."""
+"""How many parts a value may have: each item, each key and every 16 characters count as one."""
 _MAX_BITS = 1024
 
 _DIGITS = re.compile(r"\d{1,9}")
@@ -102,7 +102,7 @@ def budget() -> Iterator[None]:
 def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts; a part that occurs twice counts twice.
 
-    With ``data``, it refuses an object of another kind, whose text holds an address in memory.
+    With ``data``, refuse objects that are not data, because their text has a memory address.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)

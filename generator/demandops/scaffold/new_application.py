@@ -1,7 +1,7 @@
 """A new application: its definition, values, chart, registry entries, README and example demand.
 
-Its services form a chain: the first reads the inputs, each further one reads the outputs of the one
-before. Launch files of one image start all of them. Pure.
+Its services form a chain: the first reads the inputs, each further service reads the outputs of the
+service before. Launch files of one image start all of them. Pure.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.errors import InvalidInput
 from demandops.identifiers import PATTERN_WORDS
 from demandops.quoting import quoted
-from demandops.scaffold.written import document
+from demandops.scaffold.yaml_document import document
 
 LIBRARY_FOLDER = f"appdefs/charts/{chart_schema.LIBRARY}"
 _NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
@@ -42,7 +42,7 @@ class ServicePlan:
 class ApplicationPlan:
     """The application to write.
 
-    ``inputs`` maps roles to message types. ``node`` is that of the example demand.
+    ``inputs`` maps roles to message types. ``node`` is the node of the example demand.
     """
 
     name: str
@@ -54,10 +54,10 @@ class ApplicationPlan:
 
 
 def refuse_name(name: str, config: Config) -> None:
-    """Refuse a name that cannot be used, or that an application, a chart or an image has.
+    """Refuse an invalid name, and a name that an application, a chart or an image already has.
 
     Raises:
-        InvalidInput: the name is one of these.
+        InvalidInput: if the name is refused.
     """
     if not _NAME.fullmatch(name):
         raise InvalidInput.at(
@@ -77,7 +77,7 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
         library: path → text of the library chart, which is added if the state repo has none.
 
     Raises:
-        InvalidInput: the configuration has an application or a chart of this name.
+        InvalidInput: if :func:`refuse_name` refuses the application's name.
     """
     refuse_name(plan.name, config)
     known = config.files if f"{LIBRARY_FOLDER}/Chart.yaml" in config.files else library
@@ -280,7 +280,8 @@ A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas
 def _requester(plan: ApplicationPlan, config: Config) -> str:
     """Return who may demand the example, by the rules of its node's access domain.
 
-    If no rule is for it, the first one is meant to be widened (``closed_domain``).
+    If no rule allows the example, take the first rule, which a person must widen
+    (``closed_domain``).
     """
     domain = config.domain_of.get(plan.node)
     rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
@@ -303,7 +304,7 @@ def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
 
 
 def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
-    """Return the access domain of the example's node if it has rules, but none that allows it."""
+    """Return the example node's access domain if it has rules and none allows the application."""
     domain = config.domain_of.get(plan.node)
     return domain if domain and domain.rules and not _rules_for(plan, config) else None
 

@@ -8,7 +8,7 @@ from typing import Any
 from demandops.config.config import DOMAINS_FILE, Config
 from demandops.errors import InvalidInput
 from demandops.naming import object_name
-from demandops.scaffold.written import document
+from demandops.scaffold.yaml_document import document
 
 
 def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:

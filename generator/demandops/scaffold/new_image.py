@@ -1,4 +1,4 @@
-"""The container file and the pipelines of a ROS package of one's own, for its own repository.
+"""The container file and the pipelines for the repository of a person's own ROS package.
 
 The pipelines test the package, build its image, and propose the image to the state repo, pinned by
 its digest. Pure.
@@ -30,11 +30,11 @@ def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str])
     Args:
         name: the image's name in the registry of the state repo.
         repository: the image's repository, with its host.
-        state_repo: the URL of the state repo; git asks for a password that it needs.
+        state_repo: the URL of the state repo, without a password.
         texts: the files of ``templates/scaffold/image``.
 
     Raises:
-        InvalidInput: ``name``, ``repository`` or ``state_repo`` has characters that the files
+        InvalidInput: if ``name``, ``repository`` or ``state_repo`` has characters that the files
             cannot contain.
     """
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)

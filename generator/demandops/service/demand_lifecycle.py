@@ -11,8 +11,8 @@
 
 A method writes to the journal, then changes the state, then wakes the worker, all under one lock.
 So a committed demand can no longer be withdrawn. Any thread may submit or withdraw a demand. One
-thread journals those that arrive, also while the worker publishes others. Only the worker's thread
-makes the other changes.
+thread journals the demands that arrive, even while the worker publishes others. Only the worker's
+thread makes the other changes.
 """
 
 from __future__ import annotations
@@ -125,15 +125,15 @@ class Demands:
             self._changed.notify()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait for a demand, :meth:`wake` or ``timeout``; return False once closed and empty."""
+        """Wait for a demand, :meth:`wake` or ``timeout``; return False if closed and none waits."""
         with self._changed:
             self._wait(timeout, self.must_not_wait)
             return self.has_waiting or not self._closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
-        """Return the demands that are new since the last call or :meth:`take`; wait for one.
+        """Wait for a demand; return the new demands since the last call or :meth:`take`.
 
-        After ``timeout`` seconds, a withdrawal or :meth:`wake` the list is empty.
+        The list is empty if ``timeout`` seconds, a withdrawal or :meth:`wake` ended the wait.
 
         Raises:
             Unsound: nobody knows what is in the journal.
@@ -165,7 +165,7 @@ class Demands:
     # ---- changes of state ----
 
     def arrive(self, ticket: Ticket) -> None:
-        """Add a demand without waiting; :meth:`journal_arrivals` takes it in."""
+        """Add a demand without waiting; :meth:`journal_arrivals` journals it."""
         ticket.state = "arrived"
         self._arrived.append(ticket)
         self._arrival.set()
@@ -175,7 +175,7 @@ class Demands:
     def journal_arrivals(self) -> None:
         """Journal demands as they arrive, until no more are accepted.
 
-        Those that arrive during a sync share the next one.
+        Demands that arrive during a sync share the next sync.
         """
         while not self._closed:
             self._arrival.wait()
@@ -218,7 +218,7 @@ class Demands:
             ticket.refuse(error)
 
     def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
-        """Return why a demand that arrived after ``others`` is not accepted, or None."""
+        """Return why a demand is not accepted, or None; ``others`` were accepted just before it."""
         if self._closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
         if others + len(self._waiting) >= self._limit:
@@ -239,7 +239,7 @@ class Demands:
             return _change(ticket, "committed")
 
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
-        """Journal the proposal that a demand waits for; return False if it was withdrawn.
+        """Journal the proposal that a demand waits for; return False if the demand was withdrawn.
 
         A demand that awaits approval can still be withdrawn.
         """
@@ -317,11 +317,11 @@ class Demands:
     ) -> None:
         """Answer each demand with its result and remove it from the journal, unless ``keep``.
 
-        A demand is answered once: a later result is dropped. A listener is told of a refusal before
-        the journal forgets the demand, because no commit shows it after a crash.
+        A demand is answered once: a later result is dropped. A listener is notified of a refusal
+        before the journal forgets the demand, because after a crash no commit shows the refusal.
 
         Raises:
-            Unsound: nobody knows what is in the journal; nobody is answered.
+            Unsound: nobody knows what is in the journal; no demand is answered.
         """
         results = list(results)
         for ticket, result in results if not keep else ():
@@ -345,10 +345,9 @@ class Demands:
                 ticket.future.set_exception(result)
 
     def _mark_done(self, results: list[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Remove demands from the journal; durably if no commit shows the outcome of one of them.
+        """Remove demands from the journal, durably unless commits show all their outcomes.
 
-        Otherwise such a demand would be decided again after a crash, so a refused one could be
-        booked.
+        Otherwise a refused demand could be decided again after a crash, and booked.
         """
         operations = [ticket.operation for ticket, _ in results]
         durably = any(
@@ -368,7 +367,7 @@ class Demands:
         self.answer([(ticket, error) for ticket in batch], keep)
 
     def end(self, error: Unsound) -> None:
-        """Accept no more demands, and end all of them with an error; the journal stays as it is."""
+        """Accept no more demands, and answer all open ones with an error; keep the journal."""
         self.close()
         with self._changed:
             left = list(self._tickets.values())

@@ -1,6 +1,6 @@
 """Evaluates one demand on top of the commits of its batch.
 
-A demand that fails gets its error as the answer. The other demands of the batch continue.
+A demand that fails gets the error as its answer. The other demands of the batch continue.
 """
 
 from __future__ import annotations
@@ -78,15 +78,16 @@ class Evaluator:
                 commit = commits.commit(decision, ticket.operation, ticket.received, now)
                 ticket.notify("committed", f"committed {commit}")
             else:
-                commits.note_settled(ticket.operation, "Unchanged")
+                waits = decision.outcome == "waiting"  # it waited already
+                commits.note_settled(ticket.operation, "waiting" if waits else "unchanged")
                 commit = str(commits.head.commit)
             return receipt_of(ticket, decision, commit, targets)
         except InvalidInput as error:
-            if ticket.has_released:  # it released a proposal, which held no claims yet
-                commits.note_settled(ticket.operation, "Unchanged")
+            if ticket.has_released:  # it released a proposal, which had no claims yet
+                commits.note_settled(ticket.operation, "released")
                 commit = str(commits.head.commit)
                 return Receipt(ticket.operation, ticket.name, "released", commit)
-            commits.note_settled(ticket.operation, "Refused")
+            commits.note_settled(ticket.operation, "refused")
             return error
         except SigningFailed as error:
             return error
@@ -100,9 +101,9 @@ class Evaluator:
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         """Return the results of demands that are already published at ``tip``, oldest first.
 
-        Such a demand was not answered because the connection or the process ended after the remote
-        accepted the push, or because a sync failed. So the commits since its base are written
-        again, durably.
+        These demands were not answered, because the connection or the process ended after the
+        remote accepted the push, or because a sync failed. So the commits since their oldest base
+        are written again, durably.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
@@ -125,7 +126,7 @@ def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt |
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
     outcome: Outcome = "booked"
-    if arrival.outcome in ("unchanged", "waiting"):
+    if arrival.outcome != "changed":
         outcome = arrival.outcome
     elif rollback_goal.is_rollback(goal):
         outcome = "restored"

@@ -3,8 +3,8 @@
 A demand counts for its first requester. Demands that share an application, a connection or a demand
 id keep their order. So do goals of the reference's action that share a requester: whether a
 shutdown repeats another depends on what was joined in between. If the next demand must follow
-another one, the queue returns that one instead. A rollback or a decommission may touch anything:
-nothing overtakes it, and it overtakes nothing.
+another demand, the queue returns that demand first. A rollback or a decommission may touch
+anything: nothing overtakes it, and it overtakes nothing.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class FairQueue:
             self._barriers.append(place)
 
     def remove(self, tickets: Collection[Ticket]) -> None:
-        """Remove demands; those that are not in the queue do not matter."""
+        """Remove demands; ignore those that are not in the queue."""
         for ticket in tickets:
             place = self._places.pop(ticket, None)
             if place is not None:
@@ -86,7 +86,7 @@ class FairQueue:
             first = before
 
     def _before(self, place: _Place) -> _Place | None:
-        """Return another demand that must be taken before this one, or None."""
+        """Return another demand that must be taken before the one at ``place``, or None."""
         barrier = _next_in(self._barriers)
         if barrier is not None and barrier.number < place.number:
             return barrier

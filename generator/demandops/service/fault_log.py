@@ -1,4 +1,4 @@
-"""What the log says about the state repo; it says each thing once."""
+"""Logs the problems of the state repo, each once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ log = logging.getLogger("demandops")
 
 
 class FaultLog:
-    """Logs faults of the state repo's files, and signing keys that this generator lacks."""
+    """Logs faults of the state repo's files, and that this generator lacks a signing key."""
 
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository

@@ -18,7 +18,7 @@ from demandops.service.demand_lifecycle import Demands
 from demandops.service.remote_status import RemoteStatus
 from demandops.service.ticket import Listener, Ticket
 from demandops.service.worker import Worker
-from demandops.staterepo.git.address import connect
+from demandops.staterepo.git.open_repository import connect
 from demandops.staterepo.git.repository import access_error
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import revisions
@@ -57,8 +57,8 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many of them one requester may have. With None, for a single
-                client, there is no such limit, and all demands keep their order.
+            requester_limit: how many demands of one requester may be queued; None, for a single
+                client: any number, and all demands keep their order.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
             fetch_interval: seconds between two fetches while no demand comes; 0: never, except
@@ -146,7 +146,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Name of each failed thread that has not recovered → the reason; for any thread."""
+        """Failed thread → the reason, until it recovers; any thread may read this."""
         return self._runtime.failures
 
     def fetch_now(self) -> None:
@@ -190,7 +190,7 @@ class Generator:
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or a descendant; any thread may call it."""
+        """Return whether ``commit`` is ``other`` or descends from it; any thread may call this."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
@@ -212,7 +212,7 @@ class Generator:
     def on_publish(self, listener: Callable[[Config], None]) -> None:
         """Call ``listener`` in the worker thread after every publication.
 
-        It gets the configuration in effect and must return at once.
+        The listener gets the configuration in effect and must return at once.
         """
         self._worker.listeners.append(listener)
 
@@ -220,8 +220,8 @@ class Generator:
         """Refuse further demands, finish the queued ones and stop; return at once.
 
         Args:
-            timeout: seconds for the queued demands. The demands that are not published then stay in
-                the journal for the next start, and their futures raise ``ShuttingDown``.
+            timeout: seconds for the queued demands. After that, unpublished demands stay in the
+                journal for the next start, and their futures raise ``ShuttingDown``.
 
         Returns:
             A future that returns, once the worker has ended, whether everything was published.

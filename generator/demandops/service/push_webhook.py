@@ -1,8 +1,8 @@
 """The inbound webhook: a Git server reports a push, and the generator fetches at once.
 
 Notifications are untrusted: only the signature is checked, and the content is not read. Anyone who
-reaches the address may connect. So the server limits the number of open connections, and cuts each
-off after some seconds, even if its sender is very slow.
+reaches the address may connect. So the server limits the number of open connections, and cuts off
+each connection after some seconds, however slow its sender is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from demandops.errors import InvalidInput
 from demandops.runtime import REAL
-from demandops.service import listener
+from demandops.service import listening_socket
 
 log = logging.getLogger("demandops")
 
@@ -46,24 +46,24 @@ class PushWebhook:
 
         Args:
             address: ``host:port``; port 0 picks a free port.
-            secret: the key that signs notifications. If empty, they need no signature, and the
-                address must be on the loopback.
+            secret: the key that signs notifications. If it is empty, notifications need no
+                signature, and the address must be on the loopback.
             on_push: called for each notification; must return at once.
 
         Raises:
-            InvalidInput: if it cannot or must not listen on the address.
+            InvalidInput: the server cannot or must not listen on the address.
         """
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
-        self._socket = listener.bound(address, "--webhook")
-        if not (secret or listener.is_local(self._socket)):
+        self._socket = listening_socket.bound(address, "--webhook")
+        if not (secret or listening_socket.is_local(self._socket)):
             self._socket.close()
             raise InvalidInput.at(
                 "--webhook",
                 f"'{address}' can be reached from other machines, so notifications must be "
                 "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1",
             )
-        self.url = listener.url_of(self._socket) + _PATH
+        self.url = listening_socket.url_of(self._socket) + _PATH
         app = Starlette(routes=[Route("/", _health), Route(_PATH, self._handle, methods=["POST"])])
         app.router.redirect_slashes = False
         config = uvicorn.Config(

@@ -35,7 +35,7 @@ class RemoteMonitor:
         self._away_from = 0.0
 
     def record_unreachable(self, reason: str) -> None:
-        """Record that the remote cannot be reached; warn if it could be before."""
+        """Record that the remote cannot be reached; warn if it was reachable before."""
         since = self.status.unreachable_since
         if since is None:
             log.warning("%s; trying again until it is back", reason)
@@ -46,7 +46,7 @@ class RemoteMonitor:
         self.status = replace(self.status, unreachable=reason, unreachable_since=since)
 
     def record_reached(self, *, pushed: bool = False) -> None:
-        """Record that the remote was reached; log it if it could not be before."""
+        """Record that the remote was reached; log this if it was unreachable before."""
         now, before = self._runtime.now(), self.status
         if before.unreachable_since is not None:
             away = self._runtime.monotonic() - self._away_from

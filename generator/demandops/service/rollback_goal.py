@@ -1,7 +1,8 @@
 """A rollback as a goal: plain data that passes through queue and journal like a demand.
 
-Only the command line makes one; actions and request files cannot contain it. It is evaluated on the
-newest tip, so it works while others write. Claims booked meanwhile count as newer.
+Only the command line makes this goal; actions and request files cannot contain it. The goal is
+evaluated on the newest tip, so a rollback works while others write. Claims booked meanwhile count
+as newer.
 """
 
 from __future__ import annotations

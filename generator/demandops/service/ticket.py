@@ -62,9 +62,9 @@ class Ticket:
     ``journaled`` returns whether the demand is in the journal, so that a crash does not lose it. It
     returns False if the demand was refused before; then ``future`` raises the reason.
 
-    ``base`` is the tip that was known when it arrived. ``maybe_published``: the remote may have
-    accepted a push of it although no answer arrived. ``has_released``: it released a demand that
-    awaited approval; then it may hold no claims.
+    ``base`` is the tip that was known when the demand arrived. ``maybe_published``: the remote may
+    have accepted a push of the demand although no answer arrived. ``has_released``: the demand
+    released another that awaited approval; then there may be no claims to release.
     """
 
     operation: str
@@ -145,7 +145,7 @@ def reason_of(error: DemandOpsError) -> str:
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket for a demand that an earlier run left in the journal, and log that."""
+    """Return a ticket for a demand that an earlier run left in the journal; log its stages."""
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
 

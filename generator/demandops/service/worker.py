@@ -147,7 +147,7 @@ class Worker:
         self._demands.fail(batch, error)
 
     def _take_a_rest(self) -> None:
-        """Stop following the state repo for a while, because that failed."""
+        """Stop following the state repo for a while after a failure."""
         if self._rest.follows_success:
             self._renew_clone_if_damaged()
         self._rest.begin()
@@ -264,14 +264,14 @@ class Worker:
         )
 
     def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
-        """Return the result of a demand; if it frees room, book demands that wait for that."""
+        """Return the result of a demand; if it frees room, book demands that wait for room."""
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         self._own_work.follow(commits, before)
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return tickets that end leases; none while a demand waits, which may renew one."""
+        """Return tickets that end leases; none while a demand waits, because it may renew one."""
         if self._rest or self._demands.has_waiting:
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
@@ -290,7 +290,7 @@ class Worker:
             if not published:
                 return False
             self._record_reached(pushed=not commits.is_empty)
-            self._set_snapshot(commits.head)
+            self._record_published(commits)
         final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
         for ticket, result in results:
@@ -363,7 +363,7 @@ class Worker:
         for _ in range(_TRIES):
             commits = self._new_commit_batch()
             if commits.publish():
-                self._set_snapshot(commits.head)
+                self._record_published(commits)
                 return not commits.is_empty
             self._repository.refresh()
             self._ends_soon.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
@@ -382,6 +382,11 @@ class Worker:
             self._log.tell(commits.head.problems)
         self._own_work.commit_due(commits)
         return commits
+
+    def _record_published(self, commits: CommitBatch) -> None:
+        if commits.followed:
+            log.info("%s", commits.followed)
+        self._set_snapshot(commits.head)
 
     def _set_snapshot(self, snapshot: Snapshot) -> None:
         before, self.snapshot = self.snapshot, snapshot

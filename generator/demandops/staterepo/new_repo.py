@@ -36,9 +36,9 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         target: a folder that does not exist or is empty; else nothing is written.
         bare: make a bare repository, which the generator can use in place.
         gitops: the GitOps controller, ``flux`` or ``argocd``.
-        url: the URL that the clusters fetch from; without one, no cluster can follow it yet.
-        example: whether it has the fleet and the application of the paper's experiment.
-        schemas: name → JSON Schema of a kind of file that people write; ``schemas/`` gets them.
+        url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
+        example: whether to include the fleet and the application of the paper's experiment.
+        schemas: name → JSON Schema of a kind of file that people write, for ``schemas/``.
         signer: signs the first commit.
 
     Raises:
@@ -58,9 +58,11 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         shutil.rmtree(partial, ignore_errors=True)
         try:
             commit = _write(partial, content, now, bare, signer)
-            if target.exists():
-                target.rmdir()
-            partial.rename(target)
+            if target.exists():  # it may be the current folder of a shell, so it stays
+                for part in partial.iterdir():
+                    part.rename(target / part.name)
+            else:
+                partial.rename(target)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
@@ -74,8 +76,8 @@ def _write(
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
-    repo.config["receive.fsckObjects"] = True  # libgit2 cannot read all that git pushes
-    repo.config["gc.auto"] = 0  # the generator joins the packs, beside its work
+    repo.config["receive.fsckObjects"] = True  # libgit2 cannot read every object that git accepts
+    repo.config["gc.auto"] = 0  # the generator joins the packs in the background
     objects = NewObjects(repo)
     tree = trees.write(objects, None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."

@@ -22,9 +22,9 @@ from demandops.runtime import REAL
 from demandops.staterepo.audit import commit_signatures, verification
 from demandops.staterepo.audit.verification import Verdict
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.address import connect, is_url
 from demandops.staterepo.git.checkout import LastFetch
-from demandops.staterepo.git.repository import StateRepository
+from demandops.staterepo.git.open_repository import connect, is_url
+from demandops.staterepo.git.repository import StateRepository, access_error
 from demandops.staterepo.history import authorship, commit_log, revisions
 from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.history.commit_log import LogEntry, PathHistory
@@ -42,13 +42,13 @@ class Reader:
     """An open state repo at its newest commit; a checkout is read at its checked-out commit."""
 
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
-        """Read from ``repository`` at ``tip``; if it is a clone, ``slot`` is the clone's slot."""
+        """Read from ``repository`` at ``tip``; ``slot`` is the slot of a clone."""
         self.repository, self._tip, self._slot = repository, tip, slot
         self._objects = repository.objects
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        """Return the open state repo; fetch a URL into a clone, which stays."""
+        """Return a reader of the state repo at an address; the clone of a URL is kept."""
         slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         try:
             repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
@@ -64,7 +64,7 @@ class Reader:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch, read from the newest commit from now on, and return that commit.
+        """Fetch and return the newest commit; read from this commit from now on.
 
         Raises:
             StateRepoError: if the state repo cannot be reached or read.
@@ -76,9 +76,16 @@ class Reader:
         return str(self._tip)
 
     def beside(self) -> Reader:
-        """Return another reader of the same fetched commits, for another thread."""
+        """Return another reader of the same fetched commits, for another thread.
+
+        Raises:
+            StateRepoError: if the state repo cannot be read.
+        """
         other = Reader(self.repository, self._tip)
-        other._objects = self.repository.reopened()
+        try:
+            other._objects = self.repository.reopened()
+        except (pygit2.GitError, OSError) as error:
+            raise StateRepoError(f"{self.repository.address} cannot be read: {error}") from None
         return other
 
     def refuse_other_render_version(self) -> None:
@@ -104,9 +111,9 @@ class Reader:
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Return a commit with the last valid versions of invalid files.
+        """Return the snapshot of a commit, with the last valid versions of invalid files.
 
-        Unlike :meth:`snapshot`, it does not need a generator to have quarantined the files.
+        Unlike :meth:`snapshot`, this works before a generator has quarantined the files.
         """
         try:
             return self.snapshot(revision, progress)
@@ -114,7 +121,7 @@ class Reader:
             return state_in_effect.state_at(self._objects, revision, progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        """Return the newest commit like :meth:`last_valid_snapshot`; start from ``before``."""
+        """Return :meth:`last_valid_snapshot` of the newest commit, read from ``before`` on."""
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
@@ -201,7 +208,7 @@ class Reader:
     ) -> list[Verdict]:
         """Return a verdict on each commit, oldest first: on its files and its signature.
 
-        With ``whole``, each commit is loaded whole, not only the differences from the one before.
+        With ``whole``, each commit is proven whole, not by its differences from an earlier commit.
         """
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
@@ -264,8 +271,11 @@ class Reader:
 @contextmanager
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
     """Yield an open state repo, and close it at the end; ``only_read`` also allows a checkout."""
-    with closing(Reader.of(address, only_read=only_read)) as reader:
-        yield reader
+    try:
+        with closing(Reader.of(address, only_read=only_read)) as reader:
+            yield reader
+    except pygit2.GitError as error:  # an object is missing, or its file cannot be read
+        raise access_error(error, address) from None
 
 
 @contextmanager

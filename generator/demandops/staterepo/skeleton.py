@@ -28,8 +28,8 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
     Args:
         gitops: the GitOps controller, ``flux`` or ``argocd``.
-        url: the URL that clusters fetch from. Without one no cluster can follow it yet.
-        example: whether it has the fleet and the application of the paper's experiment.
+        url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
+        example: whether to include the fleet and the application of the paper's experiment.
 
     Raises:
         InvalidInput: clusters cannot fetch from ``url``.
@@ -51,7 +51,7 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 
 def files_of_library(folder: str) -> dict[str, str]:
-    """Return path → text of a chart of the skeleton that others depend on."""
+    """Return path → text of a chart in the skeleton on which other charts depend."""
     appdefs = _read(data_folder("appdefs"), "appdefs/")
     return {path: text for path, text in appdefs.items() if path.startswith(f"{folder}/")}
 

@@ -45,12 +45,12 @@ _FIRST_WITH_MARKS = 2
 """The first render version whose claims mark the further topics of a source."""
 
 _FOLDER_DEPTH = 3
-"""``clusters/<cluster>/<access domain>``: the commit's message counts files per such folder."""
+"""The commit's message counts files per folder ``clusters/<cluster>/<access domain>``."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """The GitOps controller to change to and its URL; None keeps them."""
+    """The GitOps controller to change to and its URL; None keeps the current value."""
 
     gitops: str | None = None
     url: str | None = None
@@ -58,7 +58,7 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """The files that an upgrade changes; ``commit`` is the newest commit after it."""
+    """The files that an upgrade changes; ``commit`` is its commit, or the tip if it made none."""
 
     commit: str
     old: Config
@@ -207,7 +207,7 @@ def _refuse_held(state: State) -> None:
 
 
 def _root(text: str, config: Config, request: UpgradeRequest) -> str:
-    """Return ``demandops.yaml`` with the requested changes; keep all else in it."""
+    """Return the text of ``demandops.yaml`` with only the requested changes."""
     repository = config.repo_settings
     gitops = request.gitops or repository.gitops
     try:

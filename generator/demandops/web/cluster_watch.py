@@ -1,18 +1,19 @@
-"""Watches the releases on their clusters, and notes when the state of one changes."""
+"""Watches the releases on their clusters, and records when a release's state changes."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.bootstrap_status import OldBootstrap, old_bootstraps
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, Target
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import ReleaseStatus, statuses
 from demandops.runtime import Runtime
 from demandops.staterepo.git.repository import StateRepository
-from demandops.web.moment import HealthChange
+from demandops.web.situation import HealthChange
 from demandops.web.views.health_word import word_of
 
 _KEPT = 2_000
@@ -54,14 +55,24 @@ class ClusterWatch:
     ) -> dict[str, ReleaseStatus]:
         """Return the status of each release, by name; also watch releases that are new."""
         wanted = list(targets)
-        for domain in dict.fromkeys(target.domain for target in wanted):
-            if domain.cluster in self._caches and domain not in self._domains:
-                self._domains.add(domain)
-                self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        self._watch(target.domain for target in wanted)
         found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)
         by_name = {target.name: one for target, one in zip(wanted, found, strict=True)}
         self._note(by_name)
         return by_name
+
+    def old_bootstraps(
+        self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
+    ) -> tuple[OldBootstrap, ...]:
+        """Return the clusters without the current bootstrap file; ``read`` reads the state repo."""
+        self._watch(domains)
+        return tuple(old_bootstraps(domains, self._caches, read))
+
+    def _watch(self, domains: Iterable[ClusterDomain]) -> None:
+        for domain in dict.fromkeys(domains):
+            if domain.cluster in self._caches and domain not in self._domains:
+                self._domains.add(domain)
+                self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
 
     def _note(self, statuses: Mapping[str, ReleaseStatus]) -> None:
         at = self._runtime.monotonic()

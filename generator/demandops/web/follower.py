@@ -11,16 +11,19 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.bootstrap_status import OldBootstrap
+from demandops.cluster.clusters_file import ClusterAccess
+from demandops.cluster.release_status import ReleaseStatus
 from demandops.errors import DemandOpsError
 from demandops.quoting import one_line
 from demandops.runtime import REAL, Runtime
+from demandops.service import rollout_targets
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write.proposal_branch import pending_proposals
 from demandops.web.cluster_watch import ClusterWatch
-from demandops.web.moment import Commit, HealthChange, Moment, Situation
+from demandops.web.situation import Commit, HealthChange, Moment, Situation
 
 log = logging.getLogger("demandops")
 
@@ -114,6 +117,18 @@ class Follower:
             moment.last_changes[path] = next(found, None)
         return moment.last_changes[path]
 
+    def not_rendered(self, moment: Moment) -> frozenset[str]:
+        """Return the generated files that a generator has yet to write or remove at a moment.
+
+        Return no files while the state repo cannot be reached.
+        """
+        if moment.not_rendered is None:
+            try:
+                moment.not_rendered = self.reader().not_rendered(moment.snapshot)
+            except DemandOpsError:
+                return frozenset()
+        return moment.not_rendered
+
     def wake(self) -> None:
         """Check for a new commit now; any thread may call it."""
         self._wake.set()
@@ -162,17 +177,21 @@ class Follower:
     def _situation_at(self, moment: Moment) -> Situation:
         """Return the situation at a moment, with the newest statuses, proposals and history."""
         self._read_history(moment.commit)
-        statuses = {}
+        statuses: Mapping[str, ReleaseStatus] = {}
+        old: tuple[OldBootstrap, ...] = ()
         if self._watch.clusters:
             wanted = [target for _, target in moment.targets]
             repository = self._reader.repository
             statuses = self._watch.statuses(wanted, moment.commit, repository)
+            domains = rollout_targets.domains_of_state(moment.state)
+            old = self._watch.old_bootstraps(domains, self._reader.file_reader(moment.commit))
         return Situation(
             moment,
             self._runtime.now(),
             statuses=statuses,
             watched=self._watch.clusters,
             proposals=tuple(pending_proposals(self._reader.repository)),
+            old_bootstraps=old,
         )
 
     def _read_history(self, tip: str) -> None:

@@ -10,7 +10,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from demandops import settings
 from demandops.runtime import REAL
-from demandops.service import listener
+from demandops.service import listening_socket
 from demandops.web.follower import Follower
 from demandops.web.site import Site
 
@@ -37,9 +37,9 @@ class WebServer:
             InvalidInput: if it cannot listen on the address.
         """
         self._follower = follower
-        self._socket = listener.bound(address, option)
-        self.url = f"{listener.url_of(self._socket)}/"
-        is_local = listener.is_local(self._socket)
+        self._socket = listening_socket.bound(address, option)
+        self.url = f"{listening_socket.url_of(self._socket)}/"
+        is_local = listening_socket.is_local(self._socket)
         if not is_local:
             log.warning(
                 "everybody who reaches %s can read the page; a reverse proxy can ask for passwords "

@@ -28,11 +28,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from demandops import __version__
+from demandops.config.durations import relative
 from demandops.errors import DemandOpsError
 from demandops.quoting import escaped, lines
 from demandops.web.follower import Follower
 from demandops.web.view_pages import NAVIGATION, VIEWS, Asked, Data, View
-from demandops.web.views import rows
+from demandops.web.views import filtered_table
 
 log = logging.getLogger("demandops")
 
@@ -94,7 +95,7 @@ class Site:
         self._templates.filters |= {
             "when": _when,
             "clock": _clock,
-            "ago": _ago,
+            "ago": relative,
             "iso": _iso,
             "sh": shlex.quote,
         }
@@ -140,7 +141,7 @@ class Site:
             "now": asked.situation.now,
             "situation": asked.situation,
             "moment": asked.situation.moment,
-            "exactly": rows.exactly,
+            "exactly": filtered_table.exactly,
             "program": __version__,
             "has_docs": self._has_docs,
         }
@@ -161,7 +162,7 @@ class Site:
 
 
 class _Events:
-    """Tells browsers when there is something new to show, as server-sent events."""
+    """Reports to browsers that there is something new to show, by server-sent events."""
 
     def __init__(self, follower: Follower) -> None:
         self._follower, self._listeners = follower, 0
@@ -229,16 +230,3 @@ def _clock(at: datetime, now: datetime) -> str:
     """Return a time of today as a time of the day, and any other with its date."""
     at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
     return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")
-
-
-def _ago(at: datetime, now: datetime) -> str:
-    """Return a time as people say it, before or after now."""
-    seconds = (now - at).total_seconds()
-    amount = abs(seconds)
-    for unit, length in (("d", 86400), ("h", 3600), ("min", 60)):
-        if amount >= length:
-            text = f"{amount / length:.0f} {unit}"
-            break
-    else:
-        text = f"{amount:.0f} s"
-    return f"{text} ago" if seconds >= 0 else f"in {text}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 from urllib.parse import urlencode
@@ -10,19 +11,20 @@ from urllib.parse import urlencode
 from starlette.requests import Request
 
 from demandops.config.override import format_time
+from demandops.render.changes.override_state import override_state
 from demandops.web.follower import MOST_COMMITS, Follower
-from demandops.web.moment import Situation
+from demandops.web.situation import Situation
 from demandops.web.views import (
     demand_view,
+    filtered_table,
     fleet_map,
     not_ready,
     rates,
     release_view,
-    rows,
     time_line,
 )
+from demandops.web.views.filtered_table import Filter, Link, Row
 from demandops.web.views.lists import LISTS, rows_of
-from demandops.web.views.rows import Filter, Link, Row
 
 _KEPT = ("at", "q")
 """The parameters that links to other views keep."""
@@ -81,7 +83,8 @@ class Asked:
 def _not_ready(asked: Asked) -> tuple[str, Data]:
     moment = asked.situation.moment
     last_change = partial(asked.follower.last_change, moment)
-    causes = not_ready.causes(asked.situation, asked.filter, last_change)
+    pending = asked.follower.not_rendered(moment)
+    causes = not_ready.causes(asked.situation, asked.filter, last_change, pending)
     applications = not_ready.applications(asked.situation, causes, asked.filter)
     data = {"causes": causes[:_MOST_CAUSES], "total": len(causes), "applications": applications}
     return "not_ready.html.j2", data
@@ -95,7 +98,7 @@ def _map(asked: Asked) -> tuple[str, Data]:
 def _list(asked: Asked) -> tuple[str, Data]:
     kind = LISTS[asked.path]
     found = rows_of(asked.situation, kind.name)
-    shown = rows.table(kind.columns, found, asked.filter, asked.get("sort"), asked.page())
+    shown = filtered_table.table(kind.columns, found, asked.filter, asked.get("sort"), asked.page())
     return "list.html.j2", {"kind": kind, "table": shown}
 
 
@@ -139,7 +142,9 @@ def _timeline(asked: Asked) -> tuple[str, Data]:
 
 def _overrides(asked: Asked) -> tuple[str, Data]:
     now, entries = asked.situation, []
-    for entry in now.moment.override_entries(now.now):
+    pending = asked.follower.not_rendered(now.moment)
+    for found in now.moment.override_entries(now.now):
+        entry = replace(found, state=override_state(found, now.moment.state, pending))
         texts = {
             "owner": [entry.override.owner],
             "reason": [entry.override.reason],
@@ -147,7 +152,7 @@ def _overrides(asked: Asked) -> tuple[str, Data]:
             "demand": [claim.demand for claim in entry.claims],
             "requester": [who for claim in entry.claims for who in claim.requesters],
         }
-        if asked.filter.matches(Row({"override": rows.cell(entry.override.name)}, texts)):
+        if asked.filter.matches(Row({"override": filtered_table.cell(entry.override.name)}, texts)):
             entries.append(entry)
     return "overrides.html.j2", {
         "entries": entries,

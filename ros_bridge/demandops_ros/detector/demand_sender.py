@@ -1,4 +1,4 @@
-"""Sends the demands of events in threads of its own, and sends failed ones again."""
+"""Sends the demands of events in separate threads, and sends a failed demand again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from demandops_ros.client import DemandClient
 from demandops_ros.messages import fill_message
 
 _THREADS = 8
-"""How many goals are under way at once; the node publishes such goals together."""
+"""How many goals are sent at the same time; the node publishes such goals together."""
 _LONGEST_WAIT_S = 60.0
 
 Log = Callable[[str, str], None]
@@ -57,7 +57,7 @@ class DemandSender:
         self._requests.close()
 
     def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
-        """Send the goals for new wants; ``booked`` has the demands from before the start."""
+        """Send what events newly want; ``booked`` has the goals booked before the start."""
         with self._changed:
             for key, goal in (booked or {}).items():
                 self._wanted.hold(key, goal)
@@ -98,7 +98,8 @@ class DemandSender:
         try:
             if goal.action == "demand":
                 answer = self._demands.send(goal.data)
-                return Outcome("", f"{answer.outcome} in {answer.commit}", answer.lease_s)
+                told = (f"{answer.outcome} in {answer.commit}", *answer.warnings)
+                return Outcome("", one_line("; warning: ".join(told)), answer.lease_s)
             return self._send_request(goal.data)
         except DemandError as error:
             return Outcome(error.code, one_line(str(error)))
@@ -109,5 +110,6 @@ class DemandSender:
         succeeded, result, _ = self._requests.send(
             fill_message(DeploymentRequest.Goal(), dict(data))
         )
-        text = one_line(result.message.split("\n")[0])
+        lines = result.message.split("\n")
+        text = one_line("; ".join(lines if succeeded else lines[:1]))
         return Outcome("" if succeeded else text.partition(":")[0] or "aborted", text)

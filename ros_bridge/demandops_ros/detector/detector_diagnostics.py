@@ -16,7 +16,7 @@ _MOST_REFUSALS = 20
 
 
 class DetectorDiagnostics:
-    """Publishes a status each for the rules, the data and the demands."""
+    """Publishes three statuses: of the rules, of the data and of the demands."""
 
     def __init__(self, node: Node, rules: str) -> None:
         self._node, self._rules = node, rules

@@ -1,7 +1,7 @@
 """The node of the event detector: topics in, demands out.
 
-It decides on events alone and does not know what runs. Only at its start it reads in the latched
-bookkeeping which demands are its own, so that a restart does not end them.
+The node decides by events alone and does not know what runs. Only when it starts, it reads the
+latched bookkeeping to find the demands of its earlier run, so that a restart does not end them.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _RELOAD_S = 1.0
 _PATIENCE_S = 10.0
 _MOST_OBSERVATIONS = 100_000
 _UNHEARD_CLOCK = 0.0
-"""The time until the first message of a simulated clock. Once the clock runs, it is long ago."""
+"""The time that ROS reports before the first message of a simulated clock."""
 _SET_CLOCK_S = 1.0
-"""If a clock jumps by more, somebody has set it, or a simulation was restarted."""
+"""A clock that jumps by more than this was set, or its simulation was restarted."""
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class DetectorNode(Node):  # type: ignore[misc]
-    """Watches the topics of its rules and keeps the demands that follow from them."""
+    """Watches the topics of its rules and sends the demands of these rules."""
 
     def __init__(self, rules: str | None) -> None:
         """Start to watch.
@@ -113,7 +113,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         if observation.at != _UNHEARD_CLOCK:
             self._observations.append(observation)
 
-    # ---- the start: which demands are ours ----
+    # ---- the start: which demands are of the earlier run ----
 
     def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
         self._bookkeeping = json.loads(message.bookkeeping_json)
@@ -143,7 +143,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             missing += "running, and is bookkeeping_topic its topic?"
         self.get_logger().warning(missing)
 
-    # ---- again and again ----
+    # ---- periodic work ----
 
     def _refresh(self) -> None:
         self._topics.refresh()
@@ -172,7 +172,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._detector.set_clock(jumped)
 
     def _reload_if_changed(self) -> None:
-        """Use changed rules; if they are invalid, log that once and keep the last valid ones."""
+        """Use changed rules; if they are invalid, log that once and keep the last valid rules."""
         try:
             _, text = read_input(self._path)
         except InvalidInput as error:
@@ -207,10 +207,10 @@ class DetectorNode(Node):  # type: ignore[misc]
 
 
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
-    """Return the rules in a file whose message types are installed, and its text.
+    """Return the rules in a file, and the file's text.
 
     Raises:
-        InvalidInput: with every fault.
+        InvalidInput: with every fault; a message type that is not installed is one.
     """
     name, text = read_input(path)
     file = read(text, name)

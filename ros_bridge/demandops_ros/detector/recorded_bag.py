@@ -18,10 +18,11 @@ from rosbags.typesys import Stores, get_typestore
 
 
 class RecordedBag:
-    """The messages of a bag that rules read.
+    """The messages that rules read from a bag.
 
-    ``topics`` are the topics that a source reads; ``unread`` are topics that match a source, but
-    have another type. ``left_out`` counts unreadable messages by topic and reason.
+    ``topics`` are the topics that a source reads. ``unread`` maps topics whose name matches a
+    source, but whose message type differs, to that type. ``left_out`` counts unreadable messages by
+    topic and reason.
     """
 
     def __init__(self, path: Path, file: RuleFile) -> None:
@@ -68,7 +69,7 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        """Yield an observation for each readable message, in the order of their recording."""
+        """Yield an observation for each readable message, in the order of recording."""
         chosen = [one for one in self._reader.connections if one.id in self._sources]
         for connection, nanoseconds, data in self._reader.messages(connections=chosen):
             yield from self._read(connection, nanoseconds / 1e9, data)

@@ -26,7 +26,10 @@ _TRACK_M = 0.5
 
 @dataclass
 class Replay:
-    """The events and demands of rules for a bag. ``tracks`` has each entity's path, for a plot."""
+    """The events and demands that rules make from a bag.
+
+    ``tracks`` has each entity's path, for a plot.
+    """
 
     bag: str
     file: RuleFile

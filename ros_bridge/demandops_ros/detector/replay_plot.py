@@ -32,7 +32,7 @@ def svg(replay: Replay) -> str:
 
 
 class _Colors:
-    """Gives each entity a color, in the order of their first appearance."""
+    """Gives each entity a color, in the order in which the entities first appear."""
 
     def __init__(self) -> None:
         self._of: dict[str, str] = {}
@@ -56,7 +56,7 @@ class _Scale:
 
 
 def _round(metres: float) -> float:
-    """Return a round length of at most a quarter of the width."""
+    """Return a round length for the scale bar, at most a quarter of ``metres``."""
     lengths = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
     return max((one for one in lengths if one <= metres / 4), default=lengths[0])
 
@@ -136,7 +136,7 @@ def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) 
 
 
 def _spans(replay: Replay) -> dict[Key, list[Span]]:
-    """Return when each event lasted; one that lasts at the end has no end."""
+    """Return the start and end of each event; an event that is still active has no end."""
     spans: dict[Key, list[Span]] = {}
     for event, _ in replay.events:
         if event.starts:

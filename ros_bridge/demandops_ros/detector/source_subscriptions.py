@@ -21,7 +21,7 @@ _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
 
 
 def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
-    """Return the class of a message type, or ``None`` if it is not installed."""
+    """Return the class of a message type; ``None`` if the type is not installed."""
     package, _, name = type_name.split("/")
     try:
         return getattr(import_module(f"{package}.msg"), name, None)

@@ -1,1 +1,1 @@
-"""Parameter sync: keeps the parameters of a running ROS node as a ConfigMap has them."""
+"""Parameter sync: keeps the parameters of a running ROS node equal to those in a ConfigMap."""

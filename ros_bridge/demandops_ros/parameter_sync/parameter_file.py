@@ -13,7 +13,7 @@ _SECTION = "ros__parameters"
 
 
 def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
-    """Return the parameters of a node, by their dotted names; its own override those of all nodes.
+    """Return a node's parameters by dotted name; the node's section overrides that of all nodes.
 
     Args:
         node: the node's name, with or without a slash in front.

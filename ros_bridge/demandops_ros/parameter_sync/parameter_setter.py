@@ -20,7 +20,7 @@ _EVENTS = "/parameter_events"
 
 
 class ParameterSetter:
-    """Gives the node ``target`` the newest parameters that :meth:`want` got."""
+    """Sets on the node ``target`` the parameters that :meth:`want` got last."""
 
     def __init__(self, node: Node, target: str) -> None:
         self._node = node
@@ -29,7 +29,7 @@ class ParameterSetter:
         self._lock = REAL.lock()
         self._wanted: list[Any] = []
         self._version = 0
-        # the target's endpoints and the version of the parameters that were set there last
+        # the target's endpoints when parameters were last set, and the version of these parameters
         self._set: tuple[Any, int] | None = None
         self._call: Any = None
         self._called_at = 0.0
@@ -81,10 +81,10 @@ class ParameterSetter:
         self._node.get_logger().info(
             f"set {len(names) - len(refused)} parameters of {self._target}"
         )
-        self._changed.trigger()  # other parameters may be wanted by now
+        self._changed.trigger()  # the caller may want other parameters by now
 
     def _endpoints(self) -> frozenset[tuple[int, ...]]:
-        """Return the target's endpoints for parameter events, also those of a killed node."""
+        """Return the target's endpoints for parameter events; a killed node's may be among them."""
         return frozenset(
             tuple(info.endpoint_gid)
             for info in self._node.get_publishers_info_by_topic(_EVENTS)

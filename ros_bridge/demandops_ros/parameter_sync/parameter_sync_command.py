@@ -1,4 +1,4 @@
-"""``demandops parameter-sync``: keep a ROS node's parameters as a ConfigMap has them."""
+"""``demandops parameter-sync``: keep a ROS node's parameters equal to those in a ConfigMap."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PARAMETERS = {
     "ros_params_file_name": "params.yml",
     "target_ros_node": "",
 }
-"""The parameters of the reference's k8s_configmap_watcher, except `period`: a watch needs none."""
+"""The parameters of the reference's k8s_configmap_watcher, without `period`: a watch needs none."""
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -46,7 +46,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
 
     \b
     Examples:
-      demandops parameter-sync --ros-args -p configmap_name:=fusion -p target_ros_node:=/fusion
+      demandops parameter-sync --ros-args --params-file fusion.yaml
     """
     with (
         ros_process.stop_signals() as wait_for_signal,

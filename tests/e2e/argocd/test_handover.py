@@ -9,9 +9,9 @@ import pytest
 import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
+from tests.e2e.common.expected import CLUSTER, NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import CLUSTER, running
+from tests.e2e.common.running import running
 from tests.e2e.common.staterepo import demandops
 from tests.e2e.flux import view as flux_view
 from tests.e2e.flux.world import World as FluxWorld

@@ -11,8 +11,8 @@ from demandops_ros import DemandClient
 
 from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.answers import TIMEOUT_S, fusion, push_chart, restart_generator
+from tests.e2e.common.expected import CLUSTER
 from tests.e2e.common.namespace import name_of
-from tests.e2e.common.running import CLUSTER
 from tests.e2e.rig.argocd import SERVER, WEBHOOK_SECRET
 from tests.e2e.rig.cluster import Rig
 

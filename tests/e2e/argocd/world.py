@@ -42,6 +42,7 @@ class World(StateRepo[Domain]):
         self.generator.stop()
         for domain in self.domains.values():
             domain.kube.delete("Application", domain.name, NAMESPACE)
-            domain.kube.wait_gone("Application", domain.name, NAMESPACE)
+            # if a test killed the API server, Argo CD hears of the deletion when its watch is back
+            domain.kube.wait_gone("Application", domain.name, NAMESPACE, timeout=180.0)
             domain.kube.delete("AppProject", domain.name, NAMESPACE)
         self.remove_wide()

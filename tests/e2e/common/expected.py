@@ -16,6 +16,9 @@ from examples.experiment import paper
 
 EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
 
+CLUSTER = "c-its"
+NAMESPACE = "perception"
+"""The skeleton's cluster and access domain."""
 
 STEPS = range(1, len(paper.STEPS) + 1)
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")

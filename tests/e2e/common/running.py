@@ -8,11 +8,9 @@ from typing import Any, TypeVar
 
 import pytest
 
+from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.staterepo import StateRepo
 from tests.e2e.rig.cluster import Rig
-
-CLUSTER = "c-its"
-NAMESPACE = "perception"  # the skeleton's access domain
 
 World = TypeVar("World", bound=StateRepo[Any])
 

@@ -19,8 +19,10 @@ from tests.kit.config import override
 
 from . import expected
 from .expected import (
+    CLUSTER,
     DETECTION,
     FUSION,
+    NAMESPACE,
     STEPS,
     WITHOUT_DEMANDS,
     source_end,
@@ -30,7 +32,6 @@ from .expected import (
 from .golden import golden
 from .manual import change_image, overwrite, pod_template, requested_by, wait_restored
 from .namespace import Namespace
-from .running import CLUSTER, NAMESPACE
 from .staterepo import StateRepo, demandops
 from .timing import Table
 

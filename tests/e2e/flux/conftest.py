@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from tests.e2e.common.expected import NODES, WITHOUT_DEMANDS
+from tests.e2e.common.expected import CLUSTER, NODES, WITHOUT_DEMANDS
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import CLUSTER, running, worlds
+from tests.e2e.common.running import running, worlds
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 

@@ -13,8 +13,8 @@ import pytest
 import yaml
 from demandops.staterepo.pull_request.helm import HELM_BIN
 
+from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.golden import golden
-from tests.e2e.common.running import NAMESPACE
 from tests.e2e.common.steps import (
     test_the_server_does_look,
     test_the_server_takes_every_golden_manifest,
@@ -227,13 +227,13 @@ class TestCheck:
                 "{{- end }}\n{{- include",
                 "{{- include",
                 "error: appdefs/object-detection-fusion/charts/object-detection/templates/"
-                "service.yaml: ",
+                "service.yaml:",
             ),
             (
                 "appdefs/charts/ros-service/templates/_deployment.yaml",
                 ".Values.replicas | int",
                 ".Values.replicas | nonsense",
-                "error: appdefs/charts/ros-service/templates/_deployment.yaml: line ",
+                "error: appdefs/charts/ros-service/templates/_deployment.yaml:",
             ),
             (
                 f"{DETECTION}/templates/service.yaml",

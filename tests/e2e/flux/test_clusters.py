@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from tests.e2e.common import expected
-from tests.e2e.common.expected import NODES, STEPS, VEHICLES, WITHOUT_DEMANDS
-from tests.e2e.common.running import CLUSTER, NAMESPACE, running
+from tests.e2e.common.expected import CLUSTER, NAMESPACE, NODES, STEPS, VEHICLES, WITHOUT_DEMANDS
+from tests.e2e.common.running import running
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 

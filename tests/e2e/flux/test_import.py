@@ -16,8 +16,7 @@ import pytest
 import yaml
 
 from tests.e2e.common.access import access_file, limited
-from tests.e2e.common.expected import WITHOUT_DEMANDS, after
-from tests.e2e.common.running import CLUSTER, NAMESPACE
+from tests.e2e.common.expected import CLUSTER, NAMESPACE, WITHOUT_DEMANDS, after
 from tests.e2e.common.staterepo import environment
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Manifest, build_manifest

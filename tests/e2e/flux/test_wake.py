@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from tests.e2e.common import expected
 from tests.e2e.common.access import access_file, limited
-from tests.e2e.common.expected import WITHOUT_DEMANDS
-from tests.e2e.common.running import CLUSTER
+from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
 from tests.e2e.common.timing import Table
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report

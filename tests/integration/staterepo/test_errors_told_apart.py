@@ -9,15 +9,18 @@ import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import git as gitpython
 import pygit2
 import pytest
 from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import Runtime
 from demandops.service import Generator
 from demandops.staterepo import reader
+from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import (
     DiskFull,
     PushDenied,
+    RemoteAway,
     StateRepository,
     disk_error,
 )
@@ -25,6 +28,7 @@ from demandops.staterepo.git.tree import commit_of
 from pygit2 import Oid, Repository
 
 from tests.kit import rig
+from tests.kit.cli import Run
 from tests.kit.limits import files_end_at
 from tests.kit.repo import git, tip
 from tests.kit.rig import Person, Stages, goal
@@ -296,19 +300,42 @@ def test_a_damaged_clone_is_made_anew(
     rig.assert_sound(bare)
 
 
+@pytest.mark.parametrize("name", ["HEAD", "config"])
 def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
-    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
+    """Without the clone's configuration, git says that ``origin`` is no repository."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
-        head = generator._slot.folder / "clone.git" / "HEAD"
-        away = head.rename(head.with_name("HEAD.away"))
+        file = generator._slot.folder / "clone.git" / name
+        away = file.rename(file.with_name("away"))
         ticket = generator.submit(goal(2))
-        rig.wait_until(lambda: f"its clone {head.parent} cannot be read" in caplog.text, "it says")
+        rig.wait_until(lambda: f"its clone {file.parent} cannot be read" in caplog.text, "it says")
         assert not ticket.future.done()
-        away.rename(head)
+        away.rename(file)
         assert rig.receipt(ticket).outcome == "booked"
     rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (
+            "warning: unable to access 'config': Permission denied\n"
+            "fatal: unknown error occurred while reading the configuration files",
+            "warning: unable to access 'config': Permission denied",
+        ),
+        ("!\tabc:refs/heads/main\t[remote rejected] (bad pack)", "bad pack"),
+    ],
+    ids=["unreadable-file", "server-lost-the-pack"],
+)
+def test_a_failure_of_a_disk_is_no_refusal_by_the_remote(
+    url: str, tmp_path: Path, words: str, reason: str
+) -> None:
+    repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
+    error = repository.push_error(gitpython.GitCommandError(["push"], 1, words.encode()))
+    assert isinstance(error, RemoteAway)
+    assert str(error) == f"{url} cannot be pushed to: {reason}"
 
 
 def test_a_demand_is_booked_although_what_was_packed_cannot_be_cleaned_up(
@@ -343,7 +370,7 @@ def test_what_people_push_beside_a_damaged_clone_is_followed(
 
 
 def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
-    bare: Path, tmp_path: Path
+    bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
     blob = rig.git(bare, "rev-parse", "main:demandops.yaml").strip()
     packs = [path.replace(tmp_path / path.name) for path in bare.glob("objects/pack/*.pack")]
@@ -360,3 +387,7 @@ def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
         f"{bare} cannot be read: missing blob {blob}; check its disk, and if "
         f"`git -C {bare} fsck` finds it broken, restore it from a backup or a clone"
     )
+    told = demandops("bookkeeping", "--state-repo", bare)
+    assert told.code == 1
+    assert f"error: {bare} cannot be read: " in told.err
+    assert "check its disk and its files" in told.err

@@ -116,8 +116,9 @@ def _everything(bare: Path) -> str:
     ("place", "change"), [(CHANGES[name][0], name) for name in CHANGES], indirect=["place"]
 )
 def test_a_change_is_honoured_without_any_demand(
-    place: str, bare: Path, person: Person, change: str
+    place: str, bare: Path, person: Person, change: str, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
     _, make, holds = CHANGES[change]
     with rig.running(place, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1), goal(2))
@@ -131,6 +132,7 @@ def test_a_change_is_honoured_without_any_demand(
         assert committer == "DemandOps generator"
         rig.book(generator, goal(3))
         assert holds(_everything(bare)), "still so after a further demand"
+    assert caplog.text.count(f"after commit {made[:12]}") == 1
     rig.assert_sound(bare)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from demandops.staterepo import reader
-from demandops.staterepo.git.address import connect
+from demandops.staterepo.git.open_repository import connect
 
 from tests.kit import rig
 from tests.kit.rig import Person

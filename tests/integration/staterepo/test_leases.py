@@ -198,7 +198,10 @@ def test_an_idle_generator_releases_what_another_process_booked(clock: Clock, ba
     rig.assert_sound(bare)
 
 
-def test_two_generators_release_once(clock: Clock, url: str, bare: Path) -> None:
+def test_two_generators_release_once(
+    clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
     with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
         rig.book(first, put("d"))
         rig.book(second, put("other", None))  # so that it knows of the first one
@@ -207,6 +210,7 @@ def test_two_generators_release_once(clock: Clock, url: str, bare: Path) -> None
         wait_until_gone(first, "d")
         wait_until_gone(second, "d")
     assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["d"]]
+    assert "the lease of 'd' has ended: released" in caplog.text
     rig.assert_sound(bare)
 
 

@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from demandops.ledger import waiting
+from demandops.service import Generator
+from demandops.staterepo.write.journal import JournalEntry
+from demandops.staterepo.write.slot import Slot
 
 from tests.kit import rig
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person
+from tests.kit.turns import Turns
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 NODES, DOMAINS = "inventory/nodes.yaml", "policy/access-domains.yaml"
@@ -88,3 +92,26 @@ def test_demands_wait_and_are_booked_in_turn_by_any_generator(
         "put", "wait", "wait", "wait", "release", "put", "release", "release", "put", "release",
     ]  # fmt: skip
     rig.assert_sound(bare)
+
+
+def test_a_lost_answer_of_a_demand_that_waits_on_is_told_again(
+    bare: Path, person: Person, tmp_path: Path
+) -> None:
+    """It changed nothing, so the next commit records it, and as waiting: not as unchanged."""
+    person.change(_with_room_for_one(bare), "One at a time")
+    turns, base = Turns(1), rig.tip(bare)
+    generator = Generator(str(bare), data=tmp_path / "first", runtime=turns)
+    goals = [_put("a"), _put("b"), _put("b"), _put("c")]
+    tickets = [generator.submit(goal, f"op-{number}") for number, goal in enumerate(goals)]
+    turns.wait(generator.stop().done)
+    outcomes = [ticket.future.result().outcome for ticket in tickets]
+    assert outcomes == ["booked", *["waiting"] * 3]
+
+    slot = Slot(tmp_path / "second")
+    received = tickets[2].received.isoformat()
+    slot.journal.append([JournalEntry("op-2", goals[2], received, base)])
+    slot.close()
+    again = Generator(str(bare), data=tmp_path / "second", runtime=turns)
+    resumed = again._demands._tickets["op-2"].future
+    turns.wait(again.stop().done)
+    assert resumed.result().outcome == "waiting"

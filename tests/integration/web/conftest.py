@@ -14,10 +14,10 @@ import yaml
 from demandops.service import Generator
 from demandops.staterepo.reader import Reader
 from demandops.web.follower import Follower
-from demandops.web.moment import Situation
 from demandops.web.site import Site
+from demandops.web.situation import Situation
 from demandops.web.views import not_ready
-from demandops.web.views.rows import Filter
+from demandops.web.views.filtered_table import Filter
 from starlette.testclient import TestClient
 
 from tests.kit import goals

@@ -15,16 +15,19 @@ from typing import Any
 import pytest
 import yaml
 from demandops.service import Generator
+from demandops.staterepo.reader import Reader
 from demandops.web import view_pages
 from demandops.web.follower import Follower
-from demandops.web.moment import Moment
+from demandops.web.site import Site
+from demandops.web.situation import Moment
 from demandops.web.views import fleet_map, map_layout
+from demandops.web.views.filtered_table import Filter
 from demandops.web.views.lists import LISTS, rows_of
-from demandops.web.views.rows import Filter
+from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import VIEWS, Look, causes
 from tests.kit import goals
-from tests.kit.generator import Proposed, book, wait_until
+from tests.kit.generator import Proposed, book, running, wait_until
 from tests.kit.repo import GitRepo, Person, away
 
 DENY = """apiVersion: demandops/v1
@@ -57,6 +60,18 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     assert "vehicle01/edge" not in look("/connections").text
     for path in VIEWS:
         look(path)
+
+
+def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state: GitRepo) -> None:
+    with running(bare) as generator:
+        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
+    state.commit({"overrides/roadworks.yaml": DENY})
+    follower = Follower(Reader.of(str(bare)), {}, 0)
+    client = TestClient(Site(follower, ("127.0.0.1",)).application, base_url="http://127.0.0.1")
+    overrides, first = client.get("/overrides"), client.get("/")
+    follower.close()
+    assert "not rendered yet" in overrides.text
+    assert "wait for a generator to carry out a person&#39;s commit" in first.text
 
 
 def test_an_invalid_file_names_who_wrote_it(
@@ -125,7 +140,7 @@ def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
         },
     )
     (row,) = look("/leases").texts("tr")[1:]
-    assert re.match(r"in (10 min|[0-9]+ s) vehicle02/cloud connection short vehicle02 600 s", row)
+    assert re.match(r"in [0-9m]+s? vehicle02/cloud connection short vehicle02 10m", row)
 
 
 def test_a_release_that_stopped_is_still_explained(booked: Generator, look: Look) -> None:

@@ -7,14 +7,15 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
+from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.health.release_health import Health
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.ledger.waiting import WaitingDemand
 from demandops.web.follower import Follower
-from demandops.web.moment import Moment, Situation
+from demandops.web.situation import Moment, Situation
 from demandops.web.views import fleet_map
+from demandops.web.views.filtered_table import Filter
 from demandops.web.views.lists import rows_of
-from demandops.web.views.rows import Filter
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
@@ -85,6 +86,14 @@ def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
     (cause,) = causes(now, follower)
     assert cause.kind == "waiting" and len(cause.releases) == len(names)
     assert cause.remedy.who == "the operator of cluster c-its"
+
+
+def test_a_cluster_with_an_old_bootstrap_file_is_a_cause(follower: Follower) -> None:
+    old = OldBootstrap("c-its", "bootstrap/c-its.yaml", ("perception",), "git show …")
+    (cause,) = causes(replace(follower.newest, old_bootstraps=(old,)), follower)
+    assert cause.what.text == "bootstrap/c-its.yaml"
+    assert cause.why == "is not applied to cluster 'c-its' as it is now"
+    assert cause.remedy.command == old.command
 
 
 def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:

@@ -7,32 +7,32 @@ from demandops.staterepo.pull_request.helm import parsed_error, parsed_kinds, pa
 
 
 @pytest.mark.parametrize(
-    ("err", "file", "field", "said"),
+    ("err", "file", "line", "said"),
     [
         (
             "Error: parse error at (camera/templates/service.yaml:7): unclosed action\n\n"
             "Use --debug flag to render out invalid YAML\n",
             "camera/templates/service.yaml",
-            "line 7",
+            7,
             "parse error at (camera/templates/service.yaml:7): unclosed action",
         ),
         (
             "Error: execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
             "camera/charts/ros-service/templates/_names.tpl",
-            "line 31",
+            31,
             "execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
         ),
         (
             "level=WARN msg=x\nError: cannot load values.yaml: error converting YAML to JSON",
             "camera",
-            "",
+            None,
             "cannot load values.yaml: error converting YAML to JSON",
         ),
     ],
 )
-def test_an_error_names_template_and_line(err: str, file: str, field: str, said: str) -> None:
+def test_an_error_names_template_and_line(err: str, file: str, line: int | None, said: str) -> None:
     fault = parsed_error(err, "camera")
-    assert (fault.file, fault.field) == (file, field)
+    assert (fault.file, fault.line) == (file, line)
     assert fault.message == f"helm says '{said}'; fix the chart or its values"
 
 

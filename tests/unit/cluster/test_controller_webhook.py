@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from demandops.cluster import access, controller_webhook
+from demandops.cluster import clusters_file, controller_webhook
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 
 from tests.kit.generator import wait_until
@@ -47,7 +47,7 @@ def test_the_signature_is_the_one_that_github_documents() -> None:
 
 
 def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
-    trigger("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     call = hook.calls[0]
     assert call.headers["X-Signature"] == by_openssl(call.body)
 
@@ -59,7 +59,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
         "clusters/other/perception/edge/b.yaml",
         "ledger/applications/aa/b/c.yaml",
     ]
-    reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    reached = clusters_file.ClusterAccess(webhook=hook.url, secret_file=secret_file)
     trigger("argocd-experiment", reached, changed)
     headers, body = hook.calls[0].headers, hook.calls[0].body
     assert headers["X-Hub-Signature-256"] == by_openssl(body)
@@ -78,7 +78,9 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
 def test_where_nothing_is_known_of_what_changed_argo_cd_looks_at_all(
     hook: Server, secret_file: Path
 ) -> None:
-    trigger("argocd-experiment", access.ClusterAccess(webhook=hook.url, secret_file=secret_file))
+    trigger(
+        "argocd-experiment", clusters_file.ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    )
     assert hook.calls[0].json()["commits"] == []
 
 
@@ -92,7 +94,7 @@ def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
         return f"{len(asked)}", []
 
     state, _ = start("argocd-experiment")
-    reached = access.ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    reached = clusters_file.ClusterAccess(webhook=hook.url, secret_file=secret_file)
     waker = ReconcileTrigger({"c-its": reached}, changed)
     try:
         hook.answer = lambda call: Answer(503)
@@ -112,7 +114,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
     hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
-    trigger("experiment", access.ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
     assert len(hook.calls) in (1, 2)  # the second, as it is closed
     assert SECRET not in caplog.text and "/hook" not in caplog.text
@@ -125,7 +127,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
 def test_the_other_controller_s_webhook_is_not_called(
     hook: Server, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
 ) -> None:
-    trigger(case, access.ClusterAccess.model_validate({other: hook.url}))
+    trigger(case, clusters_file.ClusterAccess.model_validate({other: hook.url}))
     assert hook.calls == []
     assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
 
@@ -145,6 +147,6 @@ def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, pa
 
 def test_a_repository_without_a_host_cannot_be_named() -> None:
     with pytest.raises(
-        access.NoAccess, match=r"names no host, by which .*; write https://HOST/PATH or "
+        clusters_file.NoAccess, match=r"names no host, by which .*; write https://HOST/PATH or "
     ):
         controller_webhook.web_address("file:///srv/fleet.git")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from demandops.cluster import access
+from demandops.cluster import clusters_file
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 from demandops.errors import InvalidInput
 
@@ -16,7 +16,9 @@ from tests.kit.http import Answer, Call, kubeconfig, serving
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
 
-def trigger(case: str, reached: access.ClusterAccess, changed: list[str] | None = None) -> None:
+def trigger(
+    case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
+) -> None:
     """Trigger the cluster of a golden case once; ``changed`` are the paths since the last time."""
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
@@ -29,7 +31,7 @@ def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None
     file.write_text(
         f"{HEAD}clusters: {{a: {{kubeconfig: /x}}, b: {{receiver: https://h/hook/1}}}}\n"
     )
-    clusters = access.read(file).clusters
+    clusters = clusters_file.read(file).clusters
     assert (clusters["a"].kubeconfig, clusters["b"].receiver) == (Path("/x"), "https://h/hook/1")
 
 
@@ -62,7 +64,7 @@ def test_a_file_that_cannot_be_used_is_told_with_field_and_remedy(
         secret_file.write_text(secret)
         secret_file.chmod(mode)
     with pytest.raises(InvalidInput) as caught:
-        access.read(file)
+        clusters_file.read(file)
     place = f"{file}:3" if message.startswith("clusters.") else file
     assert str(caught.value) == f"{place}: {message.replace('SECRET', str(secret_file))}"
 
@@ -112,14 +114,14 @@ def test_the_object_that_fetches_is_annotated(
     api: tuple[Path, list[tuple[str, bytes]]], case: str, path: str, annotation: bytes
 ) -> None:
     kubeconfig, heard = api
-    trigger(case, access.ClusterAccess(kubeconfig=kubeconfig))
+    trigger(case, clusters_file.ClusterAccess(kubeconfig=kubeconfig))
     assert {asked for asked, _ in heard} == {path}
     assert annotation in heard[0][1]
 
 
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
-    reached = access.ClusterAccess(receiver=url)
+    reached = clusters_file.ClusterAccess(receiver=url)
     ReconcileTrigger({"c-its": reached}, lambda since: ("", None)).close()
     assert heard == []
 
@@ -129,8 +131,8 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
 ) -> None:
     url, heard = receiver
     state, _ = start("experiment")
-    away = access.ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
-    clusters = {"away": away, "here": access.ClusterAccess(receiver=url)}
+    away = clusters_file.ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
+    clusters = {"away": away, "here": clusters_file.ClusterAccess(receiver=url)}
     waker = ReconcileTrigger(clusters, lambda since: ("", None))
     waker(state.config)
     waker.close()

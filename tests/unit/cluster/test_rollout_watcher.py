@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from demandops.cluster.access import ClusterAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health.release_health import ClusterDomain, Target
 from demandops.cluster.rollout_watcher import RolloutWatcher
 

@@ -26,6 +26,7 @@ VERSIONS = "registry/versions.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
 V1 = "- id: vehicle01\n"
+_FUSION = "    prefix: of\n"
 FOLDER = f"    folder: {CHART}\n"
 
 
@@ -201,7 +202,11 @@ _EDITS: dict[str, tuple[str, str, str]] = {
     "a shared service that does not exist": (
         APPDEF, "services:\n", "uses:\n  lidar-driver: {cloud: point_cloud}\nservices:\n",
     ),
-    "a node for a service of each topic": (APPDEF, "prefix: od\n", "prefix: od\n    place: {}\n"),
+    "a node for a service at its sources": (
+        APPDEF,
+        "prefix: od\n",
+        "prefix: od\n    placement: source\n    place: {}\n",
+    ),
     "a source for an application": (APPDEF, "prefix: of\n", "prefix: of\n    placement: source\n"),
     "an output that does not exist": (
         APPDEF, "object-detection.object_list", "object-detection.objects",
@@ -283,6 +288,22 @@ MISTAKES: dict[str, Mapping[str, str | None]] = {
     **{name: scaled(scaling) for name, scaling in _SCALING.items()},
     "a size of a shared service by a parameter that does not exist": shared(
         ("scope", "scaling: {sizes: {parameter: size, replicas: {s: 1}}}\nscope")
+    ),
+    "properties of two types, and a service that asks for another": edited(
+        NODES,
+        V1,
+        "- {id: new, type: edge, cluster: c-its, properties: {ros: 2}}\n"
+        f"  {V1}    properties: {{memoryGiB: 8, ros: jazzy}}\n",
+    )
+    | edited(APPDEF, _FUSION, f"{_FUSION}    place: {{properties: {{memoryGiB: a, ros: yes}}}}\n"),
+    "values that no property can have": edited(
+        NODES, V1, f"{V1}    properties: {{ros: [jazzy], memory GiB: 8, ram: .inf, os: ''}}\n"
+    ),
+    "bounds that nothing meets": edited(
+        APPDEF,
+        _FUSION,
+        f"{_FUSION}    place:\n"
+        "      properties: {a: {min: 8, max: 7}, b: {least: 1}, c: {min: x}}\n",
     ),
     # several places or files
     "a chart without metadata": {f"{CHART}/Chart.yaml": "version: [\n"},

@@ -120,7 +120,7 @@ def test_the_list_of_the_documentation_is_taken() -> None:
         (
             {"kinds": f"[{', '.join(KINDS)}]", "network": "namespace"},
             ": kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; "
-            "remove one of them",
+            "remove NetworkPolicy from kinds, or remove network",
         ),
     ],
 )
@@ -149,7 +149,7 @@ def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
         "{{- if .Values.agent }}\napiVersion: apps/v1\nkind: DaemonSet # on each node\n{{- end }}\n"
     )
     assert warned({template: text}) == [
-        f"{template}: line 3: DaemonSet is not among the kinds of access domain 'perception', "
+        f"{template}:3: DaemonSet is not among the kinds of access domain 'perception', "
         f"whose cluster refuses it if the chart renders it; add it to kinds in {DOMAINS}, or leave "
         "it out"
     ]
@@ -176,7 +176,7 @@ def test_only_what_is_rendered_counts() -> None:
     }
     assert warned(quiet) == []
     below = {f"{CHART}/charts/sub/templates/a.yml": 'kind: "DaemonSet"\n'}
-    assert warned(below)[0].startswith(f"{CHART}/charts/sub/templates/a.yml: line 1: DaemonSet is")
+    assert warned(below)[0].startswith(f"{CHART}/charts/sub/templates/a.yml:1: DaemonSet is")
 
 
 def test_what_cannot_be_known_is_said() -> None:
@@ -193,6 +193,6 @@ def test_what_cannot_be_known_is_said() -> None:
         f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among the kinds of access "
         "domain 'perception', whose cluster refuses it if the chart renders it; add it to kinds "
         f"in {DOMAINS}, or leave it out",
-        f"{CHART}/templates/any.yaml: line 1: kind '{{{{ .Values.kind }}}}' is computed; "
+        f"{CHART}/templates/any.yaml:1: kind '{{{{ .Values.kind }}}}' is computed; "
         "check yourself that its access domain allows it",
     ]

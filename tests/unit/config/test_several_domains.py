@@ -181,13 +181,13 @@ def test_a_node_that_leaves_leaves_all_its_domains() -> None:
             [{"name": "fleet"}],
             (FLEET, CITY),
             "accessDomains[0].name: 'edge' is in 'fleet' already, or 'edge@fleet' is a node; "
-            "remove one of the two",
+            "remove this, or the other",
         ),
         (
             [{"name": "city"}, {"name": "city"}],
             (FLEET, CITY),
             "accessDomains[1].name: 'edge' is in 'city' already, or 'edge@city' is a node; "
-            "remove one of the two",
+            "remove this, or the other",
         ),
         (
             [{"name": "city"}],

@@ -96,10 +96,9 @@ TOO_LARGE = [
 )
 def test_a_mistake_is_told_with_template_and_line(text: str, word: str) -> None:
     (found,) = appended(text)
-    assert found.startswith(f"{TEMPLATE}: line ")
+    assert found.startswith(f"{TEMPLATE}:{LAST}: ")
     assert word.lower() in found.lower()
     assert found.endswith("; fix the template")
-    assert f"line {LAST}" in found or "not valid YAML" in found
 
 
 @pytest.mark.parametrize(
@@ -118,7 +117,7 @@ def test_a_mistake_is_told_with_template_and_line(text: str, word: str) -> None:
 )
 def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -> None:
     (found, *_) = appended(text)
-    assert found.startswith(f"{TEMPLATE}: ")
+    assert found.startswith(f"{TEMPLATE}:")
 
 
 GROWING = (
@@ -153,7 +152,7 @@ GROWING = (
 )
 def test_what_would_run_for_ever_or_grow_is_the_templates_fault(text: str) -> None:
     (found, *_) = faults(text)
-    assert found.startswith(f"{TEMPLATE}: ")
+    assert found.startswith(f"{TEMPLATE}:")
     assert any(word in found for word in ("steps", "large", "longer", "most", "allowed", "deeper"))
 
 
@@ -172,7 +171,7 @@ def test_what_would_run_for_ever_or_grow_is_the_templates_fault(text: str) -> No
 )
 def test_nothing_random_gets_into_a_value(expression: str) -> None:
     (found,) = appended("x: {{ " + expression + " }}\n")
-    assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
+    assert found.startswith(f"{TEMPLATE}:{LAST}: ")
 
 
 def test_formats_of_usual_size_work() -> None:
@@ -189,9 +188,9 @@ def test_formats_of_usual_size_work() -> None:
 def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
     for name in ("other.yaml.j2", "../../../../etc/passwd", "/etc/passwd", "demandops.yaml"):
         (found,) = appended("{% include '" + name + "' %}\n")
-        assert found.startswith(f"{TEMPLATE}: line {LAST}: ")
+        assert found.startswith(f"{TEMPLATE}:{LAST}: ")
         assert "root:" not in found
-        assert not found.startswith(f"{TEMPLATE}: line {LAST}: {name}; "), "says not what is wrong"
+        assert not found.startswith(f"{TEMPLATE}:{LAST}: {name}; "), "says not what is wrong"
 
 
 class TestValues:
@@ -211,7 +210,7 @@ class TestValues:
     @staticmethod
     def places(found: list[str]) -> list[str]:
         assert all(one.endswith(f"; fix the template or {CHART}") for one in found)
-        assert all(one.startswith(f"{TEMPLATE}: ") for one in found)
+        assert all(one.startswith(f"{TEMPLATE}:") for one in found)
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
@@ -219,13 +218,13 @@ class TestValues:
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(
-            rf'{TEMPLATE}: values.detection.pointCloudTopic: "/prefix\"{TOPIC}\"'
+            rf'{TEMPLATE}:{LAST - 2}: values.detection.pointCloudTopic: "/prefix\"{TOPIC}\"'
         )
 
     def test_a_value_in_quotes_is_no_yaml(self) -> None:
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", '"{{ source_topic }}"')
         (found,) = faults(text)
-        assert found.startswith(f"{TEMPLATE}: line ")
+        assert found.startswith(f"{TEMPLATE}:{LAST - 2}: line ")
         assert found.endswith("; fix the template")
         assert " of the rendered text: not valid YAML: " in found
 
@@ -314,13 +313,13 @@ class TestBeforeTheFirstDemand:
     def test_a_template_that_nobody_has_demanded_is_checked(self) -> None:
         text = skeleton()[TEMPLATE] + "x: {{ nope }}\n"
         assert self.rehearsal({TEMPLATE: text}) == [
-            f"{TEMPLATE}: line {LAST}: 'nope' is undefined; fix the template"
+            f"{TEMPLATE}:{LAST}: 'nope' is undefined; fix the template"
         ]
 
     def test_all_templates_are_checked_together(self) -> None:
         other = TEMPLATE.replace("detection.yaml", "fusion.yaml")
         change = {path: skeleton()[path] + "x: {{ nope }}\n" for path in (TEMPLATE, other)}
-        assert [found.split(": ")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
+        assert [found.split(":")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
 
     def test_what_is_laid_down_passes(self) -> None:
         try_configuration(State.of(load(configuration()), Ledger()))

@@ -7,8 +7,9 @@ from itertools import combinations
 import pytest
 import yaml
 
-from tests.kit.config import brokers
-from tests.kit.goals import application, connection, goal, perception
+from tests.kit.config import brokers, skeleton
+from tests.kit.connections import IMAGES, ROS_IMAGE, WAN
+from tests.kit.goals import application, connection, goal, perception, put
 from tests.kit.memory import MemoryRepo
 
 
@@ -103,3 +104,19 @@ def test_every_pair_of_odd_requesters_makes_its_own_demand() -> None:
         books.send(goal([application(who=pair)]))
     demands = {claim.demand for claim in books.state.ledger}
     assert len(demands) == len(list(combinations(texts, 2)))
+
+
+def test_a_derived_ros_connection_has_the_message_type_of_the_input() -> None:
+    inventory = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
+    for node in inventory["nodes"]:
+        node.update(WAN if node["id"] == "edge" else {})
+    files = {"inventory/nodes.yaml": yaml.safe_dump(inventory)}
+    books = MemoryRepo(files | {IMAGES: skeleton()[IMAGES] + ROS_IMAGE})
+    app = {"id": "edge/typed", "type": "object-detection-fusion", "node": "edge", "connect": "ros"}
+    topic = {"topic": "/points", "source": "vehicle00", "type": "sensor_msgs/msg/PointCloud2"}
+    app["inputs"] = {"point_cloud": [topic]}  # type: ignore[assignment]
+    for outcome in ("booked", "unchanged"):
+        sent = books.send(put("typed", "me", applications=[app], connections=[]))
+        assert sent.outcome == outcome
+    (claim,) = (one for one in books.state.ledger if not one.is_on_application)
+    assert [route.type for route in claim.connection.topics] == [topic["type"]]

@@ -134,7 +134,7 @@ def joined_claims(draw: st.DrawFn) -> Claim:
     return claim.with_holders(claim.held, holders)
 
 
-@examples(100)
+@examples(50)
 @given(claims | joined_claims())
 def test_every_claim_survives_its_file(claim: Claim) -> None:
     path, text = claim_file.path_of(claim.key), claim_file.text_of(claim)

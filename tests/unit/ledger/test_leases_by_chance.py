@@ -78,7 +78,7 @@ def assert_recorded(world: running.World, promises: Promises) -> None:
             assert claim.lease.until <= end <= claim.lease.expires_at
 
 
-@examples(60)
+@examples(30)
 @given(chances, st.integers(1, 16))
 def test_what_was_promised_is_kept(random: Random, length: int) -> None:
     world, promises, maker = running.World(EMPTY, FILES), Promises(SLACK_S), Maker(random)

@@ -104,7 +104,7 @@ def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> 
     return named and f"'{subject}'" in text and text.endswith(f" for {who}")
 
 
-@examples(60)
+@examples(25)
 @given(chances, st.integers(1, 14))
 def test_bookkeeping_files_and_outcomes_are_the_models_after_every_request(
     random: Random, length: int
@@ -163,7 +163,7 @@ def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> Non
     assert taken.changes.not_held == ()
 
 
-@examples(20)
+@examples(10)
 @given(chances, st.integers(0, 6), st.integers(0, 6))
 def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: int) -> None:
     maker = Maker(random)
@@ -192,7 +192,7 @@ def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: i
     assert with_guest.files == without.files
 
 
-@examples(20)
+@examples(10)
 @given(chances, st.integers(1, 8))
 def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, count: int) -> None:
     maker, repo = Maker(random, calm=True), MemoryRepo()
@@ -205,7 +205,7 @@ def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, coun
     assert repo.files == MemoryRepo().files
 
 
-@examples(14)
+@examples(8)
 @given(chances, st.integers(2, 6))
 def test_the_order_of_independent_demands_does_not_matter(random: Random, count: int) -> None:
     maker = Maker(random, calm=True)
@@ -230,7 +230,7 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     assert one.files == other.files
 
 
-@examples(28)
+@examples(14)
 @given(chances, st.integers(1, 8))
 def test_a_further_requester_changes_no_release(random: Random, length: int) -> None:
     maker, repo = Maker(random), MemoryRepo()

@@ -43,7 +43,7 @@ class Following:
         return len(found)
 
 
-@examples(40)
+@examples(20)
 @given(chances, st.integers(1, 20))
 def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
     """One change at a time, or several at once."""

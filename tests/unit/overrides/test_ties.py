@@ -9,15 +9,15 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
-from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile, Selector, merge_patch
-from demandops.config.override_conflicts import (
+from demandops.config.checks.override_conflicts import (
     can_meet,
     contested_effects,
     patches_commute,
     patterns_overlap,
 )
+from demandops.config.config import Config
+from demandops.config.load import load
+from demandops.config.override import Override, OverrideFile, Selector, merge_patch
 from demandops.config.policy import matches
 from demandops.plan.overrides.claim_overrides import Traits, fits
 from demandops.plan.overrides.release_overrides import apply_effects, effects_on
@@ -87,7 +87,7 @@ selector = fields.filter(bool).map(Selector.model_validate)
 
 
 @given(st.lists(selector, min_size=1, max_size=2), st.lists(selector, min_size=1, max_size=2))
-@examples(150)
+@examples(60)
 def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Selector]) -> None:
     if can_meet(one, other, config()):
         return
@@ -129,7 +129,7 @@ patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
 
 
 @given(patch, patch, patch)
-@examples(150)
+@examples(60)
 def test_patches_that_commute_give_the_same_in_either_order(
     target: dict[str, Any], one: dict[str, Any], other: dict[str, Any]
 ) -> None:
@@ -184,7 +184,7 @@ def _release() -> ServiceRelease:
 
 
 @given(effects, effects)
-@examples(150)
+@examples(60)
 def test_what_is_not_contested_is_the_same_in_either_order(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:

@@ -48,9 +48,11 @@ class Origin(NamedTuple):
 class Graphs:
     """Two types of applications of services that read each other, made by chance."""
 
-    def __init__(self, random: Random, place: Mapping[str, Any] | None = None) -> None:
-        """Make them; some services for applications have what ``place`` has."""
-        self.random, self._place = random, dict(place or {})
+    def __init__(
+        self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
+    ) -> None:
+        """Make them; some services have what ``place`` has, with ``each`` those for topics too."""
+        self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
         self.files: dict[str, str | None] = {**brokers("edge")}
         roles = [Origin(role, frozenset({role}), "source") for role in ROLES]
@@ -142,6 +144,8 @@ class Graphs:
             read = [each, *self._chosen(more)]
             service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
             service |= {"each": "in0", "placement": "source" if at_source else "application"}
+            if self._places_each and not at_source and self.random.random() < 0.5:
+                service |= copy.deepcopy(self._place)
             self._add(type, name, "topic", at_source, read)
         self._appdefs[type]["services"][name] = service
 
@@ -187,13 +191,15 @@ class Demands:
             return head | {"operation": "release"}
         ids = self.random.sample(sorted(self.where), self.random.randint(1, 2))
         for id in ids:
-            others = {
-                app["id"] for other, apps in self.held.items() if other != demand for app in apps
-            }
-            if id not in others:
+            if id not in self.others(head):
                 self.where[id] = self.random.choice(NODES)
         self.held[demand] = [self._application(id) for id in ids]
         return head | {"applications": self.held[demand]}
+
+    def others(self, goal: dict[str, Any]) -> set[str]:
+        """Return the applications that demands other than that of a goal hold."""
+        others = (apps for demand, apps in self.held.items() if demand != goal["demand"])
+        return {app["id"] for apps in others for app in apps}
 
     def _application(self, id: str) -> dict[str, Any]:
         inputs = defaultdict(list)
@@ -284,7 +290,7 @@ def in_clusters(files: Mapping[str, str]) -> dict[str, str]:
     return {path: text for path, text in files.items() if path.startswith("clusters/")}
 
 
-@examples(30)
+@examples(20)
 @given(chances, st.integers(1, 8))
 def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carried(
     random: Random, length: int

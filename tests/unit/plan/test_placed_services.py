@@ -42,6 +42,17 @@ MOST = 2
 PLACE = {"place": {"capabilities": ["gpu"]}, "requests": {"slot": 1}}
 
 
+class Naming(Demands):
+    """Demands that name the nodes of some services."""
+
+    def _application(self, id: str) -> dict[str, Any]:
+        app = super()._application(id)
+        services = self.graphs.services[app["type"]].items()
+        names = [name for name, one in services if one["scope"] == "application"]
+        chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
+        return app | {"services": {name: self.random.choice(NODES) for name in chosen}}
+
+
 def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
     """Return the configuration with slots on some nodes, in another order each time."""
     nodes = [
@@ -71,7 +82,9 @@ def assert_sound(repo: MemoryRepo, demands: Demands) -> None:
     placed = services(repo)
     for app in apps:
         for name, definition in repo.config.services[app["type"]].items():
-            assert (name in placed[app["id"]]) is bool(definition.place)
+            assert name in placed[app["id"]] or not definition.place
+        for name, node in app.get("services", {}).items():
+            assert placed[app["id"]][name] == node
     running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
     wanted = {k for app in apps for k in instances(demands.graphs, app, placed[app["id"]])}
     assert running == wanted
@@ -93,8 +106,8 @@ def assert_sound(repo: MemoryRepo, demands: Demands) -> None:
 def test_services_that_are_placed_fit_stay_and_leave_drained_nodes(
     random: Random, length: int
 ) -> None:
-    graphs = Graphs(random, PLACE)
-    demands = Demands(random, graphs)
+    graphs = Graphs(random, PLACE, each=length > 4)
+    demands = Naming(random, graphs) if length > 4 else Demands(random, graphs)
     repo = MemoryRepo(graphs.files)
     plain = repo.config
     for _ in range(length):
@@ -109,8 +122,10 @@ def test_services_that_are_placed_fit_stay_and_leave_drained_nodes(
             assert isinstance(same, Refused) and str(same) == str(taken)
             assert {fault.code for fault in taken.faults} <= {"no-room", "capacity", "conflict"}
             demands.held, demands.where = held
+        alone = {app["id"] for app in goal.get("applications", ())} - demands.others(goal)
         for id, nodes in services(repo).items():
-            assert nodes == before.get(id, nodes), "what runs is not moved by a demand"
+            named = id in alone and isinstance(demands, Naming)
+            assert named or nodes == before.get(id, nodes), "what runs is not moved by a demand"
         assert_sound(repo, demands)
         node = random.choice(NODES)
         configure(repo, with_gpus(plain, random, node))
@@ -217,3 +232,12 @@ def test_a_deployment_request_has_its_services_placed_and_is_told_what_is_not_ca
     decision = repo.send(goal(apps=[application("app", ego=[("/ego", "vehicle00")], clouds=[])]))
     assert decision.placed == (f"{WHY}'cloud', the only node that fits",)
     assert any("no connection carries" in text and "'cloud'" in text for text in decision.warnings)
+
+
+def test_a_service_at_its_sources_has_no_node_that_a_demand_names() -> None:
+    services = {"services": {"object-detection": {"placement": "source"}}}
+    config = load(configuration(config={f"appdefs/{TYPE}/appdef.yaml": services}))
+    repo, named = MemoryRepo(state=State.of(config, Ledger())), {"object-detection": "edge"}
+    refused = repo.take(DEMAND | {"applications": [APP | {"services": named}]})
+    assert isinstance(refused, Refused)
+    assert "services.object-detection: object-detection runs at its sources" in str(refused)

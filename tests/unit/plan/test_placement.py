@@ -12,7 +12,9 @@ import pytest
 import yaml
 from demandops.config.config import Config
 from demandops.config.inventory import Node, Position
+from demandops.config.load import load
 from demandops.config.policy import AccessDomain, Rule
+from demandops.decision import Decision, State
 from demandops.demand.application import Application, InputTopic, Requirement
 from demandops.demand.demand_request import Demanded, Put, place_in
 from demandops.ledger.ledger import Ledger
@@ -26,6 +28,7 @@ from hypothesis import strategies as st
 
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW, MemoryRepo
+from tests.scenarios.running import configuration
 
 CONFIG = MemoryRepo().config
 ROLES, LABELS, CAPABILITIES = ("edge", "cloud"), ("", "a", "b"), ("gpu", "lidar")
@@ -228,3 +231,48 @@ def test_the_middle_of_all_sources_decides() -> None:
     assert "on 'edge', the nearest" in repo.decide(goal).placed[0]
     inputs["ego_data"] = [{"topic": "/ego", "source": id} for id in vehicles]
     assert "on 'cloud', the nearest" in repo.decide(goal).placed[0]
+
+
+def with_limits(random: Random) -> MemoryRepo:
+    """Return a repo in which nodes refuse demands: by a quota, for want of a broker or by rules."""
+    edges = [f"edge{number}" for number in range(random.randint(1, 5))]
+    ids = (*SOURCES, *edges)
+    kinds = {id: "vehicle" if id in SOURCES else "edge" for id in ids}
+    nodes = [{"id": id, "type": kinds[id], "cluster": "c-its"} for id in ids]
+    other = [id for id in edges if random.random() < 0.4] or ["none"]
+    peers = random.choice([[], ["*"]])
+    domains: list[dict[str, Any]] = [
+        {"name": name, "namespace": name, "rules": [{"name": "all", "peers": [*peers]}]}
+        for name in ("first", "other")
+    ]
+    domains[0]["nodes"] = [id for id in ids if id not in other]
+    domains[0]["quotas"] = {"servicesPerNode": random.randint(1, 2)}
+    domains[1]["nodes"] = other
+    brokers = [{"node": id, "host": id} for id in edges if random.random() < 0.6]
+    files = {
+        "inventory/nodes.yaml": {"nodes": nodes},
+        "inventory/brokers.yaml": {"brokers": brokers or [{"node": SOURCES[0], "host": "any"}]},
+        "policy/access-domains.yaml": {"domains": domains},
+    }
+    return MemoryRepo(state=State.of(load(configuration(config=files)), Ledger()))
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.randoms(use_true_random=False))
+def test_a_demand_is_refused_only_if_each_node_that_fits_refuses_it(random: Random) -> None:
+    repo = with_limits(random)
+    edges = [id for id, node in repo.config.nodes.items() if node.type == "edge"]
+    for number in range(5):
+        goal = asking({"role": "edge"}, demand=f"d{number}")
+        (app,) = goal["applications"]
+        role, source = random.choice(["ego_data", "point_cloud"]), random.choice(SOURCES)
+        app |= {"id": random.choice("xyz"), "inputs": {role: [{"topic": "/t", "source": source}]}}
+        named = {
+            id: repo.copy().take(goal | {"applications": [app | {"node": id}]}) for id in edges
+        }
+        takes = {id for id, taken in named.items() if isinstance(taken, Decision)}
+        taken = repo.take(goal)
+        assert isinstance(taken, Decision) is bool(takes), (str(taken), named)
+        if isinstance(taken, Decision):
+            booked = repo.state.ledger.application(app["id"])
+            assert booked is not None and booked.node in takes

@@ -40,7 +40,7 @@ def replicas(repo: MemoryRepo) -> int:
 
 
 @given(STEPS)
-@examples(30)
+@examples(15)
 def test_a_service_has_the_most_that_it_needed_in_the_time(
     steps: list[tuple[int, int | None]],
 ) -> None:

@@ -60,7 +60,7 @@ def outcome(read: Any) -> tuple[str, Any]:
 
 
 @given(data=DATA)
-@examples(200)
+@examples(100)
 def test_pyyaml_would_write_the_same(data: Any) -> None:
     written = strict_yaml.dump({"data": data})
     assert written + 'odd: "\\x01"\n' == strict_yaml.dump({"data": data, "odd": "\x01"})
@@ -68,7 +68,7 @@ def test_pyyaml_would_write_the_same(data: Any) -> None:
 
 
 @given(values=st.lists(LISTS, min_size=1, max_size=3), around=st.sampled_from(AROUND))
-@examples(200)
+@examples(100)
 def test_a_list_is_read_as_pyyaml_reads_it(values: list[list[str]], around: str) -> None:
     fields = [f"f{place}: {strict_yaml.to_json(value)}" for place, value in enumerate(values)]
     indent = "\n" + " " * (len(around.partition("{}")[0].rpartition("\n")[2]))

@@ -185,7 +185,7 @@ def of_the_first_version(*records: dict[str, object]) -> bytes:
 _AT = "2026-01-31T12:00:00"
 WAITING = {"operation": "op-1", "goal": {"id": 1}, "received": f"{_AT}+00:00", "base": ""}
 PROPOSED = {**WAITING, "operation": "op-2", "proposal": {"branch": "demand/x", "commits": ["a"]}}
-NOT_PROPOSED = ({"branch": "demand/x"}, {"branch": "demand/x", "commits": [], "brunch": ""}, "x")
+NOT_PROPOSED = ({}, {"branch": "x"}, {"branch": "x", "commits": [], "brunch": ""}, "x", "", [])
 
 
 def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:

@@ -29,7 +29,7 @@ TRAILERS = st.lists(st.tuples(KEYS, VALUES), min_size=1, max_size=6)
 
 @given(paragraphs=st.lists(st.lists(VALUES, min_size=1), min_size=1, max_size=3), trailers=TRAILERS)
 @example(paragraphs=[["Join a"]], trailers=[("Requester", value) for value in HOSTILE])
-@examples(200)
+@examples(80)
 def test_trailers_are_read_back_exactly_and_nothing_else_stands_in_the_message(
     paragraphs: list[list[str]], trailers: list[tuple[str, str]]
 ) -> None:

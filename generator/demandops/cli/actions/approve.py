@@ -8,12 +8,13 @@ import click
 
 from demandops.cli.actions.person_change import (
     confirmed,
+    known,
     reason_option,
     writable,
     yes_option,
 )
 from demandops.cli.json_output import output_option, show
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
 from demandops.cli.target import signing_option, writable_repo_option
 from demandops.errors import InvalidInput, suggestion
@@ -78,7 +79,8 @@ def approve(
         print_proposal(proposal, output)
         confirmed("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
-        author = Author(repo.operator(), REAL.now(), summary, " ".join((reason or "").split()))
+        why = " ".join((reason or "").split())
+        author = Author(known(repo.operator()), REAL.now(), summary, why)
         made = person_commit.merge(repo.repository, proposal, author)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": made.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {made.commit}"])

@@ -14,9 +14,15 @@ from demandops.cli.actions.ledger_change import (
     print_consequences,
     started_generator,
 )
-from demandops.cli.actions.person_change import confirmed, is_asked, reason_option, yes_option
+from demandops.cli.actions.person_change import (
+    confirmed,
+    is_asked,
+    known,
+    reason_option,
+    yes_option,
+)
 from demandops.cli.json_output import claim_data, output_option, show
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.output import busy, progress
 from demandops.cli.target import signing_option, writable_repo_option
 from demandops.decision import decide
@@ -26,6 +32,7 @@ from demandops.ledger.claim_changes import ClaimChange
 from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.history import authorship
+from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.load.snapshot import Snapshot
 
 
@@ -68,21 +75,26 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
       demandops decommission edge --node
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
-    by = str(authorship.operator())
-    goal = Decommission(name, kinds=chosen, by=by, reason=" ".join((reason or "").split())).goal()
+    by = authorship.operator()
+    goal = Decommission(
+        name, kinds=chosen, by=str(by), reason=" ".join((reason or "").split())
+    ).goal()
     if dry_run or is_asked(yes, output):
         row = _dry_run(goal, state_repo, output) or _row(goal, "unchanged", None, ())
         show(output, row, _lines(row, True))
         if dry_run or row["outcome"] == "unchanged":
             return
         confirmed("Continue?", yes, output)
-    row = _book(goal, state_repo, signing_key) or _row(goal, "unchanged", None, ())
+    row = _book(goal, by, state_repo, signing_key) or _row(goal, "unchanged", None, ())
     show(output, row, _lines(row, False))
 
 
-def _book(goal: dict[str, Any], state_repo: str, signing_key: Path | None) -> dict[str, Any] | None:
+def _book(
+    goal: dict[str, Any], by: Person, state_repo: str, signing_key: Path | None
+) -> dict[str, Any] | None:
     """Return the result, or None if the node is known and holds nothing; that is no error."""
     with started_generator(state_repo, signing_key) as generator:
+        known(by)
         try:
             ticket = generator.submit(goal)
             with busy("booking"):

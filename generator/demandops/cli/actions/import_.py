@@ -10,9 +10,9 @@ import click
 from demandops import strict_yaml
 from demandops.cli.actions.request import Document, book_or_show
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import errors
+from demandops.cli.output import busy, errors
 from demandops.cli.target import clusters_option, signing_option, writable_repo_option
-from demandops.cluster import access
+from demandops.cluster import clusters_file
 from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 from demandops.config.base_model import parse_file
@@ -102,7 +102,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
     """Return the custom resources of a cluster."""
-    clusters = access.read(access_file).clusters if access_file else {}
+    clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:
         known = ", ".join(one for one, way in clusters.items() if way.kubeconfig) or "none"
@@ -110,7 +110,8 @@ def _resources(access_file: Path | None, name: str, namespace: str) -> list[tupl
         raise click.UsageError(f"--cluster: {message}")
     cache = ObjectCache(name, reachable, lambda: None)
     wanted = [ObjectSelector(kind, namespace) for kind in reference_files.KINDS]
-    cache.read_once(wanted)
+    with busy(f"asking cluster '{name}'"):
+        cache.read_once(wanted)
     if problem := cache.why_unknown(wanted):
         raise InvalidInput([fault("", f"cannot be read: {problem}").within(f"cluster {name}")])
     items = [{"kind": key[0], **item} for key, item in sorted(cache.objects().items())]

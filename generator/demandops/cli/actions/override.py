@@ -22,18 +22,18 @@ from demandops.cli.actions.person_change import (
     warn_of_idle,
     writable,
 )
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
+from demandops.config.durations import seconds_of
 from demandops.config.load import is_override_name
 from demandops.config.override import OVERRIDES_ROOT, format_time, parse_time
-from demandops.config.policy import seconds_of
 from demandops.errors import InvalidInput, suggestion
 from demandops.identifiers import id_problem
 from demandops.input_file import read_input
 from demandops.plan.views.override_report import Entry
 from demandops.quoting import quoted
 from demandops.runtime import REAL
-from demandops.scaffold.written import document
+from demandops.scaffold.yaml_document import document
 from demandops.staterepo.reader import Reader
 
 
@@ -43,7 +43,7 @@ def override() -> None:
 
     \b
     Examples:
-      demandops override create calm --node edge --hold -m "Demonstration on Friday"
+      demandops override create calm --node edge --hold -m "Demonstration"
       demandops override end calm
       demandops get overrides
     """
@@ -98,9 +98,9 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 
     \b
     Examples:
-      demandops override create calm --node edge --hold -m "Demonstration on Friday"
-      demandops override create more --service tracker --replicas 2 --expires 2d -m Load
-      demandops override create later --application 'edge/*' --keep -m Tests --propose
+      demandops override create calm --node edge --hold -m Demonstration --propose
+      demandops override create more --service tracker --replicas 2 -m Load
+      demandops override create late --node edge --keep -m Tests --expires 2d
     """
     effects: dict[str, Any] = {
         "values": _values(values_file),

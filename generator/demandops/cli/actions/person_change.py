@@ -21,8 +21,8 @@ from demandops.cli.json_output import (
     release_data,
     show,
 )
-from demandops.cli.names import names_of
-from demandops.cli.output import errors
+from demandops.cli.name_completion import names_of
+from demandops.cli.output import errors, progress
 from demandops.cli.target import hint_to_pull, signing_option, writable_repo_option
 from demandops.config.base_model import parse_file
 from demandops.config.override import Override, OverrideFile
@@ -35,6 +35,7 @@ from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo import reader
 from demandops.staterepo.git.signing import Signer
+from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write import person_commit
 from demandops.staterepo.write.person_commit import Author, Published
@@ -68,6 +69,17 @@ def confirmed(question: str, yes: bool, output: str) -> None:
     """
     if is_asked(yes, output) and not click.confirm(question, err=True):
         raise click.ClickException("nothing was changed")
+
+
+def known(person: Person) -> Person:
+    """Return the author of a commit; warn if git's configuration does not name one."""
+    if not person.is_known:
+        errors.print(
+            f"warning: git does not know who you are, so this is done in the name {person}; to "
+            'change that: git config --global user.name "Your Name" and '
+            "git config --global user.email you@example.org"
+        )
+    return person
 
 
 @contextmanager
@@ -131,12 +143,13 @@ class Edit:
 
 
 def consequence(repo: Reader, edit: Edit) -> Entry:
-    """Return the effect of a new override, or the current effect of one that is removed.
+    """Return the effect of a new override, or the current effect of a removed override.
 
     Raises:
         InvalidInput: the new file is not valid.
     """
-    state = repo.last_valid_snapshot(repo.commit()).state
+    with progress("reading the ledger") as report:
+        state = repo.last_valid_snapshot(repo.commit(), report).state
     world = World(state.config, state.ledger)
     if edit.text is not None:
         override = Override.from_file(edit.name, parse_file(OverrideFile, edit.text, edit.path))
@@ -149,7 +162,7 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     """Commit the edit to main, or to a branch with a merge request; return what was published."""
     files = {edit.path: edit.text}
-    author = Author(repo.operator(), REAL.now(), edit.summary, one_line(edit.reason))
+    author = Author(known(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason))
     if not propose:
         return person_commit.commit_to_main(repo.repository, lambda _: files, author)
     branch = f"override/{edit.name}"

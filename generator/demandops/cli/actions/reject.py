@@ -7,7 +7,7 @@ import click
 from demandops.cli.actions.approve import print_proposal, proposal_named
 from demandops.cli.actions.person_change import confirmed, writable, yes_option
 from demandops.cli.json_output import output_option, show
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.target import writable_repo_option
 from demandops.staterepo.write.proposal_branch import ProposalBranches
 

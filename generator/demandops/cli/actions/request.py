@@ -130,7 +130,10 @@ def book_or_show(
 
 
 def _is_unanswered(row: dict[str, Any]) -> bool:
-    """Return whether a request has no answer yet; for one that waits for room, that is a commit."""
+    """Return whether a request has no answer yet.
+
+    A commit is the answer to a request that waits for room.
+    """
     return row["outcome"] == "waiting" and row["commit"] is None
 
 
@@ -165,8 +168,8 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
 
 def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
     """Return a refusal for each document because at least one does not parse."""
-    with reader.opened(state_repo) as repo:
-        state = repo.snapshot().state
+    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
+        state = repo.snapshot(progress=report).state
     rows = []
     for index, document in enumerate(documents):
         message = "not booked because another request of this call does not parse"

@@ -7,7 +7,7 @@ import click
 from demandops.cli.actions.override import end_override
 from demandops.cli.actions.person_change import Edit, Way, editing, selecting, selector, writable
 from demandops.cli.actions.suspend import described, name_of
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 
 
 @click.command()

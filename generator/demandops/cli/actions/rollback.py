@@ -19,6 +19,7 @@ from demandops.cli.actions.person_change import (
     confirmed,
     dry_run_option,
     is_asked,
+    known,
     reason_option,
     yes_option,
 )
@@ -77,9 +78,8 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo, only_read=False) as repo:
         to, base = repo.commit(revision), repo.commit()
-        goal = rollback_goal.goal(
-            to, drop_newer=drop_newer, reason=reason or "", who=repo.operator()
-        )
+        who = repo.operator() if dry_run else known(repo.operator())
+        goal = rollback_goal.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
         result: dict[str, Any] = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}

@@ -41,7 +41,7 @@ def suspend(
     \b
     Examples:
       demandops suspend --requester vehicle00 -m "In the workshop"
-      demandops suspend --application 'edge/*' --expires 2h -m "The edge is serviced"
+      demandops suspend --application 'edge/*' --expires 2h -m "Service"
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
     effect = {"expires": ends_at(expires), "deny": True}

@@ -13,12 +13,13 @@ from demandops.cli.json_output import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
-from demandops.render.changes.merge_preview import FileChange
+from demandops.render.changes.merge_preview import FileChange, MergePreview
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import CheckResult
 from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 
 _MOST_DIFF_LINES = 400
+_LONG_NEW_FILE = 30
 _MOST_DIFF_LINES_JSON = 20_000
 
 
@@ -155,16 +156,27 @@ def _lines(checked: CheckResult) -> Iterator[str]:
     if checked.bookkeeping:
         yield "\nbookkeeping:"
         yield from (f"  {line}" for line in entry_lines(checked.bookkeeping))
-    yield from _file_lines(consequence.files)
+    yield from _file_lines(consequence)
 
 
-def _file_lines(files: tuple[FileChange, ...]) -> Iterator[str]:
+def _file_lines(consequence: MergePreview) -> Iterator[str]:
+    """Yield the changed files and their differences, except long new files of no release."""
+    others, files = {*consequence.other_files}, consequence.files
+    new = {
+        each.path: length
+        for each in files
+        if each.before is None
+        and each.path in others
+        and (length := len((each.after or "").splitlines())) > _LONG_NEW_FILE
+    }
     if not files:
         return
     count = "1 file" if len(files) == 1 else f"{len(files)} files"
     yield f"\nthe generator will write or remove {count}:"
-    yield from (f"  {'remove' if each.after is None else 'write '} {each.path}" for each in files)
-    written = tuple(each for each in files if each.after is not None)
+    for each in files:
+        note = f" (new, {new[each.path]} lines)" if each.path in new else ""
+        yield f"  {'remove' if each.after is None else 'write '} {each.path}{note}"
+    written = tuple(each for each in files if each.after is not None and each.path not in new)
     shown, left = _bounded(written, _MOST_DIFF_LINES)
     for text in shown.values():
         yield ""

@@ -21,7 +21,7 @@ def completion(shell: str) -> None:
 
     \b
     Examples:
-      demandops completion bash > ~/.local/share/bash-completion/completions/demandops
+      demandops completion bash > /etc/bash_completion.d/demandops
       demandops completion zsh > ~/.zfunc/_demandops
       demandops completion fish > ~/.config/fish/completions/demandops.fish
     """

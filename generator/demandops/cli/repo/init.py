@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from demandops.cli.json_output import output_option, show
+from demandops.cli.output import busy
 from demandops.cli.repo import schema
 from demandops.cli.target import signing_option
 from demandops.errors import StateRepoError
@@ -75,16 +76,17 @@ def init(
             "--gitops argocd needs --url, because all its manifests name the URL from which the "
             "clusters fetch the state repo: --url https://HOST/PATH or git@HOST:PATH"
         )
-    commit = new_repo.init(
-        directory,
-        REAL.now(),
-        bare=bare,
-        gitops=gitops,
-        url=url,
-        example=example == "experiment",
-        schemas={name: schema.text(name) for name in schema.SCHEMAS},
-        signer=Signer(signing_key) if signing_key else None,
-    )
+    with busy("creating the state repo"):
+        commit = new_repo.init(
+            directory,
+            REAL.now(),
+            bare=bare,
+            gitops=gitops,
+            url=url,
+            example=example == "experiment",
+            schemas={name: schema.text(name) for name in schema.SCHEMAS},
+            signer=Signer(signing_key) if signing_key else None,
+        )
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from demandops.cli.json_output import output_option, show
+from demandops.cli.output import busy
 from demandops.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.config.load import load
 from demandops.config.registry import Image
@@ -20,7 +21,7 @@ from demandops.scaffold import new_application, new_entry, new_image
 from demandops.scaffold.new_application import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
 from demandops.settings import data_folder
 from demandops.staterepo import skeleton
-from demandops.staterepo.pull_request import worktree
+from demandops.staterepo.pull_request import edited_checkout
 
 _IMAGE = re.compile(r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:.*))?")
 _INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
@@ -210,7 +211,7 @@ def override(  # noqa: PLR0913 - as many as options
 
     \b
     Examples:
-      demandops new override calm --node edge --deny -m "Demonstration" --owner petra
+      demandops new override calm --node edge --deny -m Works --owner petra
     """
     given = {"services": services, "applications": apps, "nodes": nodes}
     select = {field: [*values] for field, values in given.items() if values}
@@ -256,7 +257,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
     \b
     Examples:
-      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:fleet
+      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
     """
     folder = data_folder("templates") / "scaffold" / "image"
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
@@ -362,14 +363,17 @@ def _lay_down(
     directory: Path, made: Callable[[Config], Files], output: str, then: list[str] | None = None
 ) -> None:
     """Write new files, but only if the whole configuration is valid with them."""
-    files, faults = worktree.files_of(directory)
-    if faults:
-        raise InvalidInput(faults)
-    known = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
-    found = made(load(known))
+    with busy("reading the state repo"):
+        files, faults = edited_checkout.files_of(directory)
+        if faults:
+            raise InvalidInput(faults)
+        known = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
+        config = load(known)
+    found = made(config)
     if strange := [path for path in found if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
-    try_configuration(State.of(load({**known, **found}), Ledger()))
+    with busy("rendering an example of each application"):
+        try_configuration(State.of(load({**known, **found}), Ledger()))
     _write(directory, found, output, [f"to check it: demandops check {directory}", *(then or [])])
 
 

@@ -14,7 +14,7 @@ from demandops.plan.views.bookkeeping import EntryChange
 from demandops.quoting import lines, one_line
 from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
 from demandops.staterepo.pull_request.merge_check import CheckResult
-from demandops.staterepo.pull_request.rendered_charts import MISSING, RenderedCharts
+from demandops.staterepo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 
 MARK = "<!-- demandops check -->"
 """The first line of every report, by which a pipeline finds its own comment."""
@@ -37,7 +37,7 @@ def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
     if charts is None:
         return
     if MISSING in charts.not_rendered.values():
-        yield f"charts not rendered: {MISSING}"
+        yield NO_HELM
         return
     if charts.rendered:
         yield (

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from demandops.cli.contexts import ContextsFile
 from demandops.cli.output import console
 from demandops.cli.repo.schema_properties import describe
-from demandops.cluster.access import AccessFile
+from demandops.cluster.clusters_file import AccessFile
 from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
 from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
 from demandops.config.override import OverrideFile

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import progress
+from demandops.cli.output import Progress, busy
 from demandops.cli.target import signing_option, writable_repo_option
 from demandops.render.gitops.controller_switch import Step
 from demandops.runtime import REAL
@@ -65,16 +66,29 @@ def upgrade(
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
     now = REAL.now()
     signer = Signer(signing_key) if signing_key and not dry_run else None
-    with progress("reading the ledger") as report:
-        if dry_run or asks:
+    if dry_run or asks:
+        with _shown() as report:
             made = upgrading.plan(state_repo, request, now, report)
-        if asks and not dry_run and made.handover.before:
-            show(output, None, _step_lines("before this, on the clusters:", made.handover.before))
-            if not click.confirm("Is this done?"):
-                raise click.ClickException("nothing was changed; do this first, or give --yes")
-        if not dry_run:
+    if asks and not dry_run and made.handover.before:
+        show(output, None, _step_lines("before this, on the clusters:", made.handover.before))
+        if not click.confirm("Is this done?"):
+            raise click.ClickException("nothing was changed; do this first, or give --yes")
+    if not dry_run:
+        with _shown() as report:
             made = upgrading.upgrade(state_repo, request, now, report, signer)
     show(output, _data(made, dry_run), _lines(made, dry_run))
+
+
+@contextmanager
+def _shown() -> Iterator[Progress]:
+    """Show which files of the ledger are read, and then that everything is rendered."""
+    with busy("reading the state repo") as say:
+
+        def report(done: int, total: int) -> None:
+            read = f"reading the ledger, {done} of {total} files"
+            say(read if done < total else "rendering everything")
+
+        yield report
 
 
 def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import click
 
 from demandops import strict_yaml
 from demandops.cli.json_output import Json, output_formats, print_json, show
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.output import at_option, errors, painted, progress, warn_of, warn_of_not_rendered
 from demandops.cli.table import Table
 from demandops.cli.target import state_repo_option

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
@@ -17,15 +18,14 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.output import version_lines
 from demandops.cli.table import Cell, Column
-from demandops.cli.times import relative
 from demandops.cli.views.proposal_list import proposals
+from demandops.config.durations import duration_text, relative
 from demandops.config.override import parse_time
 from demandops.demand.lease import Lease
-from demandops.ledger.world import World
 from demandops.plan.views import demand_list, node_list, release_causes
 from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.override_report import Entry, affected_releases, override_report
-from demandops.render.gitops.paths import path_of
+from demandops.plan.views.override_report import override_report
+from demandops.render.changes.override_state import override_state
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
 
@@ -135,14 +135,6 @@ def _overrides(source: Source) -> list[Json]:
         }
         for entry in override_report(source.snapshot.state, source.now)
     ]
-
-
-def override_state(entry: Entry, world: World, not_rendered: Collection[str]) -> str:
-    """Return the state of an override; one whose files are not written yet is not in force."""
-    if entry.state != "in force" or not not_rendered:
-        return entry.state
-    paths = {path_of(one) for one in affected_releases(entry, world)}
-    return "not rendered yet" if paths & {*not_rendered} else entry.state
 
 
 def _when(time: str | None, now: datetime) -> str:
@@ -284,7 +276,7 @@ KINDS: dict[str, Kind] = {
         lambda item, now: (
             item["name"],
             ", ".join(item["requesters"]),
-            f"{item['lease']['seconds']} s",
+            duration_text(item["lease"]["seconds"]),
             _lease_text(item["lease"], now).removeprefix("ends "),
             _absolute_time(item["lease"]["until"]),
             [*item["applications"], *item["connections"]],
@@ -316,9 +308,10 @@ KINDS: dict[str, Kind] = {
             str(len(item["releases"])),
             ", ".join(item["requesters"]),
             item["capabilities"],
+            [f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()],
             item["releases"],
         ),
-        (Column("Capabilities"), Column("Names of releases")),
+        (Column("Capabilities"), Column("Properties"), Column("Names of releases")),
         {
             "node": _key("name"),
             "requester": _key("requesters"),

@@ -10,11 +10,11 @@ from typing import Any
 import click
 
 from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.output import busy
 from demandops.cli.table import Column, Table
 from demandops.cli.target import state_repo_option
-from demandops.cli.times import relative
+from demandops.config.durations import relative
 from demandops.config.override import parse_time
 from demandops.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.quoting import quoted

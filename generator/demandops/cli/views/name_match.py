@@ -44,7 +44,7 @@ class Match:
 
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
-    """Return the object that a name identifies; raise if it fits none, or several."""
+    """Return the object that a name identifies; raise if the name fits none, or several."""
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
@@ -93,13 +93,15 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 
 
 def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Iterator[Match]:
-    """Yield what a name may mean that no release, application or connection has."""
+    """Yield the meanings of a name that is no release, application or connection."""
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
     if found is not None:
         yield found
     elif kind in (None, "release") and (running := _release_with(name, world)):
         yield Match("release", running.name, path_of(running), running)
+    elif kind in (None, "demand") and (begun := _demand_from(name, world)):
+        yield Match("demand", begun)
     elif kind in (None, "demand") and demand_commits(repo, snapshot, name):
         yield Match("demand", name)
     elif kind in (None, "release"):
@@ -107,7 +109,7 @@ def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> I
 
 
 def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield what has this name, other than releases, applications and connections."""
+    """Yield everything of this name except releases, applications and connections."""
     config = world.config
     if ("demand", name) in world.ledger.index:
         yield Match("demand", name)
@@ -136,13 +138,19 @@ def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator
         yield Match("release", name, repo.release_path(name, commit) or "")
 
 
-def _only(part: str, names: list[str]) -> str:
+def _demand_from(start: str, world: World) -> str | None:
+    """Return the only demand whose id begins with ``start``, or None; raise if several do."""
+    found = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(start))
+    return _only(start, found, "demands have {} at the start of their id") if found else None
+
+
+def _only(part: str, names: list[str], what: str = "releases have {} in their name") -> str:
     if len(names) == 1:
         return names[0]
     listed = ", ".join(names[:_MOST_LISTED])
     more = ", …" if len(names) > _MOST_LISTED else ""
     raise StateRepoError(
-        f"{len(names)} releases have {quoted(part)} in their name; give more of it: {listed}{more}"
+        f"{len(names)} {what.format(quoted(part))}; give more of it: {listed}{more}"
     )
 
 

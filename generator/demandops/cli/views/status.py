@@ -20,12 +20,13 @@ from demandops.cli.output import (
 )
 from demandops.cli.table import Column, Table
 from demandops.cli.target import clusters_option, state_repo_option
-from demandops.cluster import access
+from demandops.cluster import clusters_file
 from demandops.cluster.bootstrap_status import OldBootstrap, old_bootstraps
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import ReleaseStatus, statuses
+from demandops.config.durations import duration_text
 from demandops.errors import suggestion
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.views.missing_inputs import MissingInput, missing_inputs
@@ -36,9 +37,8 @@ from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.reader import Reader
 
 _SHORT = 10
-
-
 _POLL_S = 2.0
+_PATIENCE_S = 10
 
 
 @click.command()
@@ -57,16 +57,30 @@ _POLL_S = 2.0
     callback=duration,
     help="How long --wait waits: 90s, 10m or 1h30m.",
 )
+@click.option(
+    "--request-timeout",
+    metavar="DURATION",
+    default=duration_text(_PATIENCE_S),
+    show_default=True,
+    callback=duration,
+    help="How long a cluster may take to answer. All are asked at once.",
+)
 @output_option
 def status(
-    state_repo: str, access_file: Path | None, wait: bool, timeout: int, output: str
+    state_repo: str,
+    access_file: Path | None,
+    *,
+    wait: bool,
+    timeout: int,
+    request_timeout: int,
+    output: str,
 ) -> None:
     """Show the state of each release on its cluster.
 
     That is the commit that the cluster has applied, and the health of the release. The exit code
     is 1 if a file is invalid or waits for a generator, or if a cluster with a kubeconfig in
-    --clusters has an old bootstrap file or a release that is not healthy. A cluster without one is
-    unknown, which is no fault.
+    --clusters does not answer, has an old bootstrap file or a release that is not healthy. A
+    cluster without one is unknown, which is no fault.
 
     \b
     Examples:
@@ -74,19 +88,21 @@ def status(
       demandops status --wait --timeout 5m
       demandops status -o json
     """
-    clusters = access.read(access_file).clusters if access_file else {}
+    clusters = clusters_file.read(access_file).clusters if access_file else {}
     if wait and not any(cluster.kubeconfig for cluster in clusters.values()):
         raise click.UsageError(
             "--wait needs --clusters FILE with a kubeconfig: without one the state is unknown"
         )
     with reader.opened(state_repo) as repo:
-        found = Status.of(repo, clusters)
+        found = Status.of(repo, clusters, request_timeout)
         if wait:
-            found = _healthy(repo, clusters, found, timeout)
+            found = _healthy(repo, clusters, found, timeout, request_timeout)
     show(output, found.data(), found.text())
     warn_of_not_rendered(found.not_rendered)
     for missing in dict.fromkeys((one.application, one.reason) for one in found.missing_inputs):
         errors.print(f"warning: application '{missing[0]}': {missing[1]}")
+    for name, reason in found.unreadable.items():
+        errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
     for name in clusters.keys() - found.clusters:
         errors.print(
             f"warning: --clusters: no release runs on a cluster '{name}'"
@@ -100,7 +116,11 @@ def status(
 
 
 def _healthy(
-    repo: Reader, clusters: Mapping[str, access.ClusterAccess], found: Status, timeout: int
+    repo: Reader,
+    clusters: Mapping[str, clusters_file.ClusterAccess],
+    found: Status,
+    timeout: int,
+    patience_s: int,
 ) -> Status:
     """Wait until all releases are healthy or the time has passed; return the last status."""
     end, told = REAL.monotonic() + timeout, ""
@@ -110,7 +130,7 @@ def _healthy(
             told = amiss
         REAL.sleep(_POLL_S)
         repo.refresh()
-        found = Status.of(repo, clusters)
+        found = Status.of(repo, clusters, patience_s)
     return found
 
 
@@ -125,16 +145,24 @@ class Status:
     not_rendered: frozenset[str]
     old_bootstraps: tuple[OldBootstrap, ...]
     missing_inputs: tuple[MissingInput, ...]
+    unreadable: Mapping[str, str]
+    """Cluster → why it cannot be read."""
 
     @classmethod
-    def of(cls, repo: Reader, clusters: Mapping[str, access.ClusterAccess]) -> Status:
-        """Return the current status of all releases."""
+    def of(
+        cls,
+        repo: Reader,
+        clusters: Mapping[str, clusters_file.ClusterAccess],
+        patience_s: int = _PATIENCE_S,
+    ) -> Status:
+        """Return the current status of all releases; wait so long for the clusters' answers."""
         problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
         targets = rollout_targets.targets_of_state(snapshot.state)
         domains = rollout_targets.domains_of_state(snapshot.state)
-        stores = _read(clusters, {*domains, *(target.domain for _, target in targets)})
+        wanted = _wanted({*domains, *(target.domain for _, target in targets)})
+        stores = _read(clusters, wanted, patience_s)
         old = tuple(old_bootstraps(domains, stores, repo.file_reader(str(snapshot.commit))))
         commit = str(snapshot.commit)
         ledger = without_suspended(snapshot.state).ledger
@@ -145,20 +173,24 @@ class Status:
         ]
         missing = tuple(missing_inputs(snapshot.state))
         known = frozenset(snapshot.state.config.clusters)
-        return cls(commit, rows, problems, known, repo.not_rendered(snapshot), old, missing)
+        reasons = {name: store.why_unknown(wanted[name]) for name, store in stores.items()}
+        unreadable = {name: reason for name, reason in sorted(reasons.items()) if reason}
+        pending = repo.not_rendered(snapshot)
+        return cls(commit, rows, problems, known, pending, old, missing, unreadable)
 
-    def amiss(self, clusters: Mapping[str, access.ClusterAccess]) -> str:
+    def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
         """Return how many problems and unhealthy releases there are, as text; empty if none."""
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
         failing = sum(row["failing"] for row in watched)
         healthy = sum(row["health"] == "healthy" for row in watched)
-        counts = {
+        counts: dict[str, int | str] = {
             "problems in files": len(self.problems),
             "files that a generator has yet to write": len(self.not_rendered),
             "clusters with an old bootstrap file": len(self.old_bootstraps),
             "releases failing": failing,
             "releases not healthy yet": len(watched) - failing - healthy,
+            "clusters that cannot be read": ", ".join(self.unreadable),
         }
         return ", ".join(f"{what}: {count}" for what, count in counts.items() if count)
 
@@ -171,6 +203,9 @@ class Status:
             "not_rendered": sorted(self.not_rendered),
             "old_bootstraps": [asdict(each) for each in self.old_bootstraps],
             "missing_inputs": [asdict(each) for each in self.missing_inputs],
+            "unreadable": [
+                {"cluster": name, "reason": why} for name, why in self.unreadable.items()
+            ],
             "faults": faults,
         }
 
@@ -185,26 +220,36 @@ class Status:
         return [*text, releases_table(self.rows), *old, f"desired: {self.commit}"]
 
 
-def _read(
-    clusters: Mapping[str, access.ClusterAccess], domains: Iterable[ClusterDomain]
-) -> dict[str, ObjectCache]:
-    """Return the objects of each cluster; read all at once, so that none delays the others."""
+def _wanted(domains: Iterable[ClusterDomain]) -> dict[str, list[ObjectSelector]]:
+    """Return the objects to read of each cluster."""
     wanted: dict[str, dict[ObjectSelector, None]] = {}
     for domain in domains:
         watched = health_reader(domain).objects_to_watch(domain)
         wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
+    return {name: [*selectors] for name, selectors in wanted.items()}
+
+
+def _read(
+    clusters: Mapping[str, clusters_file.ClusterAccess],
+    wanted: Mapping[str, Iterable[ObjectSelector]],
+    patience_s: int,
+) -> dict[str, ObjectCache]:
+    """Return the objects of each cluster; read all at once, so that none delays the others."""
     stores = {
         name: ObjectCache(name, cluster, lambda: None)
         for name, cluster in clusters.items()
         if cluster.kubeconfig and name in wanted
     }
-    threads = [
-        REAL.start_thread(f"read-{name}", partial(store.read_once, wanted[name]))
+    threads = {
+        name: REAL.start_thread(f"read-{name}", partial(store.read_once, wanted[name]))
         for name, store in stores.items()
-    ]
+    }
+    end = REAL.monotonic() + patience_s
     with busy("asking the clusters"):
-        for thread in threads:
-            thread.join()
+        for name, thread in threads.items():
+            thread.join(max(0.0, end - REAL.monotonic()))
+            if thread.is_alive():
+                stores[name].give_up(f"it did not answer within {duration_text(patience_s)}")
     return stores
 
 

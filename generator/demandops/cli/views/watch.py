@@ -17,7 +17,7 @@ from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cli.views.kinds import KINDS, Source
 from demandops.cli.views.log import log_table
 from demandops.cli.views.status import Status, releases_table
-from demandops.cluster import access
+from demandops.cluster import clusters_file
 from demandops.errors import StateRepoError
 from demandops.runtime import REAL
 from demandops.staterepo import reader
@@ -48,7 +48,7 @@ def watch(state_repo: str, access_file: Path | None) -> None:
     from rich.live import Live  # noqa: PLC0415 - only here
     from rich.text import Text  # noqa: PLC0415
 
-    clusters = access.read(access_file).clusters if access_file else {}
+    clusters = clusters_file.read(access_file).clusters if access_file else {}
     try:
         with reader.opened(state_repo) as repo, Live(screen=True, auto_refresh=False) as live:
             away = ""
@@ -65,7 +65,9 @@ def watch(state_repo: str, access_file: Path | None) -> None:
         return
 
 
-def _screen(repo: Reader, clusters: Mapping[str, access.ClusterAccess], away: str) -> list[str]:
+def _screen(
+    repo: Reader, clusters: Mapping[str, clusters_file.ClusterAccess], away: str
+) -> list[str]:
     width, height = shutil.get_terminal_size()
     now = REAL.now()
     status = Status.of(repo, clusters)

@@ -10,7 +10,7 @@ import click
 
 from demandops.cli.output import errors, progress
 from demandops.cli.target import clusters_option, state_repo_option
-from demandops.cluster import access
+from demandops.cluster import clusters_file
 from demandops.runtime import REAL
 from demandops.service.timing.polling import parse_interval
 from demandops.staterepo.reader import Reader
@@ -57,7 +57,7 @@ def web(state_repo: str, listen: str, access_file: Path | None, interval: float)
       demandops web
       demandops web --listen 127.0.0.1:8081 --clusters clusters.yaml
     """
-    clusters = access.read(access_file).clusters if access_file else {}
+    clusters = clusters_file.read(access_file).clusters if access_file else {}
     reader = Reader.of(state_repo)
     with progress("reading the ledger") as report:
         follower = Follower(reader, clusters, interval, progress=report)

@@ -17,7 +17,7 @@ from demandops.cli.json_output import (
     show,
     subject_data,
 )
-from demandops.cli.names import names_of
+from demandops.cli.name_completion import names_of
 from demandops.cli.output import at_option, busy
 from demandops.cli.target import state_repo_option
 from demandops.cli.views import why_text
@@ -75,9 +75,9 @@ def why(
 
     The command shows the requesters, the configuration and overrides that apply, and the commits.
     NAME is a release, or a part of its name that no other release has; the id of an application,
-    connection, demand, node or requester; or the name of an application definition or override.
-    PATH is a file below clusters/ or ledger/. For what no longer runs, the command shows the commit
-    that stopped it.
+    connection, demand, node or requester, or the start of a demand's; or the name of an application
+    definition or override. PATH is a file below clusters/ or ledger/. For what no longer runs, the
+    command shows the commit that stopped it.
 
     \b
     Examples:

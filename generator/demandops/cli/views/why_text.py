@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from demandops.cli.json_output import Json, time_text
+from demandops.config.durations import duration_text
 
 _OF_RELEASES = {"node": "runs", "appdef": "runs", "override": "applies to"}
 
@@ -45,7 +46,7 @@ def lines_of(answer: Json) -> Iterator[str]:
 
 
 def _state(answer: Json) -> str:
-    """Return what becomes of the thing, as the verb of a sentence."""
+    """Return the state of the subject as a verb: ``runs``, ``is suspended``."""
     runs, kind = answer["runs"], answer["kind"]
     if kind in ("file", "claim") and not runs:
         return "no longer exists" if answer["stopped"] else "exists"
@@ -63,9 +64,8 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
     yield "requested by"
     for claim in claims:
         lease, subject = claim["lease"], f"{claim['subject']['kind']} '{claim['subject']['id']}'"
-        until = (
-            f", lease of {lease['seconds']} s until {time_text(lease['until'])}" if lease else ""
-        )
+        until = f", lease of {duration_text(lease['seconds'])}" if lease else ""
+        until += f" until {time_text(lease['until'])}" if lease else ""
         until += ", which is over: waits for a generator" if claim["overdue"] else ""
         version = f", version {claim['version']}" if claim["version"] else ""
         yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
@@ -76,7 +76,7 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
             yield f"    its node was chosen for {required or 'no requirement'}"
         if claim["services"]:
             nodes = ", ".join(f"{name} on {node}" for name, node in claim["services"].items())
-            yield f"    its services were placed: {nodes}"
+            yield f"    services on nodes of their own: {nodes}"
         if claim["suspended_by"]:
             yield f"    suspended by {_override_text(claim['suspended_by'])}"
         if claim["kept_by"]:

@@ -1,8 +1,8 @@
 """The health of releases, from Argo CD's objects. Pure.
 
-Objects are plain data as the Kubernetes API returns them. The field names are
-those of Argo CD 3.2 (argoproj.io/v1alpha1). The status lags behind the spec. So it counts only if
-it is about the current spec: ``status.sync.comparedTo`` holds the source that it is about.
+Objects are plain data as the Kubernetes API returns them. The field names are those of Argo CD 3.2
+(argoproj.io/v1alpha1). The status lags behind the spec. So a status counts only if its
+``sync.comparedTo`` holds the source of the current spec.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demandops.cluster.health.release_health import (
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""How many objects of a failed sync a reason lists at most."""
+"""The most objects of a failed sync that a reason lists."""
 
 
 class ArgoCd(HealthReader):
@@ -99,8 +99,8 @@ def _folder_application(domain: ClusterDomain) -> ObjectName:
 def _applied_commits(app: Object) -> list[str]:
     """Return the commits that an Application is known to have applied, the newest first.
 
-    If it is Synced, that is the commit that it was compared with. If commits come fast, it may
-    never be Synced, so the last successful sync of all resources counts too.
+    A Synced Application has applied the commit that it was compared with. If commits come fast, an
+    Application may never be Synced, so the last successful sync of all resources counts too.
     """
     source = (app.get("spec") or {}).get("source")
     sync, operation = _status(app, "sync"), _status(app, "operationState")
@@ -164,7 +164,7 @@ def _failure(app: Object) -> tuple[str, str]:
     synced = result.get("source")
     stale = synced and not _same(synced, (app.get("spec") or {}).get("source"))
     phase = operation.get("phase")
-    # A failed sync that will be retried has the phase Running, but also an end.
+    # A failed sync that will be retried has the phase Running and ``finishedAt``.
     if phase == "Running" and operation.get("finishedAt"):
         prefix = "its previous spec is still being retried: " if stale else ""
         return prefix + _sync_message(operation), revision

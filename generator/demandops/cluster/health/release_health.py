@@ -21,7 +21,7 @@ class ObjectName(NamedTuple):
 
 
 class ObjectSelector(NamedTuple):
-    """Selects objects of a kind: all in a namespace, or the one with this name."""
+    """Selects objects of a kind: all in a namespace, or only the object with this name."""
 
     kind: str
     namespace: str
@@ -32,7 +32,7 @@ class ObjectSelector(NamedTuple):
 class ClusterDomain:
     """An access domain on a cluster.
 
-    ``application`` is the Argo CD Application of its folder; with Flux it is ``None``.
+    ``application`` is the Argo CD Application of the domain's folder; with Flux it is ``None``.
     """
 
     cluster: str
@@ -45,7 +45,7 @@ class ClusterDomain:
 class Target:
     """A release, and whether it should run.
 
-    With ``by_helm`` it is a service, otherwise the single Deployment of a communication client.
+    With ``by_helm`` the release is a service, otherwise the Deployment of a communication client.
     """
 
     domain: ClusterDomain
@@ -58,7 +58,7 @@ class Target:
 class Health:
     """The state of a domain or a release.
 
-    ``reason`` says why it has not reached the next level, if possible in the controller's words.
+    ``reason`` says why the next level is not reached, if possible in the controller's words.
     ``object`` is the object that the reason comes from. ``failing`` says whether the reason is a
     failure.
     """
@@ -122,7 +122,7 @@ class HealthReader(ABC):
         """Return how far a domain has applied a commit."""
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return how far a cluster is with a release of a commit: applied, started or removed."""
+        """Return how far a release of a commit is on its cluster: applied, started or removed."""
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain
@@ -131,7 +131,7 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return whether a release of an applied commit runs, or is gone if it must not run."""
+        """Return whether a release is as its applied commit wants it: running, or gone."""
         key = self._key(target)
         item = objects.get(key)
         if not target.wanted:
@@ -144,7 +144,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the object that applies a domain's folder; the bootstrap file makes it."""
+        """Return the key of the object of the bootstrap file that applies a domain's folder."""
 
     @abstractmethod
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
@@ -220,7 +220,7 @@ def deployment_health(deployment: Object) -> Health:
 
 
 def why_unavailable(pods: Iterable[Any]) -> str:
-    """Return why pods do not run: a container that waits, or no node; empty if not known."""
+    """Return why pods do not run: a container waits, or no node fits; empty if not known."""
     for pod in pods:
         for container in pod.status.container_statuses or ():
             waiting = container.state.waiting if container.state else None

@@ -13,7 +13,7 @@ from demandops.config.appdef.service_definition import (
     size_problems,
 )
 from demandops.config.base_model import Approval, CamelModel, DnsLabel, FileModel, Text, Word
-from demandops.errors import suggestion
+from demandops.errors import sentences, suggestion
 
 VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]
 """What happens if demands that share an application or a service ask for different versions.
@@ -60,7 +60,7 @@ class ApplicationDefinition(FileModel):
             if role not in self.inputs
         ]
         problems += [
-            f"uses.{name}: 'services' has a service of this name too; rename that one"
+            f"uses.{name}: 'services' has a service of this name too; rename that service"
             for name in self.uses
             if name in self.services
         ]
@@ -72,5 +72,5 @@ class ApplicationDefinition(FileModel):
         if not self.services and not self.uses:
             problems.append("services: is empty; list one, or name a shared one under uses")
         if problems:
-            raise ValueError("; ".join(problems))
+            raise ValueError(sentences(problems))
         return self

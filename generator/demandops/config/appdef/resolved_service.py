@@ -50,6 +50,11 @@ class Service(Deployed):
         return not self.at_source and not self.nodes
 
     @property
+    def is_placeable(self) -> bool:
+        """Whether the service may get a node of its own: no other definition shares it."""
+        return self.scope == "application" or not (self.shared or self.at_source)
+
+    @property
     def file(self) -> str:
         """The file that defines the service."""
         return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"

@@ -10,7 +10,9 @@ from pydantic import Field, model_validator
 
 from demandops import strict_yaml
 from demandops.config.base_model import CamelModel, Positive, Word
-from demandops.config.policy import Duration, seconds_of
+from demandops.config.durations import seconds_of
+from demandops.config.policy import Duration
+from demandops.errors import sentences
 
 Count = Annotated[int, Field(ge=0, le=1000)]
 """A number of replicas."""
@@ -32,7 +34,7 @@ class Sizes(CamelModel):
     replicas: Annotated[dict[Word, Count], Field(min_length=1)]
 
     def replicas_for(self, value: object) -> int | None:
-        """Return the replicas for a parameter's value; of a list, for the largest size.
+        """Return the replicas for a parameter's value; for a list, those of its largest size.
 
         ``None`` means that the value is not a size.
         """
@@ -71,7 +73,7 @@ class Scaling(CamelModel):
     @model_validator(mode="after")
     def _consistent(self) -> Scaling:
         if problems := [*self._problems()]:
-            raise ValueError("; ".join(problems))
+            raise ValueError(sentences(problems))
         return self
 
     def _problems(self) -> Iterator[str]:
@@ -104,7 +106,7 @@ class Scaling(CamelModel):
 
     @property
     def kept_for(self) -> timedelta | None:
-        """How long a service keeps replicas that no demand needs any longer."""
+        """The time for which a service keeps replicas that no demand needs any longer."""
         return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
 
     @property

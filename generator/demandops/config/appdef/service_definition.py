@@ -1,4 +1,4 @@
-"""Services as people define them: an appdef's own, and those that several appdefs use."""
+"""Services as people define them: services of one appdef, and services that several use."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from demandops import strict_yaml
 from demandops.config.appdef.scaling import Scaling
 from demandops.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 from demandops.config.inventory import LabelKey, LabelValue, NodeId, Resources
-from demandops.errors import suggestion
+from demandops.config.node_property import AskedValue, PropertyName
+from demandops.errors import sentences, suggestion
 
 TopicPattern = Annotated[
     str,
@@ -26,11 +27,15 @@ Scope = Literal["application", "topic", "node", "cluster"]
 
 
 class Place(CamelModel):
-    """What the node of a service must have: its type, labels of its selector, capabilities."""
+    """What the node of a service must have: type, labels of its selector, capabilities, properties.
+
+    A property has a value that it must equal, or bounds of a number: ``{min: 8}``.
+    """
 
     role: Word | Literal[""] = ""
     labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
     capabilities: Items[Word] = ()
+    properties: dict[PropertyName, AskedValue] = Field(default_factory=dict)
 
 
 class Input(CamelModel):
@@ -90,11 +95,8 @@ class OwnService(Deployed):
     def _consistent(self) -> OwnService:
         if self.placement == "source" and not self.each:
             raise ValueError("placement 'source' needs 'each': an application has no single source")
-        if self.each and self.place:
-            raise ValueError(
-                "place needs a service without 'each': with it, one instance serves applications "
-                "that would choose different nodes"
-            )
+        if self.placement == "source" and self.place:
+            raise ValueError("place and placement 'source' both say where it runs; keep one")
         return self
 
 
@@ -133,7 +135,7 @@ class ServiceDefinition(Deployed, FileModel):
                 "applications that would choose different nodes"
             )
         if problems := [*size_problems(self.scaling, self.parameters)]:
-            raise ValueError("; ".join(problems))
+            raise ValueError(sentences(problems))
         return self
 
 

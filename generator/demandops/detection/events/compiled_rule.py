@@ -8,7 +8,7 @@ from fnmatch import translate
 from math import floor, hypot
 from typing import NamedTuple
 
-from demandops.config.policy import seconds_of
+from demandops.config.durations import seconds_of
 from demandops.detection.events.detection_state import Cell, Key, Observation, Who
 from demandops.detection.rules.condition import Count, Hours, Near, Threshold, Together
 from demandops.detection.rules.rule_file import Rule
@@ -60,7 +60,7 @@ class CompiledRule:
 
 
 class HoursRule(CompiledRule):
-    """A rule that holds at some hours."""
+    """A rule whose condition is met at some hours."""
 
     def __init__(self, rule: Rule, hours: Hours) -> None:
         super().__init__(rule)
@@ -96,7 +96,7 @@ class ThresholdRule(CompiledRule):
 
 
 class AreaRule(CompiledRule):
-    """A rule on the distance to an area, either of one entity or of a number of them."""
+    """A rule on an area: the distance of one entity to it, or the number of entities near it."""
 
     def __init__(self, rule: Rule, condition: Near | Count) -> None:
         super().__init__(rule)
@@ -106,7 +106,7 @@ class AreaRule(CompiledRule):
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the position and the distance, or the number of entities."""
+        """Return an entity's position and distance, or the number of entities."""
         named = self._named(subjects)
         if self.count is not None:
             return Facts({**named, "count": count}, f"{count} are there")

@@ -1,4 +1,4 @@
-"""The engine's state between two steps: who was seen where, and which events last."""
+"""The engine's state between two steps: who was seen where, and which events have not ended."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Event(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """A condition that holds since ``since``; ``lasts`` once it has held for the dwell time."""
+    """A condition that is met since ``since``; ``lasts`` is set after the dwell time."""
 
     since: float
     lasts: bool

@@ -63,7 +63,7 @@ class EngineStep:
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Do what time makes due: end dwell times, lose silent entities, follow schedules."""
+        """Apply the passing of time: end dwell times, forget silent entities, follow schedules."""
         while until >= self._due:
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
                 if at > until:
@@ -192,7 +192,7 @@ class EngineStep:
     # ---- events ----
 
     def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
-        """Start or stop a condition; if it neither starts nor stops, keep it as it is."""
+        """Start or stop a condition, or keep its state."""
         phase = self._phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")

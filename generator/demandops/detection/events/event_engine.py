@@ -10,7 +10,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from math import inf
 
-from demandops.config.policy import seconds_of
+from demandops.config.durations import seconds_of
 from demandops.detection.events.area_grid import AreaGrid
 from demandops.detection.events.compiled_rule import (
     AreaRule,

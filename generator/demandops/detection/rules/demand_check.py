@@ -32,7 +32,7 @@ def faults_of_demand(
 
     Args:
         template: the demand.
-        field: its place in the file.
+        field: the place of the demand in the file.
         subjects: the names of the entities that an event of the rule is about.
         momentary: the names of values that change; a ``Demand`` may use them, but not in its ids.
     """

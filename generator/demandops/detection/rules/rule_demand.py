@@ -1,7 +1,7 @@
 """What a rule demands: a template of a goal of one of the two actions.
 
-It makes the goals that start, renew and end a demand. It also tells which demands in the
-bookkeeping a rule has made.
+It makes the goals that start, renew and end a demand. It also finds the demands in the
+bookkeeping that a rule has made.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Goal:
 class BookedDemand:
     """A demand that the bookkeeping lists.
 
-    ``demand`` is its id, empty for one of a ``DeploymentRequest``, which has ``request``.
+    ``demand`` is its id. A demand of a ``DeploymentRequest`` has a ``request`` instead.
     """
 
     demand: str

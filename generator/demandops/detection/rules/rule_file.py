@@ -19,7 +19,8 @@ from demandops.config.base_model import (
     parse_file,
     without,
 )
-from demandops.config.policy import Duration, Patterns, matches, seconds_of
+from demandops.config.durations import seconds_of
+from demandops.config.policy import Duration, Patterns, matches
 from demandops.detection.rules.condition import Count, FieldPath, Hours, Near, Threshold, Together
 from demandops.detection.rules.demand_check import faults_of_demand
 from demandops.detection.rules.rule_demand import RuleDemand
@@ -76,7 +77,7 @@ CONDITIONS = ("near", "together", "count", "threshold", "schedule")
 class Rule(CamelModel):
     """A condition, and what is demanded while it holds.
 
-    ``entities`` limits it to entities whose names match. The condition must hold for ``dwell``
+    The rule is for entities that match ``entities``. The condition must hold for ``dwell``
     before anything is demanded. A refused demand is sent again after ``retry``. A
     ``deploymentRequest`` is repeated every ``renew``, for domains where it has a lease.
     """

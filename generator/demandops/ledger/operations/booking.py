@@ -28,8 +28,8 @@ def book(
         request: the id of the request.
         key: the key of the claim.
         current: the demand's claim on the same subject before the request.
-        now: when the request was received; a claim that only renews keeps its booking time.
-        joined: whether a join books it; a join also keeps what the current claim holds.
+        now: when the request was received; a claim that is only renewed keeps its old time.
+        joined: whether a join books the claim; a join also keeps what ``current`` holds.
     """
     claim = Claim(
         held=one.held.booked(),

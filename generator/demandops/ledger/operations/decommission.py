@@ -22,7 +22,7 @@ from demandops.subject import Subject, SubjectKind
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger without the claims of a node or requester, and the changes.
 
-    Demands that wait for this requester alone stop waiting.
+    Waiting demands whose only requester is decommissioned stop waiting.
 
     Raises:
         Refused: if the node or requester holds nothing.

@@ -2,7 +2,7 @@
 
 It takes a hold from the claim that the same request booked for the same requesters, else from the
 oldest claim in which the requester holds the topic; claims of the same request id come first. It
-never takes from claims that a demand with an id booked.
+never takes holds from claims that a demand with an id booked.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
     A shutdown that repeats one of the last 15 minutes changes nothing.
 
     Raises:
-        Refused: if the requesters hold none of them.
+        Refused: if the requesters have none of these holds.
     """
     record = RecentShutdown.of(request, now)
     repeats = ledger.shutdowns.earlier(record)
@@ -73,8 +73,8 @@ def _holds(
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
     """Yield for each listed topic its text, the claim to take holds from, and the keys to take.
 
-    The keys are those of the claim's topics that it means. The claim is ``None`` if the requester
-    holds no such topic. If no topic is listed, all holds in the first claim are taken.
+    The keys are those of the claim's topics that the listed topic means. The claim is ``None`` if
+    the requester holds none of them. If no topic is listed, all holds in the first claim are taken.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]

@@ -56,7 +56,7 @@ def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
 
 
 def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
-    """Return the field of a demand because of which an override denies it, or an empty text."""
+    """Return the field that makes an override deny ``one``, or an empty text."""
     for selector in override.select:
         for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):

@@ -36,7 +36,9 @@ def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
 
 def _claims(requester: str, before: World, after: World, domain: AccessDomain) -> Iterator[Fault]:
     most = domain.quotas.claims_per_requester
-    if most is None or after.ledger.count_of_requester(requester) <= most:  # counts all domains
+    if (
+        most is None or after.ledger.count_of_requester(requester) <= most
+    ):  # this counts the claims in all domains
         return
     count = _held(requester, after, domain)
     if count > most and count > _held(requester, before, domain):

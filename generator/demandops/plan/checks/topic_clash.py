@@ -40,9 +40,9 @@ def faults(
     """Yield a fault for each new service or route with a topic that its node has already.
 
     Args:
-        request: the demand; a release has no faults.
-        before, after: the world before and after it.
-        keys: the releases that it may change.
+        request: the demand; a request that adds no claims has no faults.
+        before, after: the world before and after the demand.
+        keys: the releases that the demand may change.
     """
     if not request.adds_claims:
         return
@@ -54,7 +54,7 @@ def faults(
         if isinstance(one.held, Connection):
             yield from _of_connection(one, one.held, before, after)
         else:
-            yield from _of_deliveries(one, one.held, after)
+            yield from _of_flows(one, one.held, after)
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
@@ -95,8 +95,8 @@ def _of_connection(
 ) -> Iterator[Fault]:
     """Yield a fault for each new route to a topic that a service publishes on the same node.
 
-    The service must have published it before the demand: if an application moves, a connection may
-    bring its output back to the old node.
+    Only a service that ran before the demand counts: if an application moves, a connection may
+    bring the application's output back to the old node.
     """
     for index, route in enumerate(connection.topics):
         _, node = route.sender_and_receiver(*connection.nodes)
@@ -114,13 +114,27 @@ def _of_connection(
             )
 
 
-def _of_deliveries(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
-    """Yield a fault for each delivered topic that its node already gets from somewhere else."""
-    for flow in flows(after.config, app) if app.deliver else ():
+def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
+    """Yield a fault for each output that the receiving node already gets from another source.
+
+    Inputs may come from several nodes: the demands say which sources they want.
+    """
+    apart = app.deliver or app.services or app.moved
+    for flow in flows(after.config, app) if apart else ():
         ids = after.ledger.connections_bringing(flow.receiver, flow.target)
-        for id in ids if flow.delivery is not None else ():
+        for id in ids if flow.delivery is not None or flow.is_output else ():
             other = after.ledger.connection(id)
-            if other is not None and {*other.nodes} != {flow.sender, flow.receiver}:
+            elsewhere = other is not None and {*other.nodes} != {flow.sender, flow.receiver}
+            if flow.delivery is None:
+                if elsewhere:
+                    message = (
+                        f"{flow.target} comes to '{flow.receiver}' by connection '{id}' already, "
+                        f"and would come from '{flow.sender}' too; choose another node for the "
+                        "service that reads it"
+                    )
+                    yield one.fault("id", message, code="conflict")
+                continue
+            if elsewhere:
                 yield one.fault(
                     f"deliver[{flow.delivery}].output",
                     f"{flow.target} comes to '{flow.receiver}' by connection '{id}' already; leave "
@@ -159,7 +173,8 @@ def _publishers(
 ) -> Iterator[ServiceKey]:
     """Yield the services on a node that publish ``topic``, except ``but``.
 
-    The patterns of appdefs tell which instances would publish it, the ledger which of them run.
+    The patterns of appdefs name the instances that would publish the topic. The ledger says which
+    of these instances run.
     """
     for services in world.config.services.values():
         for name, service in services.items():

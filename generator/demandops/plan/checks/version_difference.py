@@ -31,7 +31,7 @@ from demandops.subject import Subject
 
 _STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
 _REFUSING = ("refuse", "separate")
-"""The policies that refuse a difference. A separate instance shares nothing, so it has none."""
+"""The policies that refuse a difference. A separate instance has none: it shares nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,15 @@ class Difference:
     demanded: str
     others: str
     newer: bool
-    """Whether the demanded version is the newer one."""
+    """Whether the demanded version is newer than that of the others."""
     fault: Fault
     """The fault to report if the policy refuses the difference."""
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether a demand minds the difference; one without a version takes a newer one."""
+        """Return whether the difference concerns a demand that asks for ``asked``.
+
+        A demand that names no version accepts a newer version, unless the policy refuses it.
+        """
         return bool(asked) or self.newer or self.is_refused
 
     @property
@@ -86,9 +89,9 @@ def differences(
 
     Args:
         request: the demand.
-        before, after: the world before and after it.
-        changes: the claims that it changes.
-        plans: the releases that it may change, as they are after it.
+        before, after: the world before and after the demand.
+        changes: the claims that the demand changes.
+        plans: the releases that the demand may change, as they are afterwards.
     """
     if not request.adds_claims:
         return
@@ -107,7 +110,7 @@ def differences(
 
 
 def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
-    """Yield the difference if a claim asks for another version than the newest of the others."""
+    """Yield the difference between a claim's version and the newest of the other claims, if any."""
     app, ledger = claim.application, after.ledger
     known = after.config.application_versions[app.appdef]
     if len({known[word].rank for word in ledger.versions_asked(app.id, known)}) < 2:
@@ -141,7 +144,7 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim on a version, and the claim's name for that."""
+    """Return the requesters of the first claim on a version, and the version's name there."""
     for claim in ledger.claims_on(subject):
         word = claim.application.version
         if same_version(known.get(word, known[""]), version):

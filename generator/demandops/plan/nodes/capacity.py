@@ -1,4 +1,4 @@
-"""Capacity: how much the running services request of each node, and whether the node has it.
+"""Capacity: how much the running services request of each node, and how much the node has.
 
 Each replica of a service requests what the definition says, on the node where it runs. A shared
 service counts once. A change of :class:`Usage` looks only at the releases that a demand affects, so

@@ -1,19 +1,21 @@
 """The choice of one node: for an application, or for one of its services.
 
-A service that its definition places gets a node of its own: that of its application if it fits,
-else the first of the others.
+A placed service gets a node of its own: the application's node if that fits, else the first other
+node that fits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import fsum, inf
 from types import MappingProxyType
 
+from demandops import strict_yaml
 from demandops.config.appdef import Place, Service
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.inventory import Node, Position
+from demandops.config.node_property import asked_in, asked_texts, has_asked, problem_of
 from demandops.demand import permission
 from demandops.demand.application import Application, Requirement
 from demandops.demand.claim import Claim
@@ -25,6 +27,8 @@ from demandops.plan.overrides.claim_overrides import moved_by_overrides
 from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
+MOST_TRIED = 20
+"""On how many nodes a demand is tried; each costs as much as a booking."""
 NO_ROOM = "no-room"
 """The code of a fault: there are suitable nodes for an application, but none has room."""
 
@@ -42,15 +46,18 @@ Positions = Mapping[str, Position]
 
 
 def requirement_of(service: Service) -> Requirement:
-    """Return what a service that its definition places requires of its node."""
+    """Return what the definition of a placed service requires of the node."""
     place = service.place or Place()
     return Requirement(
-        place.role, tuple(sorted(place.labels.items())), tuple(sorted({*place.capabilities}))
+        place.role,
+        tuple(sorted(place.labels.items())),
+        tuple(sorted({*place.capabilities})),
+        tuple(sorted(asked_texts(place.properties))),
     )
 
 
 def on_node(app: Application, node: str, service: Service | None, world: World) -> Application:
-    """Return an application on a node, or with one of its services there."""
+    """Return an application moved to a node, or with only ``service`` moved to the node."""
     if service is None:
         app = replace(app, node=node)
     else:
@@ -59,15 +66,24 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
 
 
 def with_overridden_nodes(app: Application, world: World) -> Application:
-    """Return an application with its services where overrides move them."""
+    """Return an application with its services moved as overrides say."""
     return replace(app, moved=MappingProxyType(moved_by_overrides(app, world)))
+
+
+def shares(service: Service, one: Application, other: Application) -> bool:
+    """Return whether two applications share the instances of a service for each topic.
+
+    They do so at one node, in one version. What they read must come to that node in one way.
+    """
+    of = ((app.appdef, app.node, app.own_version) for app in (one, other))
+    return service.scope == "topic" and len({*of}) == 1
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
     """The choice of the node of one application, or of one of its services.
 
-    ``claims`` are the claims to book for it; their node does not matter.
+    ``claims`` are the claims to book for the application; their node does not matter.
     """
 
     one: Demanded
@@ -76,6 +92,8 @@ class Choice:
     room: Room
     claims: tuple[Claim, ...]
     service: Service | None = None
+    suits: Callable[[Application], bool] | None = None
+    """Whether the demand can be booked with the application on these nodes; by default, it can."""
 
     @property
     def config(self) -> Config:
@@ -101,6 +119,7 @@ class Choice:
         centre = self._centre(positions)
         fitting.sort(key=lambda node: self._rank(node, centre, positions))
         skipped: dict[str, None] = {}
+        tried = 0
         least: Mapping[str, int] | None = None
         for node in fitting:
             if node.capacity is not None and least is None:
@@ -111,20 +130,37 @@ class Choice:
                 skipped["that its requesters may use"] = None
             elif self._shortage(node):
                 skipped["that has room"] = None
+            elif self.suits and not self.suits(
+                on_node(self.app, node.id, self.service, self.world)
+            ):
+                skipped["on which the demand can be booked"] = None
+                tried += 1
+                if tried == MOST_TRIED:
+                    return
             else:
                 merit = self._merit(node, centre, positions)
                 which = " ".join(filter(None, (merit, " and ".join(skipped))))
                 why = f"{which} of {len(fitting)} nodes that fit"
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
 
+    def chosen(self, node: str, why: str) -> Chosen | None:
+        """Return a node as the choice, if it fits and has room."""
+        known = self.config.nodes.get(node)
+        if known is None or not self.fits(node) or self._shortage(known):
+            return None
+        return Chosen(node, why)
+
     def nodes(self) -> list[str]:
         """Return the nodes that fit and that the requesters may use, whatever room they have."""
         return [node.id for node in self._fitting() if self._is_permitted(node)]
 
     def _fitting(self) -> list[Node]:
+        required, config = self.requirement, self.config
+        traits = (*((name,) for name in required.capabilities), *required.labels)
+        pools = [config.nodes_with.get(trait, ()) for trait in traits]
         return [
             node
-            for node in self.config.nodes_by_role.get(self.requirement.role, ())
+            for node in min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
             if not any(lacks(node, self.requirement)) and not self._closed(node)
         ]
 
@@ -154,7 +190,7 @@ class Choice:
         return f"with the {'most' if choose == 'pack' else 'fewest'} applications"
 
     def _is_home(self, node: Node) -> bool:
-        """Return whether the choice is for a service, and the node is its application's."""
+        """Return whether the choice is for a service, and the node is the application's."""
         return self.service is not None and node.id == self.app.node
 
     def _rank(
@@ -204,22 +240,21 @@ class Choice:
 
     def none_fits(self, positions: Positions) -> Fault:
         """Return the fault for an application that gets no node; it lists the nearest misses."""
-        role, roles = self.requirement.role, self.config.nodes_by_role.keys() - {""}
-        if role and role not in roles:
-            message = f"no node has the role {quoted(role)}{suggestion(role, roles)}"
-            return self._fault(message, "no-node")
+        if unknown := next(unmet(self.requirement, self.config), ""):
+            return self._fault(unknown, "no-node")
         centre, code = self._centre(positions), "no-node"
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
-        for node in self.config.nodes_by_role.get(role, ()):
+        for node in self.config.nodes_by_role.get(self.requirement.role, ()):
             missing = list(lacks(node, self.requirement))
             reasons = [f"lacks {joined(missing)}"] if missing else []
             reasons += filter(None, [self._closed(node)])
             if not reasons and not self._is_permitted(node):
                 domain = self.config.domain_of[node.id].name
                 reasons.append(f"is in access domain '{domain}', which does not permit it")
+            elif not reasons and (shortage := self._shortage(node)):
+                reasons, code = shortage, NO_ROOM
             elif not reasons:
-                reasons += self._shortage(node)
-                code = NO_ROOM
+                reasons.append("is one with which the demand is refused")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))
@@ -236,17 +271,40 @@ class Choice:
         return self.one.fault("appdef", f"{self.service.name}: {message}", code=code)
 
 
+def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
+    """Yield each role and property that no node has, or that is compared with a wrong value."""
+    role, roles = requirement.role, config.nodes_by_role.keys() - {""}
+    if role and role not in roles:
+        yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
+    kinds = config.property_kinds
+    for text in requirement.properties:
+        asked = asked_in(text)
+        if asked is None:  # the form of the demand has a fault
+            continue
+        if asked.name not in kinds:
+            known = suggestion(asked.name, kinds) or f"; add it in {config.place_of(NODES_FILE)}"
+            yield f"no node has the property {quoted(asked.name)}{known}"
+        elif problem := problem_of(asked, kinds[asked.name][0]):
+            yield problem
+
+
 def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
     """Yield each part of a requirement that a node does not meet."""
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
     labels = node.labels() if requirement.labels else {}
-    for key, value in requirement.labels:
-        if labels.get(key) != value:
-            yield f"the label {quoted(f'{key}={value}')}"
+    for key, wanted in requirement.labels:
+        if labels.get(key) != wanted:
+            yield f"the label {quoted(f'{key}={wanted}')}"
     for capability in requirement.capabilities:
         if capability not in node.capabilities:
             yield f"the capability {quoted(capability)}"
+    for text in requirement.properties:
+        if not has_asked(node.properties, text):
+            asked = asked_in(text)
+            value = node.properties.get(asked.name) if asked else None
+            has = "" if value is None else f" (it has {strict_yaml.short_repr(value)})"
+            yield f"the property {quoted(text)}{has}"
 
 
 def joined(reasons: list[str]) -> str:

@@ -1,7 +1,7 @@
 """Moved connections: when an application moves, its demands' connections follow it.
 
-They bring the same topics to the new node, or take them from it, with the same type and options. A
-topic that no connection carried still has none. The reference's requests list their connections
+The connections then carry the same topics to or from the new node, with the same type and options.
+A topic without a connection still has none. The reference's requests list their connections
 themselves, so a move does not change those.
 """
 
@@ -102,7 +102,7 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 def _carried_by(flow: Flow, known: Connection | None, claim: Claim, world: World) -> Claim:
     """Return a demand's claim on the connection that carries a flow from now on.
 
-    It has the type and options of ``known``, the connection that carried the topic before.
+    The claim has the type and options of ``known``, which carried the topic before.
     """
     route = known.topics[0] if known else None
     flow = replace(flow, topic=route.read_topic) if route else flow

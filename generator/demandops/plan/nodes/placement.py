@@ -1,12 +1,12 @@
-"""Placement: the nodes of a demand's applications and services, where it does not name them.
+"""Placement: nodes for a demand's applications and services that the demand does not place.
 
-The configuration and the claims at a commit alone decide them, before the booking. The
+The configuration and the claims at a commit alone decide the nodes, before the booking. The
 claim holds the nodes as if the demand had named them, so no later stage knows the difference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import datetime, timezone
 from types import MappingProxyType
@@ -27,6 +27,7 @@ from demandops.plan.nodes.choice import (
     lacks,
     on_node,
     requirement_of,
+    shares,
     with_overridden_nodes,
 )
 from demandops.quoting import quoted
@@ -35,8 +36,12 @@ _LAST = datetime.max.replace(tzinfo=timezone.utc)
 """The booking time of a claim that is not booked yet: later than all others."""
 
 
+Trial = Callable[[DemandRequest], bool]
+"""Returns whether a request can be booked; what is not placed yet is left out of it."""
+
+
 def with_chosen_nodes(
-    request: AnyRequest, world: World, usage: Usage
+    request: AnyRequest, world: World, usage: Usage, trial: Trial | None = None
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
@@ -48,6 +53,7 @@ def with_chosen_nodes(
         request: the request.
         world: the claims and the configuration before it.
         usage: how much services request of the nodes in ``world``.
+        trial: if given, nodes with which the request cannot be booked are passed over.
 
     Returns:
         The request, and a fault for each application that gets no node.
@@ -55,9 +61,8 @@ def with_chosen_nodes(
     if not request.adds_claims:
         return request, []
     faults: list[Fault] = []
-    apps = [one.held for one in request.demanded if isinstance(one.held, Application)]
-    if any(app.place or _services_to_place(app, world) for app in apps):
-        request, faults = _placed(request, world, usage)
+    if is_placed(request, world):
+        request, faults = _placed(request, world, usage, trial)
     demanded = (
         replace(one, held=_overridden(one.held, world))
         if isinstance(one.held, Application)
@@ -67,13 +72,26 @@ def with_chosen_nodes(
     return replace(request, demanded=tuple(demanded)), faults
 
 
+def is_placed(request: DemandRequest, world: World) -> bool:
+    """Return whether a request leaves a node to the generator, or has services on other nodes."""
+    apps = (one.held for one in request.demanded if isinstance(one.held, Application))
+    return any(
+        app.place
+        or app.services
+        or _services_to_place(app, world)
+        or ((booked := world.ledger.application(app.id)) and booked.services)
+        for app in apps
+    )
+
+
 def _services_to_place(app: Application, world: World) -> list[Service]:
-    """Return the services of an application that get nodes of their own."""
-    return [one for one in world.config.services.get(app.appdef, {}).values() if one.place]
+    """Return the services of an application for which the generator chooses nodes."""
+    services = world.config.services.get(app.appdef, {}).values()
+    return [one for one in services if one.place and one.name not in app.named]
 
 
 def _overridden(app: Application, world: World) -> Application:
-    """Return an application with its services where overrides move them.
+    """Return an application with its services moved as overrides say.
 
     A booked service stays where it is: only a changed override or definition moves it.
     """
@@ -83,7 +101,9 @@ def _overridden(app: Application, world: World) -> Application:
     return with_overridden_nodes(app, world)
 
 
-def _placed(request: AnyRequest, world: World, usage: Usage) -> tuple[AnyRequest, list[Fault]]:
+def _placed(
+    request: AnyRequest, world: World, usage: Usage, trial: Trial | None
+) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with nodes, first of the applications, then of their services."""
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
@@ -92,9 +112,16 @@ def _placed(request: AnyRequest, world: World, usage: Usage) -> tuple[AnyRequest
     for one in demanded:
         if isinstance(one.held, Application) and one.held.place is None:
             room.take(_claim(request, one))
+
+    def suits(index: int) -> Callable[[Application], bool] | None:
+        if trial is None:
+            return None
+        return lambda app: trial(_so_far(request, demanded, index, app))
+
     for index, one in enumerate(demanded):
         if isinstance(one.held, Application) and one.held.place is not None:
-            choice = Choice(one, one.held.place, world, room, (_claim(request, one),))
+            claims = (_claim(request, one),)
+            choice = Choice(one, one.held.place, world, room, claims, suits=suits(index))
             placed = _with_node(request, one, choice)
             if isinstance(placed, Fault):
                 faults.append(placed)
@@ -103,16 +130,26 @@ def _placed(request: AnyRequest, world: World, usage: Usage) -> tuple[AnyRequest
                 room.take(_claim(request, placed))
     for index, one in enumerate(demanded):
         if isinstance(one.held, Application) and one.held.node:
-            demanded[index], more = _with_services(request, one, world, room)
+            demanded[index], more = _with_services(request, one, world, room, suits(index))
             faults += more
     return replace(request, demanded=tuple(demanded)), faults
 
 
+def _so_far(
+    request: DemandRequest, demanded: list[Demanded], index: int, app: Application
+) -> DemandRequest:
+    """Return what is placed of a request, with the application at ``index`` on these nodes."""
+    listed = [*demanded[:index], replace(demanded[index], held=app), *demanded[index + 1 :]]
+    placed = (one for one in listed if not isinstance(one.held, Application) or one.held.node)
+    return replace(request, demanded=tuple(placed))
+
+
 def _without_services(one: Demanded, world: World) -> Demanded:
-    """Return an application without the nodes of services that get nodes of their own."""
+    """Return an application without the nodes that are to be chosen for its services."""
     if not isinstance(one.held, Application):
         return one
     services = {service.name: "" for service in _services_to_place(one.held, world)}
+    services |= {name: one.held.services[name] for name in one.held.named}
     return replace(one, held=replace(one.held, services=MappingProxyType(services)))
 
 
@@ -151,7 +188,7 @@ def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Ch
 
 
 def _claim(request: DemandRequest, one: Demanded) -> Claim:
-    """Return the claim that books an application, as if it were booked after all others."""
+    """Return a claim on an application, dated after all others."""
     demand = request.demand or demand_id(request.id, one.requesters)
     return Claim(one.held.booked(), demand, request.id, one.requesters, _LAST)
 
@@ -171,12 +208,54 @@ def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demande
     return replace(one, held=replace(app, node=found.node), placed=(placed,))
 
 
+def _shared_node(app: Application, service: Service, world: World) -> str:
+    """Return the node of an instance that another application here shares for the same topic.
+
+    Return an empty text if there is none. A second instance would bring its outputs here twice.
+    """
+    role = service.root or ""
+    for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
+        for claim in world.ledger.claims_taking(topic.source, topic.topic):
+            other = world.ledger.application(claim.subject.id) or claim.application
+            if other.id == app.id or not shares(service, app, other):
+                continue
+            if claim.application.inputs_from(role, topic.source, topic.topic):
+                return other.chosen_node(service.name)
+    return ""
+
+
+def _named_services(one: Demanded, app: Application, world: World) -> Iterator[Fault]:
+    """Yield a fault for each service whose named node lacks what its definition asks for."""
+    for name in app.named:
+        service = world.config.services.get(app.appdef, {}).get(name)
+        node = world.config.nodes.get(app.services[name])
+        if service and node and (lacking := list(lacks(node, requirement_of(service)))):
+            message = (
+                f"{quoted(node.id)} lacks {joined(lacking)}, which place in {service.file} asks "
+                "for; name another node, or leave it out"
+            )
+            yield one.fault(f"services.{name}", message, code="no-node")
+
+
+def _contradictions(one: Demanded, app: Application, claim: Claim) -> Iterator[Fault]:
+    """Yield a fault for each service that runs on another node than the one that is named."""
+    for name in app.named:
+        current = claim.application.chosen_node(name)
+        if current != app.services[name]:
+            message = (
+                f"{quoted(app.services[name])} contradicts an existing claim: '{app.id}' is held "
+                f"by {', '.join(claim.requesters)} with {name} on '{current}'; name that node, or "
+                "use another application id"
+            )
+            yield one.fault(f"services.{name}", message, code="conflict")
+
+
 def _positions(request: DemandRequest) -> Positions:
     return request.positions if isinstance(request, Put) else {}
 
 
 def _named(choice: Choice) -> Fault | None:
-    """Return the fault if the demand names a node that lacks what it also requires."""
+    """Return the fault if the demand names a node that lacks what the demand requires."""
     node = choice.config.nodes.get(choice.app.node)
     lacking = list(lacks(node, choice.requirement)) if node else []  # admission reports no node
     if not lacking:
@@ -189,7 +268,7 @@ def _named(choice: Choice) -> Fault | None:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node of the booked application or service; ``None`` if it may get another."""
+    """Return the node of the booked application or service; ``None`` to choose another node."""
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None
@@ -215,7 +294,11 @@ def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
 
 
 def _with_services(
-    request: DemandRequest, one: Demanded, world: World, room: Room
+    request: DemandRequest,
+    one: Demanded,
+    world: World,
+    room: Room,
+    suits: Callable[[Application], bool] | None,
 ) -> tuple[Demanded, list[Fault]]:
     """Return a demanded application with its services on nodes of their own, and the faults.
 
@@ -227,17 +310,29 @@ def _with_services(
     first = claims[0].application if claims and claims[0].application.appdef == app.appdef else None
     fixed = first if request.is_reference or _of_another(claims, request.demand) else None
     if fixed is not None:
-        services = {name: node for name, node in fixed.services.items() if name in app.services}
-        one = replace(one, held=replace(app, services=MappingProxyType(services)))
+        faults += _contradictions(one, app, claims[0])
+        one = replace(one, held=replace(app, services=fixed.services))
         room.book([_claim(request, one)])
         return one, faults
+    faults += _named_services(one, app, world)
+    gone = {name for c in claims if c.demand == request.demand for name in c.application.named}
+    stay = {*world.config.services.get(app.appdef, {})} - {*app.services} - gone
+    booked = first.services if first else {}
+    kept = {name: node for name, node in booked.items() if name in stay}
+    one = replace(one, held=replace(app, services=MappingProxyType(kept | {**app.services})))
     for service in _services_to_place(app, world):
-        choice = Choice(one, requirement_of(service), world, room, (_claim(request, one),), service)
+        claims = (_claim(request, one),)
+        choice = Choice(one, requirement_of(service), world, room, claims, service, suits)
         known = first.services.get(service.name, "") if first else ""
+        shared = _shared_node(choice.app, service, world)
         found: Chosen | Fault = Chosen(known, "where it is booked already")
-        if not choice.fits(known):
+        if not known or (known != shared and not choice.fits(known)):
             positions = _positions(request)
-            found = next(choice.candidates(positions), None) or choice.none_fits(positions)
+            found = (
+                choice.chosen(shared, "where it runs for this topic already")
+                or next(choice.candidates(positions), None)
+                or choice.none_fits(positions)
+            )
         if isinstance(found, Fault):
             faults.append(found)
             continue

@@ -1,7 +1,7 @@
-"""Relocation: what was placed on a drained node, or is moved by an override, gets other nodes.
+"""Relocation: other nodes for what was placed on a drained node, or is moved by an override.
 
-Only what the generator placed leaves a drained node: a demand that names the node keeps it. What is
-required of the node is in the claims and definitions, so the demands are not needed. The
+Only what the generator placed leaves a drained node: a demand that names the node keeps it. The
+claims and definitions say what is required of the node, so the demands are not needed. The
 connections follow (:mod:`demandops.plan.nodes.moved_connections`).
 """
 
@@ -16,7 +16,7 @@ from demandops.demand import admission, permission
 from demandops.demand.application import Requirement
 from demandops.demand.claim import Claim, ClaimKey, requesters_of
 from demandops.demand.demand_request import Demanded
-from demandops.errors import Fault
+from demandops.errors import Fault, sentences
 from demandops.ledger.claim_changes import Changes, ClaimChange, claim_changes
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.conflicts import conflicts
@@ -28,8 +28,10 @@ from demandops.plan.nodes.capacity import Room, Usage
 from demandops.plan.nodes.choice import (
     Choice,
     Chosen,
+    joined,
     on_node,
     requirement_of,
+    shares,
     with_overridden_nodes,
 )
 from demandops.plan.nodes.moved_connections import Move, renaming, with_moved
@@ -52,20 +54,23 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
     room = Room(world, usage, ())
     for id in applications_of(world.ledger, request.id):
         for service in _placed_at(request.id, id, world):
-            claims = world.ledger.application_claims(id)
-            what = f"application '{id}'"
-            what = f"service '{service.name}' of {what}" if service else what
-            found: _Moved | str = next(filter(None, map(_why_fixed, claims)), "")
-            if service is not None or not found:
+            ids = _moving_with(id, service, request.id, world)
+            claims = tuple(one for each in ids for one in world.ledger.application_claims(each))
+            what = [f"application '{each}'" for each in ids]
+            what = [f"service '{service.name}' of {each}" for each in what] if service else what
+            fixed = (_why_fixed(one, request.id, service) for one in claims)
+            found: _Moved | str = next(filter(None, fixed), "")
+            if not found:
                 found = _moved(world, claims, room, service)
             if isinstance(found, str):
-                stays.append(f"{what} stays, because {found}")
+                stays.append(f"{what[0]} stays, because {found}")
                 continue
             world, chosen, touched = found
             # ``world`` has the application on its new node; ``room`` must count it there too
-            room.book(world.ledger.application_claims(id))
+            for each in ids:
+                room.book(world.ledger.application_claims(each))
             keys += touched
-            moved.append(f"{what} is placed on {quoted(chosen.node)}, {chosen.why}")
+            moved += [f"{one} is placed on {quoted(chosen.node)}, {chosen.why}" for one in what]
     moves = claim_changes(start.ledger, world.ledger, keys)
     return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays))
 
@@ -74,7 +79,7 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return what of an application was placed on a node; ``None`` stands for the application."""
+    """Return the services of an application placed on a node; ``None`` is the application."""
     app = world.ledger.application(id)
     if app is None:
         return []
@@ -85,11 +90,30 @@ def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
     return [*([None] if app.node == node else []), *services]
 
 
-def _why_fixed(claim: Claim) -> str:
-    """Return why a claim's application must stay on its node, or an empty text."""
+def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
+    """Return the applications whose service on a node must move together: they share instances."""
+    app = world.ledger.application(id)
+    if service is None or service.scope != "topic" or app is None:
+        return [id]
+    others = ((one, world.ledger.application(one)) for one in applications_of(world.ledger, node))
+    return [
+        one
+        for one, other in others
+        if other and other.services.get(service.name) == node and shares(service, app, other)
+    ]
+
+
+def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
+    """Return why a claim's application or service must stay on its node, or an empty text."""
+    app = claim.application
+    if service is not None:
+        return f"demand '{claim.demand}' names the node" if service.name in app.named else ""
     if claim.keeping_override:
         return f"the override '{claim.keeping_override}' keeps it"
-    return "" if claim.application.place else f"demand '{claim.demand}' names the node"
+    if app.place is None:
+        return f"demand '{claim.demand}' names the node"
+    here = [name for name in app.named if name not in app.services]
+    return f"demand '{claim.demand}' names the node of {joined(here)}" if here else ""
 
 
 def applications_of(ledger: Ledger, node: str) -> list[str]:
@@ -105,7 +129,7 @@ def _moved(
 ) -> _Moved | str:
     """Return the world with an application or service on the best other node, or why it stays.
 
-    The node and the keys of the changed claims come with the world.
+    Return the chosen node and the keys of the changed claims too.
     """
     required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
     required = requirement_of(service) if service else required
@@ -130,7 +154,7 @@ def _moved(
         if fault is None:
             return after, chosen, [change.key for change in changes]
         reasons.append(f"on {quoted(chosen.node)} {fault.message}")
-    return "; ".join(reasons) or choice.none_fits({}).message
+    return sentences(reasons) or choice.none_fits({}).message
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +171,7 @@ class Followed:
 
 
 def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> Followed:
-    """Return the ledger with services and their connections where overrides move them.
+    """Return the ledger with services moved as overrides say, and their connections with them.
 
     Args:
         world: the claims and the configuration.
@@ -185,7 +209,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a rollback whose claims have services where overrides now move them."""
+    """Return a rollback with the services of its claims moved as overrides now say."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims

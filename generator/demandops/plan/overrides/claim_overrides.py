@@ -1,11 +1,11 @@
-"""The effects of overrides on claims: ``deny`` suspends them, ``keep`` holds claims of its own.
+"""The effects of overrides on claims: ``deny`` suspends claims, ``keep`` books further claims.
 
-A suspended claim stays booked but is not planned. The planner reads a view of the ledger, which
-checks each claim when it is read. So there is no second ledger to keep up to date.
+A suspended claim stays booked but is not planned. The planner reads a view of the ledger that
+checks each claim on reading. So there is no second ledger to keep up to date.
 
 When the last claim on a subject is released, ``keep`` books a claim with the same content for the
-override's owner. A later demand for the subject replaces it. Because it is a claim, bookkeeping and
-history show it like any other.
+override's owner. A later demand for the subject replaces it. Bookkeeping and history show a kept
+claim like any other claim.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class UnsuspendedClaims(Ledger):
 
 
 def without_suspended(world: World) -> World:
-    """Return the world with a view of its ledger without suspended claims."""
+    """Return the world with a view of its ledger that leaves out suspended claims."""
     ledger = world.ledger
     if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in world.overrides):
         return world
@@ -191,7 +191,7 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 def with_kept_claims(
     before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
-    """Return a booking with the kept claims updated on the subjects that it changed."""
+    """Return the booking with updated kept claims on ``subjects`` and on those that it changed."""
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, more = update_kept_claims(before, after, touched, now)
@@ -201,9 +201,9 @@ def with_kept_claims(
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger with the kept claims that overrides ask for on ``subjects``, no others.
+    """Return the ledger with exactly the kept claims on ``subjects`` that overrides ask for.
 
-    The keys of the kept claims before and after come with it.
+    Return also the keys of the kept claims before and after.
 
     Args:
         before: the ledger before a change.
@@ -233,7 +233,7 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _needed(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the kept claim for a subject that no demand holds, or ``None`` if none keeps it."""
+    """Return the kept claim for a subject that no demand holds, or ``None`` if nothing keeps it."""
     for claim in existing:
         if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
             return claim

@@ -18,10 +18,10 @@ from demandops.plan.replicas import overridden
 
 
 def apply_overrides(release: Release, world: World) -> Release | None:
-    """Return a release with the effects of all overrides, or ``None`` if one denies it.
+    """Return a release changed by all overrides that select it, or ``None`` if one denies it.
 
     Raises:
-        Refused: if an override moves it to a node that is gone.
+        Refused: if an override moves the release to a node that is gone.
     """
     if not world.overrides:
         return release
@@ -33,7 +33,7 @@ def apply_overrides(release: Release, world: World) -> Release | None:
     by = []
     for override in world.overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
-        if override.node != release.node.id:  # a node is decided when claims are booked
+        if override.node != release.node.id:  # the node was chosen when the claims were booked
             effects = tuple(one for one in effects if one != "node")
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
@@ -52,7 +52,7 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release with the effects of overrides; the last one wins."""
+    """Return a release changed by the effects of overrides; the last override wins."""
     by = tuple(by)
     if not by:
         return release

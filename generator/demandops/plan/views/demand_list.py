@@ -23,7 +23,7 @@ room has no claim."""
 
 @dataclass(frozen=True, slots=True)
 class HeldDemand:
-    """A demand and what it holds. Its lease is the one of its claims that ends first."""
+    """A demand and what it holds. Its lease is the lease that ends first among its claims."""
 
     name: str
     state: State
@@ -51,7 +51,7 @@ def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
 
 
 def nodes_of(claim: Claim) -> tuple[str, ...]:
-    """Return the nodes that a claim needs, sorted: where it runs, and where its inputs are."""
+    """Return the nodes that a claim needs, sorted: its own, and the sources of its inputs."""
     held = claim.held
     if claim.is_on_application:
         sources = (topic.source for _, topic in claim.application.all_inputs())

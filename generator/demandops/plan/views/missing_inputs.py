@@ -1,7 +1,7 @@
 """Topics that applications need and that nothing brings any longer. Pure.
 
-A demand that needs a connection gets one, or is warned. Later an override may suspend it, others
-may release it, or people may take a node or an output out of the configuration.
+A demand that needs a connection gets one, or a warning. Later an override may suspend the
+connection, others may release it, or people may take a node or an output out of the configuration.
 """
 
 from __future__ import annotations

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from demandops.config.inventory import Position
+from demandops.config.node_property import PropertyValue
 from demandops.demand.claim import Claim, requesters_of
 from demandops.ledger.world import World
 from demandops.plan.release import Release
@@ -28,6 +29,7 @@ class UsedNode:
     domain: str | None
     drained: bool
     capabilities: tuple[str, ...]
+    properties: Mapping[str, PropertyValue]
     position: Position | None
     releases: tuple[str, ...]
     applications: tuple[str, ...]
@@ -56,6 +58,7 @@ def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
                 domain=domain.name if domain else None,
                 drained=bool(node and node.drained),
                 capabilities=node.capabilities if node else (),
+                properties=node.properties if node else {},
                 position=node.position if node else None,
                 releases=tuple(sorted(running[id])),
                 applications=tuple(sorted({*ids_of(claims, SubjectKind.APPLICATION)})),

@@ -17,8 +17,9 @@ from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of_claims
 
-State = Literal["in force", "held back", "expired", "matches nothing"]
-"""``held back``: another override holds every file that this override would change."""
+State = Literal["in force", "held back", "expired", "matches nothing", "not rendered yet"]
+"""``held back``: another override holds every file that this override would change. ``not rendered
+yet``: a generator has yet to write files (:mod:`demandops.render.changes.override_state`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +93,7 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
 
 
 def _is_held(release: Release, override: Override) -> bool:
-    """Return whether a hold of another override keeps this one from changing a release."""
+    """Return whether another override's hold keeps ``override`` from changing a release."""
     effects = next((effects for by, effects in release.shaping.by if by == override), ())
     return release.shaping.held and "hold" not in effects and {*effects} != {"keep"}
 

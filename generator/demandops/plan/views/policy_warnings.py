@@ -1,7 +1,7 @@
-"""Warnings about access domains and nodes, which ``demandops check`` shows.
+"""Warnings about access domains, nodes and places, which ``demandops check`` shows.
 
-They tell what the cluster will refuse, and which access it cannot prevent. They are not faults: a
-chart may render a kind only with certain values, which only Helm knows.
+They say what the cluster will refuse, and which access the cluster cannot prevent. They are not
+faults: a chart may render a kind only with certain values, which only Helm knows.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from demandops.errors import Fault, fault
 from demandops.ledger.operations.drain import Drain
 from demandops.ledger.world import World
 from demandops.plan.nodes.capacity import overcommitted, whole_usage
+from demandops.plan.nodes.choice import lacks, requirement_of, unmet
 from demandops.plan.nodes.relocation import following_overrides, with_moves
 from demandops.quoting import quoted
 
@@ -38,6 +39,7 @@ def warnings(world: World) -> Iterator[Fault]:
     yield from _connections_of_before(world)
     yield from _above_capacity(world)
     yield from _drained(world)
+    yield from _unfit_places(config)
     for path, text in following_overrides(world).stays:
         yield fault("node", text).within(path)
 
@@ -50,6 +52,25 @@ def _drained(world: World) -> Iterator[Fault]:
             file = world.config.file_of(NODES_FILE, world.config.host_of(node))
             for text in (*drain.moved, *drain.stays):
                 yield fault("", f"'{node}' is drained: {text}").within(file)
+
+
+def _unfit_places(config: Config) -> Iterator[Fault]:
+    """Yield a warning for each service whose requirements no node meets."""
+    services = {
+        (service.file, service.name): service
+        for of in config.services.values()
+        for service in of.values()
+        if service.place
+    }
+    for (file, name), service in sorted(services.items()):
+        field = "place" if service.shared else f"services.{name}.place"
+        asked = requirement_of(service)
+        problems = [*unmet(asked, config)]
+        if not problems and all(any(lacks(node, asked)) for node in config.nodes.values()):
+            problems = [f"no node in {config.place_of(NODES_FILE)} has all that it asks for"]
+        for problem in problems:
+            message = f"{problem}; demands that need '{name}' are refused"
+            yield fault(field, message).within(file)
 
 
 def _above_capacity(world: World) -> Iterator[Fault]:
@@ -127,7 +148,7 @@ def _charts(config: Config) -> Iterator[Fault]:
         for path in sorted(texts):
             name = path.removeprefix(f"{folder}/")
             if _CRDS.fullmatch(name):
-                yield from _refused(path, "", "CustomResourceDefinition", domains, config)
+                yield from _refused(path, None, "CustomResourceDefinition", domains, config)
             elif _TEMPLATE.fullmatch(name):
                 yield from _template(path, texts[path], domains, config)
 
@@ -152,7 +173,7 @@ def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
 
 def _template(path: str, text: str, domains: list[AccessDomain], config: Config) -> Iterator[Fault]:
     for match in _KIND.finditer(text):
-        value, line = match["kind"].strip(), f"line {text.count(chr(10), 0, match.start()) + 1}"
+        value, line = match["kind"].strip(), text.count("\n", 0, match.start()) + 1
         plain = _PLAIN.fullmatch(value)
         if plain:
             yield from _refused(path, line, plain[1], domains, config)
@@ -160,11 +181,11 @@ def _template(path: str, text: str, domains: list[AccessDomain], config: Config)
             message = (
                 f"kind {quoted(value)} is computed; check yourself that its access domain allows it"
             )
-            yield fault(line, message).within(path)
+            yield fault("", message, line=line).within(path)
 
 
 def _refused(
-    path: str, line: str, kind: str, domains: list[AccessDomain], config: Config
+    path: str, line: int | None, kind: str, domains: list[AccessDomain], config: Config
 ) -> Iterator[Fault]:
     for domain in domains:
         if kind not in {allowed.kind for allowed in domain.allowed_kinds}:
@@ -173,7 +194,7 @@ def _refused(
                 f"{kind} is not among the kinds of access domain '{domain.name}', whose cluster "
                 f"refuses it if the chart renders it; add it to kinds in {file}, or leave it out"
             )
-            yield fault(line, message).within(path)
+            yield fault("", message, line=line).within(path)
 
 
 def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:

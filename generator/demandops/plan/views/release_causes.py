@@ -43,7 +43,7 @@ def by_booking(claims: Iterable[Claim]) -> list[Claim]:
 
 
 def needs(claim: Claim, release: Release) -> bool:
-    """Return whether a claim on an application or connection of a release needs this release."""
+    """Return whether a claim on a release's application or connection needs the release."""
     if not isinstance(release, ServiceRelease):
         return True
     return takes(claim.application, release.service, release.key)

@@ -1,4 +1,4 @@
-"""A plan that follows a sequence of ledgers, for the proof of commits.
+"""A plan that follows a sequence of ledgers, to verify commits.
 
 Planning is a function of ledger and configuration. The plan records which parts of the ledger were
 read for each release. If none of them changes, the release stays the same; only the others are
@@ -101,7 +101,7 @@ def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
 
 @dataclass(frozen=True)
 class _RecordingKept:
-    """The kept replicas; planning reads only :attr:`steps`, whose reads are recorded."""
+    """Records reads of the kept replicas; planning reads only their :attr:`steps`."""
 
     steps: _Recording
 

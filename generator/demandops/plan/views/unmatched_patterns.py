@@ -1,4 +1,4 @@
-"""Warnings about patterns of the policy that match nothing, misspelled or outdated."""
+"""Warnings about misspelled or outdated patterns of the policy: they match nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def warnings(config: Config) -> Iterator[Fault]:
 def _patterns(
     domain: AccessDomain, config: Config
 ) -> Iterator[tuple[str, str, str, tuple[str, ...]]]:
-    """Yield (field, pattern, the kind of things that it should match, the names of these)."""
+    """Yield (field, pattern, the kind of things to match, the names of these things)."""
     own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == domain.name))
     others = tuple(sorted(config.domains.keys() - {domain.name}))
     nodes = tuple(sorted(config.nodes))

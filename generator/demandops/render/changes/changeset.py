@@ -154,7 +154,7 @@ def render_all(
 
     Args:
         keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
-        current: the generated files in the state repo; overrides may hold some of them.
+        current: the generated files in the state repo; ``hold`` overrides keep some unchanged.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.

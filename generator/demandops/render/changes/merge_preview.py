@@ -1,8 +1,8 @@
 """The releases and files that differ between two commits, or before and after a merge. Pure.
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
-may affect any release, so this module compares all. The files decide whether a release differs,
-because the clusters follow the files. The plans of both sides describe the difference.
+may affect any release, so this module compares all releases. The files decide whether a release
+differs, because the clusters follow the files. The plans of both sides describe the difference.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
 def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
     """Return the faults that keep releases from being planned or rendered.
 
-    A fault names the first of these files that exists: a claim of the release that is in
-    ``edited``, the file that has the fault, any claim of the release.
+    A fault gets the first of these files that exists: the file of a claim on the release that is in
+    ``edited``, the fault's own file, the file of any claim on the release.
     """
     faults: list[Fault] = []
     files: dict[ReleaseKey, list[str]] = {}

@@ -30,7 +30,7 @@ IN_CLUSTER = "https://kubernetes.default.svc"
 
 
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
-    """Return the name of a domain's AppProject, and of the Application over its folder."""
+    """Return the name that a domain's AppProject and the Application of its folder share."""
     return f"{repository.source}-{domain.name}"
 
 

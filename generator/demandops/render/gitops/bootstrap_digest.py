@@ -1,7 +1,8 @@
 """The digest of a bootstrap file: an annotation that says which version a cluster has. Pure.
 
 Only a person applies the file, so the cluster may have an older one. The object that applies
-an access domain's folder carries the digest, and ``demandops status`` compares it.
+an access domain's folder carries the digest. ``demandops status`` compares this digest
+with that of the file.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 from demandops import strict_yaml
@@ -19,7 +21,7 @@ _LENGTH = 16
 
 
 def with_digest(render: Callable[[str], str]) -> str:
-    """Return the file that ``render`` returns, given the digest of its objects without comments."""
+    """Return the file that ``render`` makes with its digest, which does not cover comments."""
     objects = json.dumps(list(strict_yaml.load_all(render(""))), sort_keys=True)
     return render(hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH])
 
@@ -30,6 +32,7 @@ def digest_of(item: Mapping[str, Any]) -> str:
     return str(annotations.get(ANNOTATION, ""))
 
 
+@lru_cache(maxsize=1024)  # the web page asks repeatedly
 def digest_in(text: str) -> str:
     """Return the digest in a bootstrap file, empty if it has none."""
     try:

@@ -1,8 +1,8 @@
 """The steps on the clusters when a state repo is upgraded, or switches to Flux or Argo CD.
 
 Pure: returns instructions and commands for a person. The order matters. A running controller would
-remove the workloads when its releases leave the repo, so the person stops it first. The
-person deletes its objects only after the other controller has taken over.
+remove the workloads when its releases leave the repo, so the person stops this controller first.
+The person deletes the old controller's objects only after the new controller has taken over.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class SwitchSteps:
 
 
 def switch_steps(old: Config, new: Config, changed: Container[str]) -> SwitchSteps:
-    """Return the steps to switch the controller, else those for changed bootstrap files.
+    """Return the steps to switch the controller or, without a switch, to apply bootstrap files.
 
-    No workload is deleted on the way (docs/argocd.md has the reasons).
+    The steps delete no workload (docs/argocd.md has the reasons).
 
     Args:
         old, new: the configuration before and after.

@@ -33,8 +33,8 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return the files that exist even without demands.
 
     Each cluster has a bootstrap file, with which its controller follows the repo. Each access
-    domain on it has a placeholder: Git drops empty folders, and on a missing folder Flux and Argo
-    CD fail instead of pruning.
+    domain of a cluster has a placeholder: Git drops empty folders, and on a missing folder Flux and
+    Argo CD fail instead of pruning.
     """
     if config.repo_settings.gitops == "argocd":
         return argocd.base_files(config, engine)

@@ -1,8 +1,8 @@
 """The rule by which a cluster lets pods of an access domain run only on the domain's nodes.
 
 It is an expression of the Common Expression Language over ``variables.selector``, a pod's node
-selector. For nodes with the default selector it has the patterns of the policy, so that one more
-vehicle changes nothing that a person has to apply to the cluster.
+selector. The expression matches nodes with the default selector by the patterns of the policy. So a
+new vehicle with this selector does not change the rule, which a person would have to apply.
 """
 
 from __future__ import annotations
@@ -56,4 +56,4 @@ def _has(label: str, test: str) -> str:
 
 
 def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)  # a string of the language too
+    return json.dumps(value, ensure_ascii=False)  # a JSON string is also a CEL string

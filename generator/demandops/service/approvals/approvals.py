@@ -1,7 +1,7 @@
 """The proposals that await approval, and how each one ends.
 
-It runs in the worker thread. A proposal is complete once main has its claims, by any kind of merge.
-Until then this module keeps the branch up to date, so that merging it gives what main would render.
+This code runs in the worker thread. A proposal is complete once main has its claims, by any kind of
+merge. Until then the branch is kept up to date, so that a merge gives what main would render.
 A :class:`Proposal` decides its verdict; this module carries it out.
 """
 
@@ -73,7 +73,7 @@ class Approvals:
         with_targets: bool,
         token_file: Path | None,
     ) -> None:
-        """Find the proposals of an earlier run again; ``state`` is the state of main."""
+        """Resume the proposals of an earlier run; ``state`` is the state of main."""
         self._repository, self._runtime = repository, repository.runtime
         self._demands = demands
         self._with_targets = with_targets
@@ -104,8 +104,8 @@ class Approvals:
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
         """Remove the proposals that demands of a batch release; call this before the evaluation.
 
-        Nobody can merge a proposal without its branch. If it was merged earlier, the demands are
-        evaluated on a tip that has the merge.
+        Nobody can merge a proposal without its branch. If the proposal was merged earlier, the
+        demands are evaluated on a tip that includes the merge.
 
         Raises:
             RemoteAway, PushDenied: if the branch could not be deleted.
@@ -125,7 +125,7 @@ class Approvals:
         """Withdraw those earlier demands of a batch that the demand ``by`` releases.
 
         Args:
-            earlier: their results; results of withdrawn demands are replaced.
+            earlier: the demands with results; the results of withdrawn demands are replaced.
             by: the demand that may release them.
             state: the state on which ``by`` is evaluated.
         """
@@ -189,7 +189,7 @@ class Approvals:
         return self._timer.is_due(tip, has_news=bool(self._changed) or withdrawn)
 
     def seconds_until_due(self, tip: str, longest: float) -> float:
-        """Return the seconds until the next check; ``longest`` without proposals."""
+        """Return the seconds until the next check, at most ``longest``."""
         if not self._proposals:
             return longest
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
@@ -298,7 +298,7 @@ class Approvals:
         return is_updated
 
     def _update(self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str) -> bool:
-        """Update the branch, so that merging it gives what main would render now.
+        """Update the branch, so that a merge gives what main would render now.
 
         Returns:
             False if a demand was withdrawn meanwhile and the proposal must be checked again.
@@ -375,7 +375,7 @@ class Approvals:
         self._forge.forget(proposal.branch, close=close)
 
     def _on_forge_update(self, branch: str) -> None:
-        """Check a branch again, because the forge answered; from the forge worker's thread."""
+        """Have a branch checked again, because the forge answered; runs in the forge's thread."""
         self._changed.append(branch)
         self._demands.wake()
 
@@ -388,7 +388,7 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a demand that releases something, or None if it does not."""
+    """Return the request of a demand that releases something, else None."""
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)

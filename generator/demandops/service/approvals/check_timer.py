@@ -12,7 +12,7 @@ _PAUSE_FACTOR = 9
 
 
 class CheckTimer:
-    """The times of the checks. A check that began and did not end waits for the interval."""
+    """The times of the checks. After a check that failed, the next one waits for the interval."""
 
     def __init__(self, runtime: Runtime, *, embedded: bool) -> None:
         self._runtime = runtime
@@ -21,7 +21,10 @@ class CheckTimer:
         self._began = self._rest_until = self._next = 0.0
 
     def is_due(self, tip: str, *, has_news: bool) -> bool:
-        """Return whether to check now, with main at ``tip``; always if a proposal ``has_news``."""
+        """Return whether to check now, with main at ``tip``.
+
+        With ``has_news`` a check is due at once, unless the last check failed.
+        """
         if has_news and self._checked_at is not None:
             return True
         return self.seconds_until_due(tip) <= 0
@@ -33,7 +36,7 @@ class CheckTimer:
         return due - self._runtime.monotonic()
 
     def began(self) -> None:
-        """Plan the next check, even if the one that begins now fails."""
+        """Plan the next check, in case the check that begins now fails."""
         self._began = self._runtime.monotonic()
         self._next, self._checked_at = self._began + self._interval, None
 

@@ -33,8 +33,8 @@ _PREFIX = "awaiting approval: "
 class Verdict:
     """The verdict on each demand of a proposal; some come with their decision on the current main.
 
-    ``booked``: main has their claims. ``failed``: they were withdrawn or turned down, or can no
-    longer be booked. ``free``: they no longer need approval. ``waiting``: they still do.
+    ``booked``: main has the claims. ``failed``: the demands were withdrawn or turned down, or can
+    no longer be booked. ``free``: they no longer need approval. ``waiting``: they still need it.
     """
 
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
@@ -137,7 +137,7 @@ class Proposal:
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request by one of the requesters of ``pending`` releases all of them."""
+    """Return whether a request releases all of ``pending`` and comes from one of its requesters."""
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
@@ -209,7 +209,7 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     """Return the text of a pull request with a commit's message.
 
-    A fence keeps the ids in the message, which anyone may choose, from becoming links.
+    The message is fenced, so that the ids in it, which anyone may choose, do not become links.
     """
     fence = _fence(message, 3)
     return (

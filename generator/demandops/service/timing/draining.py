@@ -27,7 +27,7 @@ class Draining:
         self._logged: dict[str, frozenset[str]] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
-        """Commit the moves of each drained node; retry later the applications that stay."""
+        """Commit the moves off each drained node; later retry the applications that stayed."""
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)

@@ -63,6 +63,9 @@ class LeaseExpiry:
             error = future.exception()
             if isinstance(error, InvalidInput):  # no client gets this error, so report it here
                 self._runtime.failed(f"end of the lease of {quoted(demand)}", error)
+            elif error is None:
+                outcome = future.result().outcome
+                log.info("the lease of %s has ended: %s", quoted(demand), outcome)
 
         ticket.future.add_done_callback(tell)
         return ticket

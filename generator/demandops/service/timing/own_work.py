@@ -28,7 +28,7 @@ class OwnWork:
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book what waited for room, if the demand decided on ``before`` gave some back."""
+        """Book what waited for room, if the demand decided on ``before`` gave room back."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
@@ -47,7 +47,7 @@ class OwnWork:
         )
 
     def seconds_until_due(self, state: State, longest: float) -> float:
-        """Return the seconds until the next end: at least one, at most ``longest``."""
+        """Return the seconds until the next check: at least one, at most ``longest``."""
         now = self._runtime.now()
         seconds = self._override_expiry.seconds_until_due(state, now, longest)
         return self._scale_down.seconds_until_due(state.ledger, now, seconds)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 
-from demandops.config.policy import seconds_of
+from demandops.config.durations import seconds_of
 from demandops.runtime import Runtime
 
 DEFAULT_INTERVAL = "30s"

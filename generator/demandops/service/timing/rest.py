@@ -8,7 +8,7 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause, twice as long after each error that follows another."""
+    """A pause after an error; each further error without a success doubles its length."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime

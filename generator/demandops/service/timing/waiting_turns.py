@@ -1,7 +1,7 @@
 """When the demands that wait for room are tried again, and in which order.
 
 When a state may have room for them, the generator tries them before it decides others. So no demand
-gets the room for which an earlier one, or one of a higher priority, was waiting.
+gets the room for which an earlier demand, or a demand of higher priority, was waiting.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class WaitingTurns:
             self._tried = commits.head.state
 
     def is_due(self, state: State) -> bool:
-        """Return whether demands wait that were not tried on this state."""
+        """Return whether any waiting demand was not tried on this state."""
         tried = self._tried
         return bool(state.ledger.waiting) and not (
             tried is not None and tried.ledger is state.ledger and tried.config is state.config

@@ -1,1 +1,1 @@
-"""Audit: commits match what ledger and configuration give, and are signed."""
+"""The audit: whether commits are signed, and match ledger and configuration."""

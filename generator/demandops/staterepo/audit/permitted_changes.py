@@ -1,4 +1,4 @@
-"""Which files a commit of the generator may change: generated files and claims that it names."""
+"""Which files a commit of the generator may change: generated files, and claims it names."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _RECORDS = tuple(
 )
 """The ledger's folders of records, which are not claims."""
 _REWRITING = ("follow", "upgrade")
-"""Operations that may write a claim anew: its lease starts, or its schema changes."""
+"""Operations that may rewrite a claim, to start its lease or to change its schema."""
 _ENDING = ("follow", "upgrade", "expire-override")
 """Operations that may add or remove the marker of an ended override."""
 
 
 def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
-    """Yield the files that a commit changed but that its message gives no reason to change.
+    """Yield the files that a commit changed without a reason in its message.
 
     These are files that people write, claims of demands that the message does not name, and claims
     that are not formatted as the generator writes them.
@@ -73,7 +73,7 @@ def _claims_named_by(entry: LogEntry) -> set[str]:
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
-    """Return whether a claim differs only in its schema, or in a lease that approval started."""
+    """Return whether a commit changed at most the schema of a claim and the start of its lease."""
     before, after = (
         ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
     )

@@ -1,10 +1,11 @@
-"""Proving commits: the generated files are those that ledger and configuration give.
+"""Proves commits: their generated files are those that ledger and configuration give.
 
 A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
-proven before it. The second way relies on object ids, and on plans and files that depend on their
-input only. It does not trust which releases the generator considered affected: it plans and renders
-every release again if any input of its plan changed (:mod:`demandops.plan.views.traced_plan`), and
-compares every file that differs in Git. The first and the last commit are proven whole.
+proven before it. The second way assumes that equal object ids mean equal files, and that plans and
+rendered files depend only on their input. It does not rely on the releases that the generator
+considered affected: it plans and renders each release again if any input of its plan changed
+(:mod:`demandops.plan.views.traced_plan`), and compares every file that differs in Git. The first
+and the last commit are proven whole.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ _CHARTS = "/_charts/"
 class Verdict:
     """Whether the generated files of a commit are those that ledger and configuration give.
 
-    ``holds`` is true if nothing is wrong, or the commit is ``skipped``. ``touched`` are files that
-    the commit changed but may not change. ``signature`` says why a required signature is not valid,
-    ``signer`` who signed.
+    ``holds`` is true if no fault was found. ``skipped`` says why the commit was not compared.
+    ``touched`` lists files that the commit changed although it may not. ``signature`` says why a
+    required signature is not valid. ``signer`` names who signed.
     """
 
     commit: str
@@ -74,7 +75,7 @@ class _Proof:
         self._render(())
 
     def is_reconfigured(self, commit: Commit) -> bool:
-        """Return whether configuration, ended overrides or the problem report changed."""
+        """Return whether a commit changes configuration, ended overrides or the problem report."""
         roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
         return trees.differ(self._commit.tree, commit.tree, roots)
 
@@ -134,7 +135,7 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each commit, oldest first; with ``whole``, load and render each whole."""
+    """Yield a verdict on each commit, oldest first; with ``whole``, prove each commit whole."""
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
@@ -144,7 +145,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
             yield verdict
             continue
         verdict = replace(verdict, touched=tuple(sorted(disallowed_files(commit, entry))))
-        before, proof = proof, None  # it stays None if the commit cannot be read
+        before, proof = proof, None  # proof stays None if the commit cannot be read
         try:
             if whole or place == len(commits) or entry.first("In-Force"):
                 differing = _differing_whole(commit, _loaded(repo, entry))
@@ -168,7 +169,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
 
 
 class _Unreadable(Exception):
-    """Raised when a commit cannot be proven because one of its files is not valid."""
+    """Raised when a commit cannot be verified because one of its files is not valid."""
 
 
 def _loaded(repo: Repository, entry: LogEntry) -> State:
@@ -179,7 +180,7 @@ def _loaded(repo: Repository, entry: LogEntry) -> State:
 
 
 def _differing_whole(commit: Commit, state: State) -> tuple[str, ...]:
-    """Return the differing files of a commit, rendered whole without results of another one."""
+    """Return the files in which a commit differs from its rendering as a whole."""
     before = trees.parent_tree(commit) if _holds(state) else None
     held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
     wanted = {path: _blob(text) for path, text in rendered_files(state, held).items()}

@@ -16,12 +16,12 @@ _ROOT_FILE = "demandops.yaml"
 
 
 def is_checkout(folder: Path) -> bool:
-    """Return whether a folder has the files of a state repo and belongs to Git."""
+    """Return whether a folder is a Git checkout of a state repo."""
     return (folder / ".git").exists() and (folder / _ROOT_FILE).is_file()
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the checkout of a state repo that a folder is in, or None."""
+    """Return the checkout of a state repo to which a folder belongs, or None."""
     return next((one for one in (folder, *folder.parents) if is_checkout(one)), None)
 
 
@@ -35,7 +35,7 @@ def origin_of(checkout: Path) -> str | None:
 
 
 class Checkout(LocalRepository):
-    """A checkout: its newest commit is the one that is checked out, whatever its branch."""
+    """A checkout: its tip is the commit that is checked out, on any branch."""
 
     main_reference = "HEAD"
     branches = "refs/remotes/origin/"

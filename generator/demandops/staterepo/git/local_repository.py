@@ -24,7 +24,7 @@ from demandops.staterepo.git.repository import (
 )
 
 _STALE_LOCK_S = 5.0
-"""Git holds a branch's lock for milliseconds. If one is this old, a killed process left it."""
+"""Git locks a branch for milliseconds. A killed process left a lock that is older than this."""
 
 log = logging.getLogger("demandops")
 
@@ -99,7 +99,7 @@ class LocalRepository(StateRepository):
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Move the branch and return True, if under Git's lock it still is at ``expected``."""
+        """Move the branch from ``expected`` to ``commit``; return whether this succeeded."""
         reference = self.objects.references[MAIN]
         if reference.target != expected:
             return False
@@ -119,7 +119,7 @@ class LocalRepository(StateRepository):
         return True
 
     def write_anew(self, since: str) -> None:
-        """Write the commits after ``since`` and the branch to new files, and sync these."""
+        """Write the commits after ``since`` and the branch to new files, and sync the files."""
         branch = Path(self.objects.path) / MAIN
         lock = branch.with_name(f"{branch.name}.lock")
         try:
@@ -140,7 +140,7 @@ class LocalRepository(StateRepository):
     def _break_stale_lock(self) -> None:
         """Remove the branch's lock if a killed process left it.
 
-        The lock's age counts from when this process first saw it, by a clock that nobody sets.
+        The age of the lock counts from when this process first saw it, by the monotonic clock.
         """
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:

@@ -1,8 +1,8 @@
 """New objects of a state repo: in memory until one pack makes them durable.
 
 A pack costs a few syncs, however many commits a batch has; loose objects cost some syncs each.
-The pack holds every object that its commits need and their parent lacks, also those that the repo
-has already: a loose object may not be on the disk yet, or may be about to be pruned.
+The pack has every object that its commits need and their parent lacks, even an object that the repo
+already has: a loose object may not be on the disk yet, or may be about to be pruned.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LAST = 0
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-"""The errors if a file system has no hard links, or a file has too many."""
+"""The errors raised if a file system has no hard links, or a file has too many."""
 _INDEX = b"\xfftOc"
 """The first bytes of the index of a pack."""
 
@@ -45,9 +45,9 @@ _FOLDER = b"40000"
 Entries = dict[bytes, bytes]
 """The entries of a folder by name; a folder's name ends in a slash, as Git sorts it."""
 _REMEMBERED = 32
-"""How many parsed folders to remember: the last written, because demands often change them again.
+"""How many of the last written folders to remember, because demands often change them again.
 
-They never become outdated, because an id always means the same content.
+A remembered folder never becomes outdated, because an id always means the same content.
 """
 
 
@@ -56,7 +56,7 @@ class NewObjects(pygit2.OdbBackend):
 
     def __init__(self, repo: Repository) -> None:
         super().__init__()
-        # libgit2 refers to this object, which Python cannot see: a strong reference would leak both
+        # Python cannot see that libgit2 refers to this object: a strong reference would leak both
         self._repo = weakref.ref(repo)
         self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
         self._folders: dict[Oid, Entries] = {}
@@ -64,9 +64,9 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository. This object refers to it weakly; who writes to it holds it."""
+        """The repository. This object has a weak reference to it; every writer has a strong one."""
         repo = self._repo()
-        assert repo is not None  # noqa: S101 - whoever writes to it holds it
+        assert repo is not None  # noqa: S101 - its writer has a strong reference
         return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
@@ -82,7 +82,7 @@ class NewObjects(pygit2.OdbBackend):
         return _entries_of(self.repo[oid].peel(Tree).read_raw()) if known is None else known
 
     def add_folder(self, entries: Entries) -> Oid:
-        """Keep a folder, to which ``entries`` belong from now on, and return its id."""
+        """Keep a folder and return its id; the caller must not change ``entries`` afterwards."""
         oid = self.add(ObjectType.TREE, b"".join(map(entries.__getitem__, sorted(entries))))
         self._folders[oid] = entries
         if len(self._folders) > _REMEMBERED:
@@ -110,9 +110,10 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
-        """Write the objects between two commits again, to a new pack, synced, like :meth:`packed`.
+        """Write the objects between two commits again, as one new synced pack.
 
-        A sync of their files may have failed; then the objects can be read, but may not be durable.
+        An earlier sync may have failed; then the objects can be read, but may not be durable.
+        Git's housekeeping keeps the pack, like that of :meth:`packed`.
         """
         with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n^{since}\n")):
             yield
@@ -121,8 +122,8 @@ class NewObjects(pygit2.OdbBackend):
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
         """Build a pack, then move it and its index into place, in this order.
 
-        Git removes an index without a pack. The pack's .keep file begins like its index, so that
-        :meth:`clean` recognizes it.
+        Git removes an index without a pack. The .keep file of the pack begins like an index, so
+        that :meth:`clean` recognizes the file.
         """
         packs = self._packs
         with _locked(packs, fcntl.LOCK_SH), _folder_until_done(self.repo.path) as folder:
@@ -241,7 +242,7 @@ def _folder_until_done(parent: str) -> Iterator[str]:
 
 @contextmanager
 def _locked(folder: Path, how: int) -> Iterator[None]:
-    """Hold a lock of a folder; writers of packs share it."""
+    """Lock a folder within the block; writers of packs share the lock."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(handle, how)
@@ -259,7 +260,7 @@ def _pack_in(folder: str) -> Path:
 def _mark(keep: Path, index: Path) -> None:
     """Make the .keep of a pack: a link to its index, which is synced already.
 
-    On a file system without hard links it is a file, synced before it gets its name.
+    On a file system without hard links, the .keep is a new file, synced before it gets its name.
     """
     try:
         keep.hardlink_to(index)

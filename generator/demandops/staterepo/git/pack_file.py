@@ -22,11 +22,11 @@ _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 _LEVEL = 1
 """The level of compression. A pack is short-lived, so speed counts more than size."""
 _SHORT_OFFSETS = 1 << 31
-"""An index keeps offsets from here on in a table of their own."""
+"""An index keeps offsets of at least this size in a separate table."""
 
 
 class Packed(NamedTuple):
-    """An object in a pack: its id, the checksum of its bytes there, and where they start."""
+    """An object in a pack: its id, the checksum of its packed bytes, and their offset."""
 
     oid: bytes
     crc: int
@@ -65,7 +65,7 @@ def _header(kind: int, size: int) -> bytes:
 
 
 def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
-    """Return an index of the second version in parts, for a pack with this checksum."""
+    """Return the parts of an index (version 2) for a pack with this checksum."""
     found = sorted(packed)
     firsts = [one.oid[0] for one in found]
     far = [one.offset for one in found if one.offset >= _SHORT_OFFSETS]
@@ -95,7 +95,7 @@ def _sha1(parts: Iterable[bytes]) -> bytes:
 
 
 def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
-    """Write a new file that nobody may change, like those of git."""
+    """Write and sync a new file that is read-only, like git's packs."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)
     with open(handle, "wb") as file:  # noqa: PTH123 - of the handle
         file.writelines(parts)

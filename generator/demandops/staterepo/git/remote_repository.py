@@ -38,17 +38,19 @@ _REMOTE_MOVED = re.compile(r"\[rejected\]")
 _REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
 _REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
 _TEMPORARY = re.compile(
-    r"lock|failed to update ref|incorrect old value|unpack|unable to (create|migrate|write)"
+    r"lock|failed to update ref|incorrect old value|unpack|bad pack|"
+    r"unable to (create|migrate|write)"
 )
-"""Matches a rejection that passes: a problem of the server or another writer, not a rule."""
+"""Matches a temporary rejection: the cause is the server or another writer, not a rule."""
 _RULE = re.compile(r"fsck|exceeds maximum|[Ii]nsufficient permission")
-"""Matches the server's words for a push that it will never accept."""
+"""Matches the server's reason if the server will never accept the push."""
 _WITHOUT_REASON = re.compile(
     r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
     r"error: failed to push some refs|Please make sure you have the correct access|"
-    r"and the repository exists|send-pack: unexpected disconnect"
+    r"and the repository exists|send-pack: unexpected disconnect|"
+    r"fatal: unknown error occurred while reading the configuration files"
 )
-"""Matches git's last lines that tell no reason."""
+"""Matches the last lines of git's output that give no reason."""
 _REMEDIES = (
     (
         re.compile(r"resolve host|Name or service not known", re.IGNORECASE),
@@ -77,8 +79,17 @@ _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
 """The limit of a first clone. Git ends an idle connection much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
-_NO_CLONE = re.compile(r"^(?!remote:).*fatal: not a git repository", re.MULTILINE)
-"""Matches what git says if it cannot read the repository in which it runs."""
+_NO_CLONE = re.compile(
+    r"^(?!remote:).*fatal: (not a git repository|'origin' does not appear to be a git|"
+    r"detected dubious ownership in repository at '.*/clone\.git')",
+    re.MULTILINE,
+)
+"""Matches git's error if it cannot read the clone in which it runs.
+
+Git knows no ``origin`` if it finds nothing in the clone's configuration.
+"""
+_NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
+"""Matches git's error if it cannot read a file (not a URL), here or on the server."""
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
@@ -113,7 +124,7 @@ class RemoteRepository(StateRepository):
         self._folder = folder
         self._aborted = False
         self._process: subprocess.Popen[bytes] | None = None
-        for lock in folder.rglob("*.lock"):  # of a killed process: no other uses the folder
+        for lock in folder.rglob("*.lock"):  # left by a killed process: no other uses the folder
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
@@ -147,12 +158,12 @@ class RemoteRepository(StateRepository):
             return False
 
     def renew_if_damaged(self) -> bool:
-        """Make the clone anew if git finds it damaged; return whether it was."""
+        """Clone again if git finds the clone damaged; return whether that was necessary."""
         try:
             with git.Repo(self._folder) as repo:
                 self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
             return False
-        except RemoteAway:  # it was aborted
+        except RemoteAway:  # the check was aborted
             return False
         except Exception as error:
             log.warning("the clone %s is damaged (%s); making it anew", self._folder, error)
@@ -169,7 +180,7 @@ class RemoteRepository(StateRepository):
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
                 config.set_value("gc", "auto", 0)
-                # a fetch keeps its pack, which git syncs: libgit2 hangs on half a loose object
+                # keep a fetched pack, which git syncs: libgit2 hangs on a half-written loose object
                 config.set_value("fetch", "unpackLimit", 1)
             partial.joinpath("config").chmod(0o600)
             self._fetch(repo, timeout=_CLONE_TIMEOUT_S)
@@ -183,7 +194,7 @@ class RemoteRepository(StateRepository):
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = TIMEOUT_S,
     ) -> None:
-        # not in the configuration: a push that outlives its generator would move the reference
+        # not in the configuration, or a push that outlives its generator moves the reference
         spec = f"+{MAIN}:{_REMOTE_MAIN}"
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
@@ -193,12 +204,12 @@ class RemoteRepository(StateRepository):
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit`` and return True, if it is on top of the remote's own tip."""
+        """Push ``commit`` and return True; return False if the remote's tip is not ``expected``."""
         try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except git.GitCommandError as error:
-            if _REMOTE_MOVED.search(str(error)):  # git saw it before it sent anything
+            if _REMOTE_MOVED.search(str(error)):  # git noticed before it sent anything
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
@@ -219,7 +230,7 @@ class RemoteRepository(StateRepository):
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch branches by prefix and drop those that were deleted, or raise RemoteAway."""
+        """Fetch the branches with a prefix and drop deleted ones, or raise RemoteAway."""
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         self._read(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
@@ -228,7 +239,8 @@ class RemoteRepository(StateRepository):
 
         Args:
             spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
-            lease: ``<reference>:<commit>``: the commit that the remote must have; empty for none.
+            lease: ``<reference>:<commit>``: the remote's reference must have this commit; if the
+                commit is empty, the reference must not exist.
             options: options for the server (``git push --push-option``).
         """
         push_options = [f"--push-option={option}" for option in options]
@@ -239,7 +251,7 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return ``PushDenied`` if the remote rejected a push, else the error that says why."""
+        """Return the error to raise for a failed push: ``PushDenied`` if it will always fail."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()
@@ -251,7 +263,7 @@ class RemoteRepository(StateRepository):
             reason = f"{rejected[1]}: {message}" if message else rejected[1]
             is_final = bool(_RULE.search(text)) or not _TEMPORARY.search(rejected[1])
         else:
-            is_final = bool(_NO_PERMISSION.search(text))
+            is_final = bool(_NO_PERMISSION.search(_NO_FILE.sub("", text)))
         if is_final:
             return PushDenied(f"{self.address} rejects the push: {reason}")
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
@@ -281,13 +293,14 @@ class RemoteRepository(StateRepository):
             raise self._unreadable()
         failed = "read" if command[0] == "ls-remote" else "fetched"
         reason = _reason(text)
-        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(reason)), "")
+        known = _NO_FILE.sub("", reason)  # credentials do not help with a file
+        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(known)), "")
         raise RemoteAway(f"{self.address} cannot be {failed}: {reason}{remedy}")
 
     def _unreadable(self) -> Unavailable:
         return Unavailable(
             f"{self.address} cannot be fetched or pushed: its clone {self._folder} cannot be read; "
-            "check its disk, then start again: a damaged clone is made anew"
+            "check its owner and its disk, then start again: a damaged clone is made anew"
         )
 
     def _disk_full(self) -> DiskFull:
@@ -306,7 +319,7 @@ class RemoteRepository(StateRepository):
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
         with repo.git.custom_environment(**ENVIRONMENT):
-            guard = repo.git.execute(  # keep it: when it is garbage, it ends the process
+            guard = repo.git.execute(  # keep the guard: its garbage collection ends the process
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,
                 start_new_session=True,
@@ -358,7 +371,7 @@ def _wait_for(
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its children and return the output; SIGTERM first, so that git unlocks."""
+    """End git and its children and return the output; SIGTERM first, to let git unlock."""
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -368,7 +381,7 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 
 
 def _reason(text: str) -> str:
-    """Return the last line of git's error output that tells a reason."""
+    """Return the last line of git's error output that gives a reason."""
     text = text.replace("stderr: '", "")  # GitPython's prefix
     lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
     telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines

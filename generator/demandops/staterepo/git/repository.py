@@ -1,6 +1,7 @@
 """The state repo that a writer uses: Git objects, and a tip that only moves forward.
 
-There are two kinds, on this disk and behind a URL; :mod:`demandops.staterepo.git.address` chooses.
+There are two kinds, on this disk and behind a URL;
+:mod:`demandops.staterepo.git.open_repository` chooses.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
 ENVIRONMENT = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C",
-    # a connection that carries nothing for so many seconds is cut off
+    # git cuts off a connection that carries nothing for this many seconds
     "GIT_HTTP_LOW_SPEED_LIMIT": "1",
     "GIT_HTTP_LOW_SPEED_TIME": "60",
 }
@@ -61,7 +62,7 @@ _TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objec
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
-    """Return the error to raise if a state repo on this disk could not be written, or None.
+    """Return the error to raise if the disk prevented a write to the state repo, or None.
 
     libgit2 gives the number of an error only as text. After an I/O error nobody knows what is on
     the disk.
@@ -87,8 +88,8 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
 def access_error(error: Exception, address: str) -> Exception:
     """Return the error to raise if a folder or state repo could not be read or written.
 
-    It replaces an error of the system or of libgit2, and returns any other unchanged, as a fault of
-    the program.
+    Only an error of the system or of libgit2 is replaced. Any other error is returned unchanged,
+    because it is a fault of the program.
     """
     if not isinstance(error, OSError | pygit2.GitError):
         return error
@@ -107,7 +108,7 @@ class StateRepository(ABC):
     signer: Signer | None = None
     """Signs the commits made here; None: they are not signed."""
     runtime: Runtime = REAL
-    """The clock, chance and threads of the code that writes to the state repo."""
+    """The clock, randomness and threads of the code that writes to the state repo."""
     always_current: bool
     """Whether :meth:`tip` is never out of date (a repository on this disk)."""
     _tidying: subprocess.Popen[bytes] | None = None
@@ -134,10 +135,10 @@ class StateRepository(ABC):
         """Make ``commit`` the tip, durably, if the tip is ``expected``; else return false.
 
         Raises Unavailable or PushDenied if it could not be published for another reason, and
-        Unsound if nobody knows whether it was.
+        Unsound if nobody knows whether it was published.
         """
 
-    def write_anew(self, since: str) -> None:  # noqa: B027 - a remote's answer was its promise
+    def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
         """Write the commits after ``since`` again, so that they are durable.
 
         Raises Unavailable or Unsound if that fails.
@@ -148,9 +149,9 @@ class StateRepository(ABC):
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or a descendant; false if one is not here.
+        """Return whether ``commit`` is ``other`` or descends from it; false if either is unknown.
 
-        Any thread may call it.
+        Any thread may call this.
         """
         if commit == other:
             return True
@@ -160,7 +161,7 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` is equal in two commits; false if one is not known here."""
+        """Return whether ``path`` is equal in two commits; false if either is unknown here."""
         found = self._trees(commit, other)
         if found is None:
             return False
@@ -169,7 +170,7 @@ class StateRepository(ABC):
         return trees.entry(found[0], path) is not None and not trees.differ(*found, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        """Return the paths in which two commits differ; None if one is not known here."""
+        """Return the paths in which two commits differ; None if either is unknown here."""
         found = self._trees(since, commit)
         return None if found is None else sorted(path for path, _ in trees.differences(*found))
 

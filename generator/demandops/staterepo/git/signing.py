@@ -2,7 +2,7 @@
 
 ``ssh-keygen`` signs the commit's bytes, and the signature goes into the header ``gpgsig``, so
 ``git verify-commit`` and every forge accept it. This module knows only the key's path;
-``ssh-keygen`` reads the key or an agent holds it.
+``ssh-keygen`` reads the key or asks an SSH agent.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def create_commit(
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Add a commit by ``people`` (author, committer), signed if possible, and return its id."""
+    """Add a commit by ``people`` (author, committer), signed by ``signer``; return its id."""
     content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
     if signer is not None:
         head, end, message = content.partition("\n\n")

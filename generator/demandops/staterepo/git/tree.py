@@ -17,7 +17,7 @@ pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectTyp
 
 
 MAX_DEPTH = 64
-"""How many folders a file may be inside; deeper folders are not read."""
+"""How many folders deep a file may be; deeper folders are not read."""
 
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
@@ -30,7 +30,7 @@ def commit_of(repo: Repository, revision: str | Oid) -> Commit:
             raise StateRepoError(
                 f"commit {error}; set the branch back to the commit before it"
             ) from None
-        if isinstance(revision, Oid):  # a branch or a commit named it, no person
+        if isinstance(revision, Oid):  # a branch or a commit named it, not a person
             raise StateRepoError(
                 f"the commit {revision} cannot be read; check the disk of the state repo and of "
                 "its clone, then try again"
@@ -74,7 +74,7 @@ def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
     """Yield (path, object) of each file, link or submodule at or below the paths ``roots``.
 
     The order is Git's. A folder that is deeper than :data:`MAX_DEPTH` is yielded like a file. In a
-    name that is not UTF-8, ``\\xff`` stands for a byte that is not.
+    name, a byte that is not UTF-8 is shown as ``\\xff``.
     """
     for root in roots:
         found = entry(tree, root)
@@ -105,7 +105,7 @@ def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
 
 
 def is_file(found: Object) -> bool:
-    """Return whether an entry is a file, and no link, submodule or folder."""
+    """Return whether an entry is a file, not a link, submodule or folder."""
     return isinstance(found, Blob) and found.filemode != FileMode.LINK
 
 
@@ -115,7 +115,7 @@ def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
 
 
 def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
-    """Return whether any of the files or folders ``paths`` differs."""
+    """Return whether any file or folder of ``paths`` differs between two trees."""
     return any(entry_id(one, path) != entry_id(other, path) for path in paths)
 
 
@@ -156,12 +156,12 @@ def _differences_at(
 
 
 def is_readme(path: str) -> bool:
-    """Return whether this is a README, which people may put beside generated files."""
+    """Return whether this is a README, which people may put next to generated files."""
     return path.rsplit("/", 1)[-1] == "README.md"
 
 
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Add ``base`` with ``files`` changed (``None`` removes) and return the new tree's id.
+    """Add a copy of ``base`` with ``files`` changed (``None`` removes a file); return its id.
 
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
@@ -190,7 +190,7 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
             entries[folder] = b"40000 %s\0%s" % (name, subtree.raw)
         elif kept:
             del entries[folder]
-    for name, text in here.items():  # after the folders, so that a file can replace one
+    for name, text in here.items():  # after the folders, so that a file can replace a folder
         if text is not None:
             entries.pop(name + b"/", None)
             blob = objects.add(ObjectType.BLOB, text.encode())
@@ -202,7 +202,7 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
-    """Return the raw name of the entry that is shown as ``name``; else ``name``, encoded."""
+    """Return the raw name of the entry that is shown as ``name``, or ``name`` encoded."""
     raw = name.encode()
     if raw in entries or b"\\" not in raw:
         return raw

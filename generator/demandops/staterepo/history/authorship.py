@@ -1,7 +1,7 @@
 """Authors: the commits by people, and the person who runs this program.
 
-A follow commit renders what people committed; it names their commits and has them as author.
-A commit is by a person if no generator made it, on any machine (:mod:`.commit_log`).
+A follow commit renders what people committed; it names these commits, and their authors become its
+author. A commit is by a person if no generator on any machine made it (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from demandops.staterepo.history import commit_log, commit_message
 
 _ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _MOST_NAMED = 20
+_NO_ADDRESS = "@demandops.invalid"
 
 
 class Person(NamedTuple):
@@ -32,6 +33,11 @@ class Person(NamedTuple):
 
     name: str
     email: str
+
+    @property
+    def is_known(self) -> bool:
+        """Whether git's configuration has the address; else the address is made from the login."""
+        return not self.email.endswith(_NO_ADDRESS)
 
     def __str__(self) -> str:
         return f"{self.name} <{self.email}>"
@@ -46,7 +52,7 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
     """Return a function that finds the commit and author of people's last change to a path.
 
-    If they did not change the path, it finds their last change to any path.
+    If no person changed the path, the function finds people's last change to any path.
     """
 
     @cache  # read only when needed: most problems are already in the report
@@ -81,7 +87,7 @@ def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     """Return the author of a follow commit: the people whose commits it renders.
 
-    One person keeps name and address, so that ``git log --author`` finds both commits.
+    If it is one person, name and address are kept, so that ``git log --author`` finds both commits.
     """
     if not causes:
         return commit_message.generator_signature(now)
@@ -103,5 +109,5 @@ def operator(folder: str | None = None) -> Person:
         return os.environ.get(variable) or str(setting)
 
     name = known("GIT_AUTHOR_NAME", "user.name") or login
-    email = known("GIT_AUTHOR_EMAIL", "user.email") or f"{login}@demandops.invalid"
+    email = known("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"
     return Person(name, email)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from typing import Literal
+from typing import Literal, get_args
 
 import git
 import pygit2
@@ -23,7 +23,7 @@ from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import allowed_signers, message_format
 
 PROPOSAL = "Proposal"
-"""The trailer of a commit that needs approval: the branch that it was proposed on."""
+"""The trailer that names the branch on which a commit was proposed for approval."""
 
 GENERATOR_NAME = "DemandOps generator"
 GENERATOR_EMAIL = "generator@demandops.invalid"
@@ -47,7 +47,7 @@ class LogEntry:
     by_generator: bool = False
     """Whether the generator is the committer; then the files should match the ledger.
 
-    The message alone proves nothing, because anybody may write trailers. False for a proposal: a
+    The message alone proves nothing, because anybody may write trailers. A proposal has False: a
     person merges it, perhaps onto other changes, so its files are read again.
     :func:`is_by_generator` also requires a signature.
     """
@@ -74,7 +74,7 @@ def author_of(commit: Commit) -> tuple[str, str]:
 
 
 def _text(raw: bytes) -> str:
-    """Return a text of a commit, whatever encoding the commit names."""
+    """Return a text of a commit, decoded as UTF-8 even if the commit names another encoding."""
     return raw.decode("utf-8", "replace")
 
 
@@ -100,7 +100,7 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit: it is the committer, and signed if required."""
+    """Return whether the generator made a commit, and signed it if a signature is required."""
     return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
 
 
@@ -131,7 +131,7 @@ def person_commits(
 def _told_apart(
     repo: Repository, tip: str | Oid, until: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return the commits with entries whose ``by_generator`` also means a good signature."""
+    """Return commits and entries; ``by_generator`` is false if a required signature is bad."""
     found = list(commits(repo, tip, until))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
     return [
@@ -147,11 +147,19 @@ def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
     return iter(walker)
 
 
-_Outcome = Literal["changed", "waiting", "unchanged", "refused"]
+Settled = Literal["unchanged", "waiting", "released", "refused"]
+"""The outcomes of demands that need no commit; the next commit's message records them."""
+_Outcome = Literal["changed", Settled]
+
+
+def settled_trailer(outcome: Settled) -> str:
+    """Return the name of the trailer that records a demand without a commit of its own."""
+    return f"{outcome.capitalize()}-Operation-Id"
+
+
 _OUTCOMES: dict[str, _Outcome] = {
     "Operation-Id": "changed",
-    "Unchanged-Operation-Id": "unchanged",
-    "Refused-Operation-Id": "refused",
+    **{settled_trailer(outcome): outcome for outcome in get_args(Settled)},
 }
 
 
@@ -166,8 +174,9 @@ class RecordedOutcome:
 def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
     """Return operation id → outcome of every demand that commits after ``base`` record.
 
-    A person who merges a proposal may keep its trailers; any other commit by a person records no
-    demand. It reads the whole history if ``base`` is unknown, because the remote was made anew.
+    A person's merge of a proposal may keep the proposal's trailers; any other commit by a person
+    records no demand. If ``base`` is unknown, because the remote was made anew, the whole history
+    is read.
     """
     if str(tip) == base:
         return {}
@@ -204,8 +213,8 @@ class PathChange:
 class PathHistory:
     """The commits that last added a path, changed it since, and removed it.
 
-    ``newest`` are the commits that changed it since it was added, newest first; ``more`` is how
-    many are left out. ``stopped`` is the commit that removed it, or None if it exists.
+    ``newest`` lists commits that changed the path since it was added, newest first; ``more`` counts
+    the older ones. ``stopped`` is the commit that removed the path, or None if the path exists.
     """
 
     started: LogEntry | None
@@ -264,7 +273,7 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 
 
 def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
-    """Return what ``git log`` prints for a path; ``query`` is its options, then the path."""
+    """Return the items that ``git log`` prints; ``query`` has its options, then the path."""
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
     with git.Repo(repo.path) as opened:

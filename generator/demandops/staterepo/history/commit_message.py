@@ -1,7 +1,7 @@
 """Commit messages: what changed in the desired state and why, for people and programs.
 
 The trailers are a contract: an auditor without this program finds everything with
-``git log --format='%(trailers:key=Requester)'``. Values from outside stand in a message only as
+``git log --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
 :mod:`demandops.staterepo.history.message_format` quotes them.
 :mod:`demandops.staterepo.load.state_in_effect` adds the trailers about quarantined files.
 """
@@ -44,7 +44,7 @@ _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an
 
 
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
-    """Return a person and a time, without the characters that Git does not accept."""
+    """Return a person and a time as Git's signature, without characters that Git refuses."""
     address = one_line(_UNFIT.sub("", email), _MAX_AUTHOR).strip(_CRUD) or GENERATOR_EMAIL
     plain = one_line(name.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
     return pygit2.Signature(plain.strip(_CRUD) or "unnamed", address, int(time.timestamp()), 0)
@@ -76,7 +76,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 def of_decision(
     decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``settled`` are trailers for earlier demands."""
+    """Return the message of a demand's commit; ``settled`` has further trailers for it."""
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     title, why = _title_and_why(decision, received)
@@ -126,7 +126,7 @@ _VERBS = {
 
 
 def _requesters(decision: Decision) -> tuple[str, ...]:
-    """Return the requesters of a demand, else those of the claims that it changed."""
+    """Return the requesters that a request names, else the requesters of the changed claims."""
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
     if isinstance(decision.request, Decommission):  # the requester is in the old claims only
@@ -191,7 +191,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
 
 
 def _of_request(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailers of a rollback, and that of a decommissioned node."""
+    """Return the trailers that only a rollback, a drain or a decommission has."""
     request = decision.request
     if isinstance(request, Restoration):
         return [("Restores", request.to), ("Reason", request.reason)]
@@ -247,7 +247,7 @@ def of_override_end(
 ) -> str:
     """Return the message of the commit that ends an expired override.
 
-    ``keys`` are the claims that changed with it, those of demands and of ``keep`` overrides.
+    ``keys`` names the claims that the end changes: those of demands and of ``keep`` overrides.
     """
     why = (
         f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
@@ -271,7 +271,7 @@ def of_override_end(
 def of_scale_down(
     instance: Instance, change: Changeset, more: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of the commit that ends the time for which a service keeps replicas."""
+    """Return the message of the commit that removes a service's expired extra replicas."""
     service, node = instance[1:3]
     names = ", ".join(release.name for release in change.releases) or f"{service} on {node}"
     paragraphs = [
@@ -300,7 +300,7 @@ def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
-    """Return the trailers that name the demands of claims which overrides changed."""
+    """Return the trailers that name the demands of claims; claims of overrides have none."""
     demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
     return [("Demand-Id", demand) for demand in sorted(demands)]
 

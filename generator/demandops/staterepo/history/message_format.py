@@ -1,10 +1,11 @@
 """The text of commit messages: paragraphs of lines, and trailers in the last paragraph.
 
 This module alone writes and reads messages. A line of a paragraph is for people: its text is
-escaped and cut off. A trailer is for programs: its value is read back exactly. A visible value
-stands as it is, so ``git log --format='%(trailers:key=Requester)'`` shows it; any other value
-stands in double quotes with escapes like ``\\u202e``. So no value can begin a line, end the message
-or pass for a trailer. Messages of earlier versions, which did not quote, are read the same way.
+escaped and shortened. A trailer is for programs: its value is read back exactly. A value of visible
+characters is written unchanged, so ``git log --format='%(trailers:key=Requester)'`` shows it; any
+other value is written in double quotes with escapes like ``\\u202e``. So no value can begin a line,
+end the message or look like a trailer. Messages of earlier versions, which did not quote, are read
+the same way.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ def parse(message: str) -> MessageText:
 
 
 def _trailers(message: str) -> dict[str, list[str]]:
-    """Return the lines ``Key: value`` of the last paragraph; none if it holds anything else."""
+    """Return the lines ``Key: value`` of the last paragraph; none if it has any other line."""
     trailers: dict[str, list[str]] = {}
     head, _, last = message.rstrip("\n").rpartition("\n\n")
     for line in last.split("\n") if head else ():

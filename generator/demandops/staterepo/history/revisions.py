@@ -13,7 +13,7 @@ from datetime import datetime, timedelta, timezone
 import pygit2
 from pygit2 import Commit, Object, Oid, Reference, Repository
 
-from demandops.config.policy import seconds_of
+from demandops.config.durations import seconds_of
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.history import commit_log
@@ -86,7 +86,7 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
 
 
 def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    """Return the newest commit along the first parents at ``at`` or before, or raise."""
+    """Return the newest commit along the first parents that is not later than ``at``, or raise."""
     latest = int(at.timestamp())
     for commit in commit_log.first_parents(repo, tip):
         if commit.commit_time <= latest:

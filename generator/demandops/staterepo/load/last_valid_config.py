@@ -1,8 +1,8 @@
 """The configuration at a commit; the last valid versions of files replace invalid ones.
 
-If a file is invalid, its last valid version is in effect. So are those of the other files of its
-application definition and of the commits that changed it: a commit applies whole or not at all. All
-other changes apply. If the result is not valid either, no change applies.
+If a file is invalid, its last valid version is in effect. The same is true for the other files of
+its application definition, and for all files of the commits that changed it: a commit applies whole
+or not at all. All other changes apply. If the result is not valid either, no change applies.
 """
 
 from __future__ import annotations
@@ -52,7 +52,10 @@ class ConfigSource:
 
 @dataclass(frozen=True, slots=True)
 class LastValidConfig:
-    """The part of a commit's configuration that is valid; ``config`` is None if no part is."""
+    """A commit's configuration, with the last valid versions of its invalid files.
+
+    ``config`` is None if no version is valid.
+    """
 
     config: Config | None
     source: ConfigSource

@@ -37,7 +37,7 @@ class ClaimFiles:
 
 
 def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
-    """Return the claims of these files, (path, text); skip files that hold no claim."""
+    """Return the claims of files, given as (path, text); skip files that are not claim files."""
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
         if claim_file.kind_of(path) is None:
@@ -50,7 +50,7 @@ def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None if there is no file; raise the faults of a file."""
+    """Return the claim at a path, or None if there is no file; raise if the file is not valid."""
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 
@@ -64,7 +64,7 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
 
 
 def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
-    """Return the key of the claim in effect at a path, found in the whole ledger."""
+    """Return the key of the claim in effect at a path, or None; search the whole ledger."""
     if claim_file.kind_of(path) is None:
         return None
     return next((one.key for one in ledger if claim_file.path_of(one.key) == path), None)
@@ -75,7 +75,8 @@ def last_valid_claims(
 ) -> dict[str, Claim | None]:
     """Return path → the claim as the generator last wrote it, without manual edits.
 
-    If it wrote none since the newest commit with only valid files, return that commit's claim.
+    ``last_valid_commit`` is the newest commit with only valid files. Its claim is returned if the
+    generator wrote none after it.
     """
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
@@ -101,7 +102,7 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
 ) -> list[ClaimChange]:
-    """Return the claims that people wrote, each with the one that the generator last wrote.
+    """Return people's changes of claims: ``before`` is the claim that the generator last wrote.
 
     Args:
         last_valid_commit: the newest commit with only valid files; older claims are left out.
@@ -142,7 +143,7 @@ def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
 
 
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
-    """Yield the claim files that differ, in order."""
+    """Yield the claim files that differ between two trees, in order."""
     changed = trees.differences(before, after, (claim_file.LEDGER_ROOT,))
     return (path for path, _ in changed if claim_file.kind_of(path) is not None)
 

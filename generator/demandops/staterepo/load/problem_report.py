@@ -1,6 +1,6 @@
 """The problem report: a file in the state repo that lists the invalid files.
 
-It names each fault, since which commit it exists, and who made that commit. The same problems give
+It names each fault, the commit that caused it, and the author of the commit. The same problems give
 the same bytes, so an unchanged report causes no commit. Pure: texts and faults in, text out.
 """
 
@@ -33,7 +33,7 @@ class Problem:
     since: str = ""
     author: str = ""
     line: int | None = None
-    """The line of the field in the file as it is now; the report does not have it."""
+    """The line of the field in the current file; the report does not store it."""
 
     def __str__(self) -> str:
         places = (place_text(self.file, self.line), self.field)

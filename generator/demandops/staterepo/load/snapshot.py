@@ -62,7 +62,7 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot at a new commit that this program made; ``state`` is its state."""
+        """Return the snapshot moved to a commit of this program, with that commit's state."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
@@ -79,9 +79,9 @@ class Advance:
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Load and return a commit whole.
+    """Return the snapshot of a commit, with all its files read.
 
-    It calls ``progress`` with (files read, all files) of the ledger.
+    ``progress`` is called with (files read, all files) of the ledger.
 
     Raises:
         InvalidInput, StateRepoError: with every fault of every file.
@@ -194,8 +194,8 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
     """Return whether every release must be rendered to find the generated files that must change.
 
-    Generated files fit the newest commit of a generator. After it, people may have edited them, or
-    undone what another generator did since ``before``.
+    At a generator's newest commit, generated files match the ledger. After that commit, people may
+    have edited the files, or undone what another generator committed since ``before``.
     """
     people = list(commit_log.person_commits(repo, to, before))
     if not people or people[0].id != to:
@@ -253,8 +253,8 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 class ReadAhead:
     """Keeps the commits read after the published snapshot, until a commit is published on them.
 
-    So each attempt to publish reads only new commits. If it read all of them again, faster writers
-    could always publish first.
+    So each attempt to publish reads only new commits. If each attempt read all commits again,
+    faster writers could always publish first.
     """
 
     def __init__(self) -> None:
@@ -262,7 +262,7 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the advance to ``tip``; raise if that has another render version."""
+        """Return the advance to ``tip``; raise if ``tip`` has another render version."""
         last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
         known = self._known
         if known is None or self._start != before.commit:

@@ -1,10 +1,11 @@
 """The state in effect at a commit, even if some files are not valid.
 
-The generator's commits record it in trailers. ``In-Force`` names the newest commit where all files
-were valid. ``Configuration`` names the commit whose configuration is in effect. Each ``Stands-In``
-names a file that is in effect in another version, as path and blob. Each ``Held-Back`` names a file
-of the ledger that is not in effect. A restart and ``demandops verify`` start from these trailers.
-They then apply people's later changes with the same code as a running generator.
+The generator's commits record this state in trailers. ``In-Force`` names the newest commit where
+all files were valid. ``Configuration`` names the commit whose configuration is in effect. Each
+``Stands-In`` names a file that is in effect in another version, as path and blob. Each
+``Held-Back`` names a file of the ledger that is not in effect. A restart and ``demandops verify``
+start from these trailers. They then apply people's later changes with the same code as a running
+generator.
 
 People's changes that cannot be planned are not applied (quarantine). If a claim cannot be planned,
 for example because it names an unknown node, or if it is refused, its file stays as it is and
@@ -79,7 +80,7 @@ def state_at(
 
 
 def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
-    """Return the state in effect at a commit: an earlier one with people's later changes."""
+    """Return the state in effect at ``to``: the earlier state ``start`` with people's changes."""
     if start.commit == to:
         return start
     commit, advance = trees.commit_of(repo, to), snapshots.advance(repo, start, to)
@@ -96,7 +97,7 @@ def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest recorded state up to a commit, or that of the newest fully valid commit.
+    """Return the newest recorded state up to a commit, else the state of the newest valid commit.
 
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
@@ -185,8 +186,8 @@ class Judgement:
 
     If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
     be planned with the new one only, the new configuration is at fault. If a claim that a person
-    wrote is refused, that claim is at fault. ``refused`` has these faults, with the new
-    configuration.
+    wrote is refused, that claim is at fault. ``refused`` has the faults of refused claims,
+    with the new configuration.
     """
 
     repo: Repository
@@ -251,10 +252,10 @@ def judge(
     tree: Tree,
     held_back: Collection[str] | None = None,
 ) -> Judgement:
-    """Return the subjects that people changed since ``before`` and that cannot be accepted.
+    """Return the judgement of people's changes since ``before``.
 
     Args:
-        held_back: the claim files that were refused, as a record says; without one, judge them.
+        held_back: claim files that a record lists as not in effect; None: judge the claims.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)

@@ -118,6 +118,6 @@ def _told(text: str, chart: str) -> Fault:
     places = [*_PLACE.finditer(text)]
     place = places[-1] if places else None
     file = place["path"] if place else chart
-    line = f"line {place['line']}" if place and place["line"] else ""
+    line = int(place["line"]) if place and place["line"] else None
     said = quoted(" ".join(text.split()), _MOST)
-    return fault(line, f"helm says {said}; fix the chart or its values").within(file)
+    return fault("", f"helm says {said}; fix the chart or its values", line=line).within(file)

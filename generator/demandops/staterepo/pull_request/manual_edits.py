@@ -24,7 +24,7 @@ from demandops.render.gitops.flux import chart_object
 from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
 from demandops.settings import API_VERSION, GENERATED_ROOTS, NOTES_ROOT, modeline
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.pull_request.worktree import Base
+from demandops.staterepo.pull_request.edited_checkout import Base
 
 _LOST = "is generated, so a manual edit is lost; revert it"
 _MOST_LEFT = 5
@@ -135,7 +135,7 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return effects of an override that replace an edit, and the parts that they miss."""
+    """Return effects of an override that replace an edit, and the parts of the edit without one."""
     if after is None:
         return {"deny": True}, []
     try:

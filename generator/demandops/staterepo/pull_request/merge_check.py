@@ -26,7 +26,12 @@ from demandops.ledger.claim_changes import changes_on
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.override_lifecycle import expired_overrides, update_ledger
-from demandops.plan.views import override_report, policy_warnings, unmatched_patterns
+from demandops.plan.views import (
+    misspelled_topics,
+    override_report,
+    policy_warnings,
+    unmatched_patterns,
+)
 from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.plan.views.missing_inputs import missing_inputs
 from demandops.render.changes import merge_preview
@@ -37,19 +42,18 @@ from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import ledger_files
 from demandops.staterepo.pull_request import manual_edits, rendered_charts
-from demandops.staterepo.pull_request.helm import HELM_BIN
+from demandops.staterepo.pull_request.edited_checkout import Base, author_of, base_of, files_of
 from demandops.staterepo.pull_request.manual_edits import Suggestion
 from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
-from demandops.staterepo.pull_request.worktree import Base, author_of, base_of, files_of
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
     """The result of a check.
 
-    ``preview`` is None if the files are not valid; ``bookkeeping`` is also None if there is no
-    valid commit for a comparison. ``base`` is the commit of the comparison, if any; if its
-    files are not valid (``base_valid``), their last valid versions are used. ``newer`` are the
+    ``preview`` is None if the files are not valid. ``bookkeeping`` is None then too, and if there
+    is no valid commit to compare with. ``base`` is the commit of the comparison, if any. If
+    ``base_valid`` is False, the last valid versions of its files are used. ``newer`` counts the
     commits that the merge target has and the checkout lacks. ``warnings`` are likely mistakes.
     """
 
@@ -130,6 +134,7 @@ def check(
                 *(fault("", text).within(path) for path, text in idle),
                 *policy_warnings.warnings(state),
                 *unmatched_patterns.warnings(state.config),
+                *misspelled_topics.warnings(state),
                 *edit.changed_bootstraps(wanted),
                 *_newly_missing(start, state),
                 *charts.warnings,
@@ -150,11 +155,7 @@ def check(
 
 def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
     if rendered_charts.MISSING in charts.not_rendered.values():
-        message = (
-            f"charts not rendered: {rendered_charts.MISSING}; install it and put it on PATH, or "
-            f"name it in {HELM_BIN}"
-        )
-        yield fault("", message)
+        yield fault("", rendered_charts.NO_HELM)
 
 
 def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
@@ -199,7 +200,7 @@ class _Edit:
         }
 
     def merged_into(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        """Return the generated files before the edit, with the wanted ones that the target has."""
+        """Return the generated files before the edit, with the wanted files that the target has."""
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
             if there.get(path) == wanted.get(path):
@@ -260,11 +261,13 @@ class _Edit:
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
         """Yield a warning for each bootstrap file that a person has to apply to its cluster."""
-        for path, text in sorted(self.merged_into(wanted).items()):
-            if path.startswith(f"{BOOTSTRAP_ROOT}/") and wanted.get(path, text) != text:
+        before = self.merged_into(wanted)
+        for path, text in sorted(wanted.items()):
+            if path.startswith(f"{BOOTSTRAP_ROOT}/") and before.get(path) != text:
                 cluster = path.removeprefix(f"{BOOTSTRAP_ROOT}/").removesuffix(".yaml")
+                change = "changes" if path in before else "is new"
                 message = (
-                    "changes with the merge, and no controller applies it; afterwards, an "
+                    f"{change} with the merge, and no controller applies it; afterwards, an "
                     f"administrator of cluster '{cluster}' applies it: "
                     f"git show main:{path} | kubectl apply -f -"
                 )

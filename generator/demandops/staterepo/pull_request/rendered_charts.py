@@ -21,19 +21,20 @@ from demandops.config.policy import matches
 from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.plan.release import ServiceRelease
-from demandops.render import values_schema
+from demandops.render import values_validator
 from demandops.render.changes import merge_preview
 from demandops.render.gitops.paths import path_of
 from demandops.render.helm_values import values_of
 from demandops.render.trial_render import trial_releases
-from demandops.staterepo.pull_request.helm import Helm, Report
+from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
 
 MISSING = "helm is missing"
+NO_HELM = f"charts not rendered: {MISSING}; install it and put it on PATH, or name it in {HELM_BIN}"
 
 
 @dataclass(frozen=True, slots=True)
 class RenderedCharts:
-    """Which charts helm rendered, for how many releases and examples, and the faults it found.
+    """Which charts helm rendered, for how many releases and examples, and the faults found.
 
     ``not_rendered`` maps the other charts to the reason.
     """
@@ -148,7 +149,7 @@ class _Run:
             for schema in (one for one in self._files if one.startswith(f"{path}/")):
                 if schema.endswith("/values.schema.json"):
                     try:
-                        values_schema.validator(self._files[schema], schema)
+                        values_validator.validator(self._files[schema], schema)
                     except InvalidInput as error:  # helm would fetch what its schema refers to
                         self._faults.update(dict.fromkeys(error.faults))
                         return False

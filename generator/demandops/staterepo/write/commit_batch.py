@@ -12,7 +12,6 @@ from dataclasses import replace
 from datetime import datetime
 from itertools import islice
 from types import MappingProxyType
-from typing import Literal
 
 import pygit2
 from pygit2 import Oid, Signature
@@ -39,6 +38,7 @@ from demandops.plan.override_lifecycle import (
     update_claims,
     update_ledger,
 )
+from demandops.quoting import one_line
 from demandops.render.changes.changeset import Change, Changeset, ReleaseChange
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.git import signing
@@ -58,7 +58,7 @@ _PAUSE_S = 0.02
 
 
 _Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
-"""The effect of people's changes: the state in effect, the files and the kept claims."""
+"""The effect of people's changes: state, files, and claims that overrides may have changed."""
 
 
 class CommitBatch:
@@ -74,6 +74,8 @@ class CommitBatch:
         self.head = start
         self.frees = False
         """Whether a demand gave room back since this was last reset."""
+        self.followed = ""
+        """What the commit that follows people's changes does, on one line for the log."""
 
     @property
     def is_empty(self) -> bool:
@@ -118,13 +120,13 @@ class CommitBatch:
         self.head = self.head.with_commit(made, state)
         return str(made)
 
-    def note_settled(self, operation: str, outcome: Literal["Unchanged", "Refused"]) -> None:
+    def note_settled(self, operation: str, outcome: commit_log.Settled) -> None:
         """Record a demand that changed nothing in the message of the next commit, if there is one.
 
         The process may die before it answers. A restart must not evaluate the demand again, because
         a later release may have changed its outcome.
         """
-        self._settled.append((f"{outcome}-Operation-Id", operation))
+        self._settled.append((commit_log.settled_trailer(outcome), operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Apply people's changes: render, and commit the files that differ, if any.
@@ -159,6 +161,8 @@ class CommitBatch:
         )
         author = authorship.follow_author(causes, now)
         self.commit_files(files, state, text, author, now)
+        title = text.partition("\n")[0]
+        self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
         """Return the effect of people's changes, with the old configuration if the new fails."""

@@ -45,9 +45,9 @@ class DamagedJournal(StateRepoError):
 class ProposalRecord:
     """The journal's record of a proposal, enough to resume it.
 
-    ``commits`` are the past, current and next commits of the branch, the newest last; ``base`` is
-    the commit of main below the newest. ``pushed``: the branch existed once. ``link``: its web
-    address. ``withdrawn``: the reason to delete it, or empty.
+    ``commits`` lists the commits at which the branch may be, newest last; ``base`` is the commit of
+    main under the newest one. ``pushed``: the branch has existed. ``link``: the address of its
+    merge request. ``withdrawn``: the reason to delete the branch, or empty.
     """
 
     branch: str
@@ -60,9 +60,9 @@ class ProposalRecord:
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """An accepted demand: operation id, goal, time received, and the tip known then.
+    """An accepted demand: operation id, goal, time received, and the tip known at that time.
 
-    ``proposal``: the proposal with which it awaits approval, if any.
+    ``proposal``: the proposal with which the demand awaits approval, if any.
     """
 
     operation: str
@@ -81,7 +81,7 @@ class JournalEntry:
 class Journal:
     """The journal of one process. Not thread-safe: the caller locks.
 
-    It rewrites the file when the size has doubled since the last time and exceeds 1 MiB.
+    It rewrites the file when its size has doubled since the last rewrite and exceeds 1 MiB.
     """
 
     def __init__(self, path: Path) -> None:
@@ -117,8 +117,9 @@ class Journal:
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
-        If ``durably``, the removal is fsynced, and a failure raises StateRepoError and keeps them.
-        Otherwise the next :meth:`append` makes it durable. Until then, a replay is harmless.
+        If ``durably``, the removal is fsynced; a failure raises StateRepoError and keeps the
+        demands. Otherwise the next :meth:`append` makes the removal durable. Until then, a replay
+        is harmless.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]
         records = [{"done": operation} for operation in done]
@@ -255,7 +256,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
-    """Return the lines of records that follow the digest ``chain``, and the last digest."""
+    """Return the lines for records, chained to the digest ``chain``, and the last digest."""
     lines = []
     for record in records:
         body = json.dumps(record, ensure_ascii=True)
@@ -288,7 +289,7 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         if record.keys() == {"done"}:
             pending.pop(record["done"], None)
             return
-        if proposal := record.pop("proposal", None):
+        if (proposal := record.pop("proposal", None)) is not None:
             proposal = ProposalRecord(**{**proposal, "commits": tuple(proposal["commits"])})
         entry = JournalEntry(**record, proposal=proposal)
         received = datetime.fromisoformat(entry.received)

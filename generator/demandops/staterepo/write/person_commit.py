@@ -1,6 +1,6 @@
-"""A person's commit, made for them by a command: on main, or on a branch to be merged.
+"""Commits that a command makes for a person: on main, or on a branch to be merged.
 
-It has the person's own name as author and committer, so a generator reads it like any other edit.
+The person is author and committer, so a generator reads the commit like any other edit.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Author:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A commit on main, or on a branch; ``link`` is the merge request that the server printed."""
+    """A commit on main, or on a branch; ``link`` is the merge request's address."""
 
     commit: str
     branch: str
@@ -153,7 +153,7 @@ def _commit(
 
 
 def _faults(tree: Tree) -> set[Fault]:
-    """Return the faults of a configuration; a commit may not add to those that main has."""
+    """Return the faults of a configuration; a commit must not add new faults to main."""
     try:
         last_valid_config.config_at(tree)
     except InvalidInput as error:

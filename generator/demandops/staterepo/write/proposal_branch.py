@@ -1,7 +1,8 @@
 """Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
 
 The generator rebuilds a branch on a newer main and deletes it in the end, but only if the branch
-is at the commit that the generator put there. It knows no forge except GitLab's push options.
+is at the commit that the generator put there. This module knows nothing of forges except GitLab's
+push options.
 """
 
 from __future__ import annotations
@@ -89,7 +90,7 @@ class ProposalBranches:
 
         Raises:
             BranchMoved: the branch is not at ``expected``.
-            RemoteAway, PushDenied: it could not be pushed for another reason.
+            RemoteAway, PushDenied: the branch could not be pushed for another reason.
         """
         with self._repository.new.packed(commit):
             return self._move(branch, commit, expected, options)
@@ -148,13 +149,13 @@ class ProposalBranches:
     def is_up_to_date(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether merging ``commit`` into ``tip`` changes ``files`` and no others, cleanly.
+        """Return whether ``commit`` merges into ``tip`` cleanly and changes just ``files``.
 
         Args:
             tip: the current commit of main.
             commit: the proposal, on top of ``base``.
             base: the commit of main that the proposal was made on.
-            files: what the demands write on the current main.
+            files: the files that the demands write on the current main.
         """
         objects = self._repository.objects
         try:

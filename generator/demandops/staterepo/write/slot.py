@@ -56,8 +56,8 @@ class Slot:
     def _adopt_orphans(self, root: Path) -> None:
         """Take over the journals of dead processes.
 
-        An entry is written to this journal before it is removed from the old one. A crash between
-        leaves two entries, which count once, because they have the same operation id.
+        An entry is written to this journal before it is removed from the old one. A crash in
+        between leaves two entries, which count once, because they have the same operation id.
         """
         for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
             lock = _lock(journal.parent) if journal.parent != self.folder else None
@@ -76,7 +76,8 @@ class Slot:
 class FoundJournal:
     """A journal on this machine, and its demands that are not done.
 
-    ``damage`` is the error of reading it, or empty; ``set_aside`` is where the file is now.
+    ``damage`` is the error of reading the journal, or empty; ``set_aside`` is the file's new path
+    if it was renamed.
     """
 
     file: Path
@@ -88,7 +89,7 @@ class FoundJournal:
 def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:
     """Yield the journals of a data folder that have demands or are damaged.
 
-    The damaged ones are renamed if ``set_aside``, except those that a running process uses.
+    Damaged journals are renamed if ``set_aside``, unless a running process uses them.
     """
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:

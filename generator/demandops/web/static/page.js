@@ -55,14 +55,20 @@ function say(text) {
   live.classList.toggle("current", /^(live|updated)$/.test(text));
 }
 
+// as config/durations.py writes it: 3h20m
+function span(seconds) {
+  const units = [[86400, "d"], [3600, "h"], [60, "m"], [1, "s"]], left = Math.floor(Math.abs(seconds));
+  const place = units.findIndex(([size]) => left >= size || size === 1);
+  const [size, unit] = units[place], [smaller, name] = units[place + 1] ?? [];
+  const whole = Math.floor(left / size), rest = smaller && whole < 10 ? Math.floor(left % size / smaller) : 0;
+  return `${whole}${unit}${rest ? `${rest}${name}` : ""}`;
+}
+
 function age() {
   const now = Date.now();
   for (const one of document.querySelectorAll("time[datetime]")) {
     const seconds = (now - Date.parse(one.dateTime)) / 1000;
-    const amount = Math.abs(seconds);
-    const [length, unit] = amount >= 86400 ? [86400, "d"] : amount >= 3600 ? [3600, "h"] : amount >= 60 ? [60, "min"] : [1, "s"];
-    const text = `${Math.round(amount / length)} ${unit}`;
-    const wanted = seconds >= 0 ? `${text} ago` : `in ${text}`;
+    const wanted = seconds > -1 ? `${span(seconds)} ago` : `in ${span(seconds)}`;
     if (one.textContent !== wanted) one.textContent = wanted;
   }
 }

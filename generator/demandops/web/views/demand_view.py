@@ -14,15 +14,15 @@ from demandops.quoting import quoted
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import API_VERSION
 from demandops.staterepo.reader import Reader
-from demandops.web.moment import Situation
+from demandops.web.situation import Situation
 
 
 @dataclass(frozen=True, slots=True)
 class Consequence:
     """What the release of a demand would change, and how to release it.
 
-    ``file`` is a demand for ``demandops request``, empty if it is released in another way, which
-    ``how`` says. ``approval`` are the rules that require a person's approval.
+    ``file`` is a demand for ``demandops request``; empty if ``how`` names another way.
+    ``approval`` are the rules that require a person's approval.
     """
 
     releases: tuple[ReleaseChange, ...]

@@ -11,7 +11,8 @@ from typing import TypeVar
 
 from demandops.config.inventory import Node
 from demandops.plan.release import ServiceRelease
-from demandops.web.moment import Situation
+from demandops.web.situation import Situation
+from demandops.web.views.filtered_table import Filter, Row
 from demandops.web.views.health_word import PLACES, WORDS, word_of
 from demandops.web.views.lists import rows_of
 from demandops.web.views.map_layout import (
@@ -23,7 +24,6 @@ from demandops.web.views.map_layout import (
     by_cluster,
     by_place,
 )
-from demandops.web.views.rows import Filter, Row
 
 _LINE = 15.0
 _MOST_DETAILED, _MOST_NAMED, _MOST_NODES = 40, 250, 1_000
@@ -45,7 +45,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Mass:
-    """Many nodes or lines of one tone, drawn together as one path."""
+    """Many nodes or lines of one color, drawn together as one path."""
 
     tone: str
     path: str

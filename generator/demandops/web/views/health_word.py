@@ -1,4 +1,4 @@
-"""The health of a release in one word, and the tone in which the page shows it."""
+"""The health of a release in one word, and the color of this word on the page."""
 
 from __future__ import annotations
 

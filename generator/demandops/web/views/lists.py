@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, TypeAlias
 
+from demandops.config.durations import duration_text
 from demandops.demand.claim import Claim, requesters_of
 from demandops.ledger.waiting import WaitingDemand
 from demandops.ledger.world import World
@@ -14,9 +15,9 @@ from demandops.plan.planner import connection_topics
 from demandops.plan.release import ServiceRelease
 from demandops.plan.views import demand_list
 from demandops.subject import SubjectKind
-from demandops.web.moment import KnownRows, Moment, Situation
+from demandops.web.situation import KnownRows, Moment, Situation
+from demandops.web.views.filtered_table import Cell, Column, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import PLACES, WORDS, word_of, worst_word
-from demandops.web.views.rows import Cell, Column, Link, Part, Row, cell, exactly
 
 Parts: TypeAlias = "tuple[Any, ...]"
 
@@ -25,8 +26,8 @@ Parts: TypeAlias = "tuple[Any, ...]"
 class ListKind:
     """A kind of list: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields each entry's id and the parts from which ``row`` makes its row. It makes the
-    row anew only if a part differs.
+    ``entries`` yields each entry's id and the parts from which ``row`` makes the row. A row is made
+    anew only if a part differs.
     """
 
     name: str
@@ -177,8 +178,8 @@ def _lease(world: World, claim: Claim) -> Row:
             "kind": cell(claim.subject.kind.value[:-1]),
             "demand": cell(demand_part(claim.demand)),
             "requester": _requesters(claim.requesters),
-            "term": cell(f"{lease.seconds} s", order=float(lease.seconds)),
-            "slack": cell(f"{lease.slack} s", order=float(lease.slack)),
+            "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
+            "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
         },
         {"node": demand_list.nodes_of(claim)},
     )

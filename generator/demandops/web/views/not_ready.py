@@ -1,12 +1,13 @@
-"""The applications that are not ready, and the causes: since when, and who can mend them."""
+"""The applications that are not ready, and the causes: since when, and who can fix them."""
 
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import datetime
 
+from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, requesters_of
@@ -16,18 +17,20 @@ from demandops.plan.release import ServiceRelease
 from demandops.plan.views import release_causes
 from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.write.proposal_branch import PendingProposal
-from demandops.web.moment import Moment, Situation
+from demandops.web.situation import Moment, Situation
+from demandops.web.views.filtered_table import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import WORDS, since_of, word_of, worst_word
 from demandops.web.views.remedy import KINDS, Kind, LastChange, Remedy, remedy_of
-from demandops.web.views.rows import Cell, Filter, Link, Part, Row, cell, exactly
+
+_MOST_LISTED = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
     """Something that keeps applications from being ready.
 
-    ``told`` are the exact words of the cluster, a file's check or a person. ``releases`` are those
-    that cannot run because of it.
+    ``told`` is the exact text of the cluster, a file's check or a person. ``releases`` cannot run
+    because of the cause.
     """
 
     kind: Kind
@@ -43,7 +46,7 @@ class Cause:
 
     @property
     def tone(self) -> str:
-        """The tone in which the page shows the cause."""
+        """The color of the cause on the page."""
         return KINDS[self.kind]
 
     def row(self) -> Row:
@@ -67,12 +70,17 @@ class Ready:
 
     @property
     def tone(self) -> str:
-        """The tone in which the page shows the word."""
+        """The color of :attr:`word` on the page."""
         return {**WORDS, **KINDS}[self.word]
 
 
-def causes(now: Situation, wanted: Filter, last_change: LastChange) -> list[Cause]:
-    """Return every cause that matches, the worst and oldest first."""
+def causes(
+    now: Situation, wanted: Filter, last_change: LastChange, pending: Collection[str] = ()
+) -> list[Cause]:
+    """Return every cause that matches, the worst and oldest first.
+
+    ``pending`` are the generated files that a generator has yet to write or remove.
+    """
     found = [
         *_unread(now),
         *_invalid(now, last_change),
@@ -81,6 +89,8 @@ def causes(now: Situation, wanted: Filter, last_change: LastChange) -> list[Caus
         *_of_releases(now, last_change),
         *map(_waits, in_turn(now.moment.state.ledger.waiting)),
         *map(_proposed, now.proposals),
+        *map(_unapplied, now.old_bootstraps),
+        *(_pending(now.moment, sorted(pending)) if pending else ()),
     ]
     places = {kind: place for place, kind in enumerate(KINDS)}
     latest = now.now.timestamp()
@@ -213,6 +223,28 @@ def _proposed(proposal: PendingProposal) -> Cause:
         since=proposal.since,
         requesters=proposal.requesters,
         demands=proposal.demands,
+    )
+
+
+def _unapplied(old: OldBootstrap) -> Cause:
+    return Cause(
+        "decision",
+        Part(old.file),
+        f"is not applied to cluster '{old.cluster}' as it is now",
+        Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
+        told=f"access domains: {', '.join(old.domains)}",
+    )
+
+
+def _pending(moment: Moment, paths: list[str]) -> Iterator[Cause]:
+    more = f" and {len(paths) - _MOST_LISTED} more" if len(paths) > _MOST_LISTED else ""
+    yield Cause(
+        "waiting",
+        Part("1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"),
+        f"{'waits' if len(paths) == 1 else 'wait'} for a generator to carry out a person's commit",
+        Remedy("the operator of the generator", "start one; it does so at its next fetch"),
+        told=", ".join(paths[:_MOST_LISTED]) + more,
+        since=moment.entry.time,
     )
 
 

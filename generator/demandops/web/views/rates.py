@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from statistics import median
 
-from demandops.web.moment import Commit, HealthChange
+from demandops.config.durations import span
+from demandops.web.situation import Commit, HealthChange
 from demandops.web.views.time_line import SPANS
 
 WIDTH, HEIGHT = 560, 150
@@ -106,7 +107,7 @@ class _Maker:
         per_hour = total * 3600 / self._span
         summary = f"{total} in all, {per_hour:.3g} an hour"
         values = [float(len(one)) for one in bins]
-        return self._plot(title, f"per {_duration(self._bin_s)}", about, values, summary, "")
+        return self._plot(title, f"per {span(self._bin_s)}", about, values, summary, "")
 
     def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
         """Return a plot of the median of the samples in each bin of time."""
@@ -150,10 +151,3 @@ class _Maker:
         return Plot(
             title, unit, about, bars, f"{top:.3g}{suffix}", self._start, end, summary, table
         )
-
-
-def _duration(seconds: float) -> str:
-    for unit, length in (("days", 86400), ("hours", 3600), ("minutes", 60)):
-        if seconds >= length:
-            return f"{seconds / length:.3g} {unit}"
-    return f"{seconds:.3g} seconds"

@@ -18,7 +18,7 @@ from demandops.quoting import quoted
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry, PathHistory
 from demandops.staterepo.reader import Reader
-from demandops.web.moment import Moment, Situation
+from demandops.web.situation import Moment, Situation
 from demandops.web.views.health_word import WORDS, since_of, word_of
 
 MOST_CHANGES = 20
@@ -36,8 +36,8 @@ class DiffLine:
 class Explained:
     """A release that runs, was denied, or ran before; ``release`` is ``None`` if it does not run.
 
-    ``difference`` is what its newest change changed in its file. The page shows an override that
-    would stop the release; ``stop_with_it`` are the other releases that it would stop.
+    ``difference`` is the newest change of the release's file. The page shows an override that
+    would stop the release; ``stop_with_it`` are the other releases that the override would stop.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Explained:
 
     @property
     def tone(self) -> str:
-        """The tone in which the page shows the word."""
+        """The color of :attr:`word` on the page."""
         return WORDS.get(self.word, "none")
 
     @property
@@ -76,7 +76,7 @@ class Explained:
 
 
 def explained(now: Situation, reader: Reader, name: str) -> Explained:
-    """Return why the release with a name runs, and its history.
+    """Return why a release runs, and the release's history.
 
     Raises:
         StateRepoError: if there is no such release and never was.

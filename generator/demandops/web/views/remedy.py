@@ -1,4 +1,4 @@
-"""Who can mend a release that is not ready, as far as its files and its cluster tell."""
+"""Who can fix a release that is not ready, as far as its files and its cluster show."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINDS: dict[str, str] = {
     "waiting": "busy",
     "starting": "busy",
 }
-"""The kinds of causes, in the order of the view, and their tones."""
+"""The kinds of causes, in the order of the view, and their colors."""
 
 LastChange = Callable[[str], "LogEntry | None"]
 """Returns the newest commit that changed a file, if there is one."""
@@ -32,7 +32,7 @@ LastChange = Callable[[str], "LogEntry | None"]
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """Who can mend a cause, how, and by which command; all but ``who`` may be empty."""
+    """Who can fix a cause, how, and by which command; all but ``who`` may be empty."""
 
     who: str
     how: str = ""
@@ -52,7 +52,7 @@ def remedy_of(
     reason: str,
     last_change: LastChange,
 ) -> Remedy:
-    """Return who can mend a release, as far as its configuration and the cluster's words tell."""
+    """Return who can fix a release, as far as its configuration and its cluster show."""
     cluster, (word, _, name) = release.node.cluster, object.partition(" ")
     namespace, _, short = name.partition("/")
     describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]

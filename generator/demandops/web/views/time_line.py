@@ -9,9 +9,9 @@ from datetime import datetime, timedelta, timezone
 
 from demandops.config.override import OVERRIDES_ROOT
 from demandops.staterepo.history.commit_log import PROPOSAL
-from demandops.web.moment import Commit, HealthChange
+from demandops.web.situation import Commit, HealthChange
+from demandops.web.views.filtered_table import Filter, Row, cell
 from demandops.web.views.health_word import WORDS
-from demandops.web.views.rows import Filter, Row, cell
 
 LANES = {
     "demands": "Demands",
@@ -64,7 +64,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Events of one lane that are close together; ``commit`` is the newest one's."""
+    """Events of one lane that are close together; ``commit`` is the commit of the newest event."""
 
     lane: str
     x: float

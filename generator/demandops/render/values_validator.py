@@ -34,7 +34,8 @@ def validator(text: str, file: str) -> Any:  # noqa: ANN401
     """Return the validator of a schema.
 
     Raises:
-        InvalidInput: if it is no schema, refers to another document, or applies too many schemas.
+        InvalidInput: if ``text`` is no schema, refers to another document, or applies too many
+            schemas.
     """
     schema: Any = None
     try:
@@ -95,7 +96,7 @@ class _Work:
             return 1
         key = (id(schema), depth)
         if key not in self._known:
-            # while it is being counted, it is too much: so a schema that contains itself is found
+            # too high while it is being counted, so that a schema that contains itself is found
             self._known[key] = _MAX_WORK + 1
             self._known[key] = self._counted(schema, depth)
         work = self._known[key]

@@ -25,9 +25,9 @@ class NoAccess(ValueError):
 class ClusterAccess(FrozenModel):
     """The access to a cluster: its API, a webhook of its controller, or both.
 
-    ``receiver`` is the URL of a Flux Receiver and ``webhook`` that of an Argo CD. ``secret_file``
-    holds the secret that signs calls to them. ``wake`` says whether the controller is woken after
-    a push.
+    ``receiver`` is the URL of a Flux Receiver, ``webhook`` the URL of Argo CD's webhook.
+    ``secret_file`` holds the secret that signs calls to either. ``wake`` says whether the
+    controller is woken after a push.
     """
 
     kubeconfig: Path | None = Field(default=None, strict=False)
@@ -60,7 +60,7 @@ class ClusterAccess(FrozenModel):
         """Return the cluster's API for objects of any kind.
 
         Raises:
-            ConfigException, OSError: by the library, if the kubeconfig cannot be used.
+            ConfigException, OSError: from the library, if the kubeconfig cannot be used.
         """
         from kubernetes import client, config  # noqa: PLC0415 - half a second; only when used
 

@@ -27,7 +27,7 @@ def is_url(address: str) -> bool:
     """Return whether this is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
     try:
         exists = Path(address).exists()
-    except OSError:  # it is too long for a name, or in a folder that this user cannot read
+    except OSError:  # the address is too long, or in a folder that this user cannot read
         exists = False
     return not exists and bool(_SCHEME.match(address) or _SCP.match(address))
 
@@ -40,12 +40,12 @@ def connect(
     allow_offline: bool = False,
     only_read: bool = False,
 ) -> StateRepository:
-    """Return the state repo in a bare repository, or at a URL that git clones to ``folder``.
+    """Return the state repo at an address: a bare repository, or a URL, cloned to ``folder``.
 
     Args:
         notify: called with a text before work that takes a while.
         allow_offline: use an existing clone if its remote cannot be reached.
-        only_read: the folder may also be a checkout.
+        only_read: the address may also be a checkout.
 
     Raises:
         StateRepoError: the address is not usable, or the remote cannot be reached.

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from demandops import strict_yaml
 from demandops.charts import chart_files
 from demandops.config.appdef import Deployed, ServiceDefinition
+from demandops.config.checks.override_conflicts import check_override_conflicts
 from demandops.config.config import (
     BROKERS_FILE,
     CHARTS_FILE,
@@ -22,8 +23,8 @@ from demandops.config.config import (
     Config,
 )
 from demandops.config.config_reader import ConfigReader
+from demandops.config.node_property import asked_kind, kind_of
 from demandops.config.override import Override, patched_settings
-from demandops.config.override_conflicts import check_override_conflicts
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
 from demandops.errors import InvalidInput, suggestion
@@ -54,6 +55,12 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
         reader.check_reference(file, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
         for peer in node.bridged:
             reader.check_reference(file, f"{place}.bridged.{peer}", peer, NODES_FILE)
+        for name, value in node.properties.items():
+            kind, first = config.property_kinds[name]
+            if kind_of(value) != kind and node.id not in config.hosts:
+                where = f"at '{first}' in {config.file_of(NODES_FILE, first)}"
+                message = f"is {kind_of(value)}, but {kind} {where}; give all nodes one type"
+                reader.add_fault(file, f"{place}.properties.{name}", message)
         for role in node.topics:
             if roles and role not in roles:
                 message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
@@ -153,6 +160,13 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
         if f"{folder}/{service.values}" not in config.files:
             message = f"'{service.values}' does not exist; add it beside {own}"
             reader.add_fault(file, f"{where}values", message)
+        for word, value in (service.place.properties if service.place else {}).items():
+            kind, first = config.property_kinds.get(word, (None, ""))
+            if kind and asked_kind(value) != kind:
+                registry = config.file_of(NODES_FILE, first)
+                message = f"asks for {asked_kind(value)}, but is {kind} at '{first}' in {registry}"
+                message += f"; ask for {kind}"
+                reader.add_fault(file, f"{where}place.properties.{word}", message)
         if service.prefix in words:
             message = f"'{service.prefix}' is the prefix of connections; choose another"
             reader.add_fault(file, f"{where}prefix", message)

@@ -38,7 +38,7 @@ Text: TypeAlias = "str | int | Part"
 class Cell:
     """The content of one field of a row: texts, or a time.
 
-    ``tone`` colours it. ``order`` is its sort key, by default its first text.
+    ``tone`` is the cell's color. ``order`` is the sort key, by default the first text.
     """
 
     parts: tuple[Part, ...] = ()

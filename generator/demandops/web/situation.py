@@ -8,6 +8,7 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any
 
+from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.health.release_health import Health, Target
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.config.config import Config
@@ -47,8 +48,8 @@ class Planned:
 class KnownRows:
     """The rows of a list by their ids, each with the parts from which it was made.
 
-    ``made_for`` are the statuses that they were made for, or None if an earlier moment made
-    them.
+    ``made_for`` are the statuses that the rows show, or None if an earlier moment made the
+    rows.
     """
 
     made_for: object
@@ -72,6 +73,8 @@ class Moment:
         self._planned: dict[ReleaseKey, Planned | None] | None = None
         self.last_changes: dict[str, LogEntry | None] = {}
         """File → the newest commit that changed it, for files that were asked for."""
+        self.not_rendered: frozenset[str] | None = None
+        """The files that a generator has yet to write or remove, if they were asked for."""
 
     @property
     def commit(self) -> str:
@@ -239,7 +242,8 @@ class Situation:
     """The state at a moment, with the health of releases and the open proposals.
 
     ``statuses`` are those of releases, by name; empty for an earlier moment. ``watched`` are the
-    clusters that are watched. ``unread`` is why a newer state cannot be read, or empty.
+    clusters that are watched. ``old_bootstraps`` are those without the current bootstrap file.
+    ``unread`` is why a newer state cannot be read, or empty.
     """
 
     moment: Moment
@@ -249,6 +253,7 @@ class Situation:
     watched: frozenset[str] = frozenset()
     proposals: tuple[PendingProposal, ...] = ()
     unread: str = ""
+    old_bootstraps: tuple[OldBootstrap, ...] = ()
 
     def status(self, release: str) -> ReleaseStatus:
         """Return the status of a release."""

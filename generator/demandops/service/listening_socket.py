@@ -13,7 +13,7 @@ def bound(address: str, option: str) -> socket.socket:
     """Return a socket that listens on ``host:port``; port 0 picks a free port.
 
     Raises:
-        InvalidInput: naming the option, if it cannot listen on the address.
+        InvalidInput: the socket cannot listen on the address; the error names the option.
     """
     host, colon, port = address.rpartition(":")
     if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 0xFFFF:

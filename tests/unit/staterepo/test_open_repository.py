@@ -7,7 +7,7 @@ from pathlib import Path
 import pygit2
 import pytest
 from demandops.errors import StateRepoError
-from demandops.staterepo.git.address import connect, is_url
+from demandops.staterepo.git.open_repository import connect, is_url
 from demandops.staterepo.git.remote_repository import without_secrets
 from demandops.staterepo.git.repository import RemoteAway
 

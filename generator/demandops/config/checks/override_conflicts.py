@@ -95,7 +95,7 @@ def _selects_services(selector: Selector) -> bool:
 
 
 def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
-    """Yield the fields that tell the selectors apart, because a release has one value there."""
+    """Yield the fields that separate the selectors: a release has a single value for each."""
     yield from ("services", "nodes")
     if not any(_shared(one, other, services) for services in config.services.values()):
         yield from ("applications", "appdefs")

@@ -1,0 +1,159 @@
+"""Properties of nodes: typed values in the inventory, and what a place asks of them.
+
+A value is a number, text, true or false. What is asked is a text: ``ros=jazzy``, ``memoryGiB>=8``
+or ``memoryGiB<=64``. On all nodes a property has values of one type. This type says how the text is
+read.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import AfterValidator, StringConstraints, WithJsonSchema
+
+from demandops import strict_yaml
+from demandops.quoting import quoted
+
+_NAME = "[a-z][A-Za-z0-9_]*"
+_TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
+_ASKED = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
+_BOUNDS = {"min": ">=", "max": "<="}
+
+PropertyName = Annotated[str, StringConstraints(pattern=f"^{_NAME}$", max_length=63)]
+"""A name of a property; a unit belongs to it: ``memoryGiB``."""
+
+Kind = Literal["a number", "text", "true or false"]
+"""The type of a property's values, in words."""
+
+
+class Asked(NamedTuple):
+    """What is asked of a property."""
+
+    name: str
+    sign: str
+    value: str
+
+
+def kind_of(value: object) -> Kind | None:
+    """Return the type of a property's value; ``None`` if no property may have it."""
+    match value:
+        case bool():
+            return "true or false"
+        case int() | float():
+            return "a number" if _number(value) is not None else None
+        case str() if _TEXT.fullmatch(value):
+            return "text"
+    return None
+
+
+def _value(value: object) -> object:
+    if kind_of(value) is None:
+        shown = strict_yaml.short_repr(value)
+        raise ValueError(f"is {shown}; give a number, true, false, or a short plain text")
+    return value
+
+
+def _asked_value(value: object) -> object:
+    if not isinstance(value, dict):
+        return _value(value)
+    bounds = {*map(str, value)}
+    if not bounds or bounds - _BOUNDS.keys():
+        raise ValueError("give min, max or both, or a plain value")
+    for bound in value.values():
+        if kind_of(bound) != "a number":
+            shown = strict_yaml.short_repr(bound)
+            raise ValueError(f"has the bound {shown}; give a number")
+    if len(bounds) == 2 and value["min"] > value["max"]:
+        raise ValueError("has a min above its max; lower min or raise max")
+    return value
+
+
+_PLAIN: list[dict[str, Any]] = [{"type": name} for name in ("number", "string", "boolean")]
+_LIMITS: dict[str, Any] = {
+    "title": "Bounds",
+    "type": "object",
+    "properties": {bound: {"type": "number"} for bound in _BOUNDS},
+    "additionalProperties": False,
+    "minProperties": 1,
+}
+PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": _PLAIN})]
+"""The value of a node's property."""
+AskedValue = Annotated[
+    Any, AfterValidator(_asked_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
+]
+"""The value that a definition asks for, or bounds of a number: ``{min: 8}``."""
+
+
+def asked_texts(properties: Mapping[str, object]) -> Iterator[str]:
+    """Yield what a definition's ``properties`` ask for, as texts."""
+    for name, value in properties.items():
+        if isinstance(value, dict):
+            yield from (f"{name}{_BOUNDS[bound]}{limit}" for bound, limit in value.items())
+        else:
+            yield f"{name}={str(value).lower() if isinstance(value, bool) else value}"
+
+
+def asked_kind(value: object) -> Kind | None:
+    """Return the type of property that a definition's value can be compared with."""
+    return "a number" if isinstance(value, dict) else kind_of(value)
+
+
+@lru_cache(maxsize=1024)
+def asked_in(text: str) -> Asked | None:
+    """Return what a text asks for; ``None`` if the text cannot be read."""
+    match = _ASKED.fullmatch(text)
+    asked = Asked(*match.groups()) if match else None
+    return None if asked and asked.sign != "=" and _number(asked.value) is None else asked
+
+
+def problem_of(asked: Asked, kind: Kind) -> str:
+    """Return why what is asked cannot be compared with a property of a type, or an empty text."""
+    if _read(asked, kind) is not None:
+        return ""
+    return f"{quoted(asked.name)} is {kind}; ask for {_EXAMPLES[kind].format(asked.name)}"
+
+
+_EXAMPLES: dict[Kind, str] = {
+    "a number": "{0}=8, {0}>=8 or {0}<=8",
+    "text": "{0}=word",
+    "true or false": "{0}=true or {0}=false",
+}
+
+
+def has_asked(properties: Mapping[str, object], text: str) -> bool:
+    """Return whether a node with these properties has what a text asks for."""
+    asked = asked_in(text)
+    value = properties.get(asked.name) if asked else None
+    kind = kind_of(value)
+    wanted = _read(asked, kind) if asked and kind else None
+    if wanted is None or asked is None:
+        return False
+    match asked.sign:
+        case ">=":
+            return bool(value >= wanted)  # type: ignore[operator]  # both are numbers
+        case "<=":
+            return bool(value <= wanted)  # type: ignore[operator]
+    return value == wanted
+
+
+def _read(asked: Asked, kind: Kind) -> object:
+    """Return the asked value as a type; ``None`` if it is not of that type."""
+    if kind == "a number":
+        return _number(asked.value)
+    if asked.sign != "=":
+        return None
+    if kind == "text":
+        return asked.value
+    return {"true": True, "false": False}.get(asked.value)
+
+
+def _number(value: str | float) -> float | None:
+    try:
+        number = float(value)
+    except (ValueError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None

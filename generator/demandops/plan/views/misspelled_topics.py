@@ -1,0 +1,100 @@
+"""Warnings about misspelled topics: those that differ by a letter from a known topic of the node.
+
+Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ by a
+digit, or by a letter of a short word (``lidar_fl``, ``lidar_fr``), are two topics.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import takewhile
+
+from demandops.connections.connection import Connection
+from demandops.demand.application import Application
+from demandops.demand.demand_request import DemandRequest
+from demandops.errors import Fault, fault
+from demandops.ledger import claim_file
+from demandops.ledger.world import World
+
+_WORD = re.compile(r"[A-Za-z]+")
+_SHORT = 4
+
+
+def notes(request: DemandRequest, world: World) -> Iterator[str]:
+    """Yield a warning for each misspelled topic that a request lists."""
+    if request.adds_claims:
+        known = _KnownTopics(world)
+        for one in request.demanded:
+            yield from known.notes_on(one.held)
+
+
+def warnings(world: World) -> Iterator[Fault]:
+    """Yield a warning for each misspelled topic of a claim."""
+    known = _KnownTopics(world)
+    for claim in sorted(world.ledger, key=lambda one: claim_file.path_of(one.key)):
+        for note in known.notes_on(claim.held):
+            yield fault("", note).within(claim_file.path_of(claim.key))
+
+
+class _KnownTopics:
+    """The known topics of each node: those of the inventory, and those that demands took first."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._listed: dict[str, frozenset[str]] = {}
+        self._booked: dict[tuple[str, str], frozenset[str]] = {}
+        self._told: set[tuple[str, str]] = set()
+
+    def notes_on(self, held: Application | Connection) -> Iterator[str]:
+        """Yield a warning for each misspelled topic, and none that was given before."""
+        if isinstance(held, Application):
+            for role, one in held.all_inputs():
+                known = self._of(one.source) | self._usual(role, one.source)
+                yield from self._notes(f"application '{held.id}'", one.source, one.topic, known)
+            return
+        for route in held.topics:
+            sender, _ = route.sender_and_receiver(held.source, held.target)
+            topic = route.read_topic
+            yield from self._notes(f"connection '{held.id}'", sender, topic, self._of(sender))
+
+    def _notes(self, what: str, node: str, topic: str, known: frozenset[str]) -> Iterator[str]:
+        near = () if topic in known else sorted(one for one in known if _is_misspelling(topic, one))
+        if near and (node, topic) not in self._told:
+            self._told.add((node, topic))
+            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{near[0]}'?"
+
+    def _of(self, node: str) -> frozenset[str]:
+        if node not in self._listed:
+            entry = self._world.config.nodes.get(node)
+            bridged = entry.bridged.values() if entry else ()
+            self._listed[node] = frozenset(
+                (*entry.topics.values(), *entry.types, *(one for some in bridged for one in some))
+                if entry
+                else ()
+            )
+        return self._listed[node]
+
+    def _usual(self, role: str, source: str) -> frozenset[str]:
+        if (role, source) not in self._booked:
+            found = self._world.ledger.usual_topics(role, source, but="")
+            self._booked[role, source] = frozenset(found)
+        return self._booked[role, source]
+
+
+def _is_misspelling(one: str, other: str) -> bool:
+    """Return whether two names differ by one letter, or by two that changed places."""
+    start = _common(one, other)
+    end = _common(one[start:][::-1], other[start:][::-1])
+    rest, known = one[start : len(one) - end], other[start : len(other) - end]
+    if sorted(rest) != sorted(known) and max(len(rest), len(known)) > 1:
+        return False
+    if len(rest) > len("ab") or not (rest + known).isalpha():
+        return False
+    word = next(found for found in _WORD.finditer(other + " a") if found.end() >= start)
+    return len(word[0]) >= _SHORT and word.start() <= start
+
+
+def _common(one: str, other: str) -> int:
+    """Return how many characters two texts have in common at their start."""
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))

@@ -1,0 +1,62 @@
+"""Finds the line of a values template that wrote a faulty line of the rendered text."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+from demandops import field_lines
+from demandops.errors import Fault
+
+_EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
+_PLACE = re.compile(r"line (\d+)")
+_LONGEST = 2_000
+"""How long a line may be; comparing a longer one could take long."""
+_VALUES = "values."
+
+
+class TemplateLines:
+    """The lines of a template, and of the text that it rendered to."""
+
+    def __init__(self, template: str, rendered: str) -> None:
+        self._template, self._rendered = template.splitlines(), rendered.splitlines()
+        self._text = rendered
+        self._fields: dict[str, int] | None = None
+
+    def located(self, fault: Fault) -> Fault:
+        """Return a fault of the rendered text with the line of the template, if one is known."""
+        place = _PLACE.match(fault.field)
+        number = int(place[1]) if place else self._number_of(fault.field.removeprefix(_VALUES))
+        return replace(fault, line=fault.line or (self._line_of(number) if number else None))
+
+    def _number_of(self, path: str) -> int | None:
+        if self._fields is None:
+            self._fields = field_lines.lines(self._text)
+        return field_lines.nearest(path, self._fields)
+
+    def _line_of(self, number: int) -> int | None:
+        """Return the line of the template that wrote a line of the text; None if several may have.
+
+        An identical line of the template goes before a line with expressions.
+        """
+        if number > len(self._rendered) or len(self._rendered[number - 1]) > _LONGEST:
+            return None
+        rendered = self._rendered[number - 1]
+        lines = [*enumerate(self._template, 1)]
+        same = [at for at, line in lines if line == rendered]
+        found = same or [at for at, line in lines if _may_write(line, rendered)]
+        return found[0] if len(found) == 1 else None
+
+
+def _may_write(line: str, rendered: str) -> bool:
+    """Return whether the text around the expressions of a line occurs in a rendered line."""
+    first, *others = _EXPRESSION.split(line)
+    if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):
+        return False
+    at, end = len(first), len(rendered) - len(others[-1])
+    for part in others[:-1]:
+        at = rendered.find(part, at)
+        if at < 0:
+            return False
+        at += len(part)
+    return at <= end and rendered.endswith(others[-1])

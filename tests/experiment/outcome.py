@@ -1,0 +1,81 @@
+"""What an experiment plays, and all that was seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from . import routes
+from .fleet import Carrier
+from .routes import Way
+from .rules import Event, Near, Pose
+from .running_pod import RunningPod
+
+if TYPE_CHECKING:
+    from tests.e2e.rig.cluster import Gitops
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to play: routes by a seed, or the tracks of a bag."""
+
+    gitops: Gitops = "flux"
+    connections: Carrier = "mqtt"
+    seed: int = 0
+    gap: float = 10.0
+    short: bool = False
+    vanish: str = ""
+    bag: str = ""
+    large: int = 0
+    tracks: tuple[Way, ...] = ()
+
+    def routes(self) -> tuple[Way, ...]:
+        """Return who drives where."""
+        if self.tracks:
+            return self.tracks
+        if self.large:
+            return routes.many(self.seed, self.large)
+        found = routes.one(self.seed, self.gap) if self.short else routes.four(self.seed, self.gap)
+        return routes.vanishing(found, self.vanish) if self.vanish else found
+
+
+@dataclass(frozen=True)
+class Formed:
+    """A demand that the detector formed: its commit, its stages, and what was booked after it."""
+
+    commit: str
+    vehicle: str
+    joins: bool
+    stages: dict[str, float]
+    books: dict[str, list[str]] | None  # None: nobody looked
+
+    def __str__(self) -> str:
+        return f"{self.vehicle} {'joins' if self.joins else 'leaves'}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that was seen. Times are seconds since 1970."""
+
+    settings: Settings
+    routes: tuple[Way, ...]
+    near: Near
+    set_off: float
+    over: float
+    held: float
+    poses: list[Pose]
+    events: list[Event]
+    formed: list[Formed]
+    pods: list[RunningPod]
+    node_ids: dict[str, str]
+    inputs: list[tuple[float, frozenset[str]]]
+    fused: list[tuple[float, float, int]]
+    tracks: list[tuple[float, list[tuple[float, float]]]]
+    arrivals: dict[str, list[float]]
+    early: int
+    published: dict[str, dict[str, int]]
+    carried: dict[str, int]
+    left: frozenset[str]
+    before: frozenset[str]
+    crossings: tuple[Near, ...] = ()
+    """All intersections, if there are more."""

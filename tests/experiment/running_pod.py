@@ -1,0 +1,80 @@
+"""A pod whose containers run as processes of this machine."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+
+@dataclass
+class Container:
+    """A container, the starts of its process, and when it may start again."""
+
+    name: str
+    command: list[str]
+    environment: dict[str, str]
+    process: subprocess.Popen[bytes] | None = None
+    starts: list[float] = field(default_factory=list)
+    due: float = 0.0
+
+
+@dataclass
+class RunningPod:
+    """A pod on a node, and what became of it."""
+
+    manifest: dict[str, Any]
+    folder: Path
+    bound: float
+    containers: list[Container] = field(default_factory=list)
+    ended: float | None = None
+
+    @property
+    def name(self) -> str:
+        """The pod's name."""
+        return str(self.manifest["metadata"]["name"])
+
+    @property
+    def service(self) -> str:
+        """The name of its release or connection client."""
+        return str(self.manifest["metadata"]["labels"]["app.kubernetes.io/instance"])
+
+    @property
+    def node(self) -> str:
+        """The name of its cluster node."""
+        return str(self.manifest["spec"]["nodeName"])
+
+    def requests(self) -> tuple[float, float]:
+        """Return the processor cores and the bytes of memory that it requests."""
+        found = [c["resources"].get("requests", {}) for c in self.manifest["spec"]["containers"]]
+        cores = sum(quantity(each.get("cpu", "0")) for each in found)
+        return cores, sum(quantity(each.get("memory", "0")) for each in found)
+
+
+def program_of(image: str) -> str:
+    """Return what stands for an image's own program: its name without registry and tag."""
+    return image.rpartition("/")[2].partition("@")[0].partition(":")[0]
+
+
+def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
+    """Return the text with paths below mounts made paths of this machine."""
+    if not mounts:
+        return text
+    longest_first = sorted(mounts, key=len, reverse=True)
+    below = "|".join(map(re.escape, longest_first))
+    # in one pass: a path of this machine may lie below a mount's name, such as /tmp
+    return re.sub(rf"(?<![\w./-])({below})(?=/|$)", lambda hit: str(mounts[hit[1]]), text)
+
+
+_UNITS = {"m": 1e-3, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
+
+
+def quantity(text: str) -> float:
+    """Return a quantity of Kubernetes as a number."""
+    for unit, factor in _UNITS.items():
+        if text.endswith(unit):
+            return float(text.removesuffix(unit)) * factor
+    return float(text)
