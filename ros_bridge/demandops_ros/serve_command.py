@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -111,7 +112,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
       demandops serve --state-repo fleet.git
       demandops serve --state-repo https://git.example/fleet.git --clusters c.yaml
     """
-    with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args:
+    with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args, ExitStack() as parts:
         of_reference = reference_parameters.read(ros_args)
         settings = node_parameters.read(
             {
@@ -133,33 +134,36 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
                 fetch_interval=parse_interval(settings["fetch_interval"]),
                 signing_key=signing_key,
             )
+        parts.callback(generator.close)
+        signals = parts.enter_context(_Signals())
         for warning in reference_parameters.warnings(of_reference, generator.snapshot.state.config):
             errors.print(f"warning: {warning}")
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
+        parts.callback(trigger.close)
         generator.on_publish(trigger)
         trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
-        push_webhook = PushWebhook(webhook, secret, generator.fetch_now) if webhook else None
-        page = _page(web, generator, settings, clusters) if web else None
+        if webhook:
+            push_webhook = PushWebhook(webhook, secret, generator.fetch_now)
+            parts.callback(push_webhook.close)
+            get_logger("demandops").info(f"listening for pushes at {push_webhook.url}")
+        if web:
+            parts.callback(_page(web, generator, settings, clusters).close)
         status = RolloutWatcher(clusters, generator) if clusters else None
-        with _Signals() as signals:
-            leadership = None
-            if leader_lease:
-                # publish the journal's demands before those of clients, unless they must wait
-                leadership = Leadership(
-                    leader_lease,
-                    lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
-                    signals.wake,
-                )
-                signals.wait(lambda: leadership.is_leader)
-            if signals.stopping:  # a signal came before this process was the leader
-                generator.close()
-            else:
-                _run(generator, settings, status, push_webhook, signals)
-            if leadership is not None:
-                leadership.close()
-            trigger.close()
-            if page is not None:
-                page.close()
+        if status is not None:
+            parts.callback(status.close)
+        if leader_lease:
+            # publish the journal's demands before those of clients, unless they must wait
+            leadership = Leadership(
+                leader_lease,
+                lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
+                signals.wake,
+            )
+            parts.callback(leadership.close)
+            signals.wait(lambda: leadership.is_leader)
+        if signals.stopping:  # a signal came before this process was the leader
+            generator.close()
+        else:
+            _run(generator, settings, status, signals)
 
 
 def _page(
@@ -181,7 +185,6 @@ def _run(
     generator: Generator,
     settings: dict[str, Any],
     status: RolloutWatcher | None,
-    push_webhook: PushWebhook | None,
     signals: _Signals,
 ) -> None:
     node = DemandNode(
@@ -201,11 +204,7 @@ def _run(
     thread = ros_process.ExecutorThread(node)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
-    if push_webhook is not None:
-        node.get_logger().info(f"listening for pushes at {push_webhook.url}")
     signals.wait()
-    if push_webhook is not None:
-        push_webhook.close()
     _drain(thread, node, generator, status)
     thread.close()
     node.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -54,9 +55,11 @@ LOG_LEVEL = "parameter log_level is 'loud'; it takes debug, info, warn, error, f
 def test_what_cannot_be_served_is_refused_with_a_reason(
     bare: Path, demandops: Run, args: list[str], code: int, message: str
 ) -> None:
+    threads = set(threading.enumerate())
     refused = demandops("serve", "--state-repo", bare, *args)
     assert refused.code == code
     assert message in " ".join(refused.err.split())
+    assert set(threading.enumerate()) <= threads, "what was started has ended"
 
 
 def test_a_missing_state_repo_is_refused_with_the_remedy(tmp_path: Path, demandops: Run) -> None:

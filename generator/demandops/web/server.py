@@ -9,6 +9,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from demandops import settings
+from demandops.errors import InvalidInput
 from demandops.runtime import REAL
 from demandops.service import listening_socket
 from demandops.web.follower import Follower
@@ -31,13 +32,18 @@ class WebServer:
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows; it is closed with the server.
+            follower: provides what the page shows; it is closed with the server, and if the server
+                cannot start.
 
         Raises:
             InvalidInput: if it cannot listen on the address.
         """
         self._follower = follower
-        self._socket = listening_socket.bound(address, option)
+        try:
+            self._socket = listening_socket.bound(address, option)
+        except InvalidInput:
+            follower.close()
+            raise
         self.url = f"{listening_socket.url_of(self._socket)}/"
         is_local = listening_socket.is_local(self._socket)
         if not is_local:

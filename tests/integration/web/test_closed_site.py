@@ -83,11 +83,11 @@ def test_an_address_that_others_reach_is_warned_of(
     assert "everybody who reaches http://0.0.0.0:" in caplog.text
 
 
-def test_an_address_that_cannot_be_used_is_named(bare: Path) -> None:
+def test_an_address_that_cannot_be_used_is_named_and_the_follower_ends(bare: Path) -> None:
     follower = Follower(Reader.of(str(bare)), {}, 0)
     with pytest.raises(InvalidInput) as told:
         WebServer("8080", "--web", follower)
-    follower.close()
+    assert follower.closed.is_set()
     assert str(told.value) == (
         "--web: '8080' is not an address to listen on; write one like 127.0.0.1:8090"
     )
