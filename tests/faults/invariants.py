@@ -38,7 +38,7 @@ def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[s
         if words in text:
             yield f"blames itself: {words}"
     if ran.code and not any(word in text for word in told):
-        yield "does not say what is wrong"
+        yield f"does not say what is wrong: {_last_line(ran)}"
 
 
 def after_restart(
@@ -53,8 +53,8 @@ def after_restart(
     """
     found = rig.book(NEXT, limit=2 * rig.limit)
     if not found.commit:
-        last = found.err.strip().splitlines()[-1:] or [found.out]
-        yield f"the next start fails: exit code {found.code} {found.hangs} {last[0]}"
+        told = f"{found.hangs} {_last_line(found)}"
+        yield f"the next start fails: exit code {found.code} {told}"
         return
     booked = demands(rig)
     times = len(booked.get(DEMAND, []))
@@ -96,6 +96,10 @@ def _state(rig: Rig, numbers: set[int], clones: bool) -> Iterator[str]:
             yield f"git fsck: {' '.join(told)}"
         for pattern in _LEFTOVERS:
             yield from (f"left over: {_named(path)}" for path in folder.glob(pattern))
+
+
+def _last_line(ran: Ran) -> str:
+    return next(iter(ran.err.strip().splitlines()[-1:]), ran.out)
 
 
 def _named(path: Path) -> str:

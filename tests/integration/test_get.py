@@ -237,7 +237,17 @@ class TestWhichStateRepo:
         told = demandops("request", "-", "--state-repo", fleet.path, stdin=more)
         assert (told.code, told.err) == (0, "")
         git(clone, "remote", "remove", "origin")
-        ran = demandops("request", "-", stdin=yaml.safe_dump(goal()))
+        for command in (
+            "request -",
+            "decommission vehicle00",
+            "rollback HEAD",
+            "upgrade",
+            "override create calm --node edge --hold -m Tests",
+            "suspend --requester vehicle00 -m Tests",
+        ):
+            ran = demandops(*command.split(), "--dry-run", stdin=more)
+            assert (ran.code, ran.err) == (0, ""), f"{command}: needs no remote to write to"
+        ran = demandops("request", "-", stdin=more)
         assert ran.code == 2
         assert "has no remote 'origin' to write to; give --state-repo" in ran.err
 

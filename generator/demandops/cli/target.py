@@ -76,6 +76,8 @@ def _writable() -> str | None:
     if around is None:
         return context.state_repo if context else None
     origin = origin_of(around)
+    if origin is None and click.get_current_context().params.get("dry_run"):
+        return str(around)
     if origin is None:
         raise click.UsageError(
             f"the checkout {around} has no remote 'origin' to write to; give --state-repo"
@@ -170,6 +172,13 @@ state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
 
 writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
 """The option ``--state-repo`` of a command that writes."""
+
+dry_run_option = click.option(
+    "--dry-run",
+    is_flag=True,
+    is_eager=True,  # what a command that writes nothing reads may be a checkout without a remote
+    help="Show the consequences and change nothing.",
+)
 
 signing_option = click.option(
     "--signing-key",

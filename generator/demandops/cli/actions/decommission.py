@@ -24,7 +24,7 @@ from demandops.cli.actions.person_change import (
 from demandops.cli.json_output import claim_data, output_option, show
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import busy, progress
-from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.decision import decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import Refused
@@ -47,7 +47,7 @@ from demandops.staterepo.load.snapshot import Snapshot
     help="Decommission only the requester of that name.",
 )
 @reason_option
-@click.option("--dry-run", is_flag=True, help="Show the consequences and release nothing.")
+@dry_run_option
 @yes_option
 @signing_option
 @output_option

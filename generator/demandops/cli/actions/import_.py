@@ -11,7 +11,12 @@ from demandops import strict_yaml
 from demandops.cli.actions.request import Document, book_or_show
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import busy, errors
-from demandops.cli.target import clusters_option, signing_option, writable_repo_option
+from demandops.cli.target import (
+    clusters_option,
+    dry_run_option,
+    signing_option,
+    writable_repo_option,
+)
 from demandops.cluster import clusters_file
 from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
@@ -36,7 +41,7 @@ from demandops.staterepo import reader
     help="Which application or connection each resource is. If the file does not exist, a proposal "
     "is written to it, and nothing is booked.",
 )
-@click.option("--dry-run", is_flag=True, help="Show the consequences and book nothing.")
+@dry_run_option
 @click.option(
     "--cluster", metavar="NAME", help="Read the custom resources from this cluster of --clusters."
 )

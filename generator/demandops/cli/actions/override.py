@@ -112,7 +112,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
         "keep": keep or None,
     }
     more = {"owner": owner, "priority": priority, "expires": ends_at(expires)}
-    with writable(way.state_repo, way.signing_key) as repo:
+    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
         text = new_override(repo, name, way, selected, {**more, **effects})
         create_override(repo, Edit(name, text, f"Create override {name}", way.reason), way)
 
@@ -130,7 +130,7 @@ def end(name: str, way: Way) -> None:
       demandops override end calm -m "The demonstration is over"
       demandops override end calm --dry-run
     """
-    with writable(way.state_repo, way.signing_key) as repo:
+    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
         end_override(repo, Edit(name, None, f"End override {name}", way.reason), way)
 
 

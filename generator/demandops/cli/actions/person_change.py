@@ -23,7 +23,12 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors, progress
-from demandops.cli.target import hint_to_pull, signing_option, writable_repo_option
+from demandops.cli.target import (
+    dry_run_option,
+    hint_to_pull,
+    signing_option,
+    writable_repo_option,
+)
 from demandops.config.base_model import parse_file
 from demandops.config.override import Override, OverrideFile
 from demandops.config.repo_settings import Proposals
@@ -46,9 +51,6 @@ reason_option = click.option(
     "-m", "--reason", metavar="TEXT", help="The reason, for the commit message and the file."
 )
 yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
-dry_run_option = click.option(
-    "--dry-run", is_flag=True, help="Show the consequences and change nothing."
-)
 propose_option = click.option(
     "--propose",
     is_flag=True,
@@ -83,9 +85,11 @@ def known(person: Person) -> Person:
 
 
 @contextmanager
-def writable(state_repo: str, signing_key: Path | None) -> Iterator[Reader]:
-    """Yield an open state repo to which a person's commits can be published."""
-    with reader.opened(state_repo, only_read=False) as repo:
+def writable(
+    state_repo: str, signing_key: Path | None, *, dry_run: bool = False
+) -> Iterator[Reader]:
+    """Yield an open state repo to which a person's commits can be published, unless ``dry_run``."""
+    with reader.opened(state_repo, only_read=dry_run) as repo:
         repo.repository.signer = Signer(signing_key) if signing_key else None
         yield repo
 

@@ -19,7 +19,12 @@ from demandops.cli.actions.ledger_change import (
 )
 from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
-from demandops.cli.target import hint_to_pull, signing_option, writable_repo_option
+from demandops.cli.target import (
+    dry_run_option,
+    hint_to_pull,
+    signing_option,
+    writable_repo_option,
+)
 from demandops.decision import admit, decide, form_faults
 from demandops.demand.demand_goal import is_demand_goal
 from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
@@ -57,7 +62,7 @@ class _Answer(Future["Receipt | dict[str, str]"]):
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
 @writable_repo_option
-@click.option("--dry-run", is_flag=True, help="Show the consequences and book nothing.")
+@dry_run_option
 @click.option("--release", is_flag=True, help="Release what the documents demand, instead.")
 @click.option(
     "--wait",

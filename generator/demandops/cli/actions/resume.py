@@ -27,5 +27,5 @@ def resume(name: str | None, way: Way, **selected: tuple[str, ...]) -> None:
     if bool(name) == bool(selector(selected)):
         raise click.UsageError("give the options that suspended it, or the override's name")
     summary = f"Resume {name or described(selected)}"
-    with writable(way.state_repo, way.signing_key) as repo:
+    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
         end_override(repo, Edit(name or name_of(selected), None, summary, way.reason), way)

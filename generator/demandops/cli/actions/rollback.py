@@ -17,7 +17,6 @@ from demandops.cli.actions.ledger_change import (
 )
 from demandops.cli.actions.person_change import (
     confirmed,
-    dry_run_option,
     is_asked,
     known,
     reason_option,
@@ -25,7 +24,7 @@ from demandops.cli.actions.person_change import (
 )
 from demandops.cli.json_output import claim_data, faults_of, output_option, show
 from demandops.cli.output import busy, progress
-from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.cli.views.diff import release_lines
 from demandops.config.config import CONFIG_ROOTS
 from demandops.decision import Decision, decide
@@ -76,7 +75,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     """
     if not (dry_run or (reason and reason.strip())):
         raise click.UsageError("give the reason: -m TEXT")
-    with reader.opened(state_repo, only_read=False) as repo:
+    with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
         who = repo.operator() if dry_run else known(repo.operator())
         goal = rollback_goal.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)

@@ -45,7 +45,7 @@ def suspend(
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
     effect = {"expires": ends_at(expires), "deny": True}
-    with writable(way.state_repo, way.signing_key) as repo:
+    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
         name = name_of(selected)
         text = new_override(repo, name, way, selected, effect)
         create_override(repo, Edit(name, text, f"Suspend {described(selected)}", way.reason), way)

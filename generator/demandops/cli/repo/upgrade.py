@@ -12,7 +12,7 @@ import click
 
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import Progress, busy
-from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.render.gitops.controller_switch import Step
 from demandops.runtime import REAL
 from demandops.staterepo import upgrade as upgrading
@@ -35,7 +35,7 @@ _MOST_PATHS = 50
     help="The URL (https or ssh) from which the clusters fetch the state repo, if demandops.yaml "
     "has no section for the controller. Default: the URL of the other controller.",
 )
-@click.option("--dry-run", is_flag=True, help="Show the changes and write nothing.")
+@dry_run_option
 @click.option(
     "--yes", is_flag=True, help="Do not ask for confirmation before the controller changes."
 )
