@@ -246,7 +246,7 @@ class TestWhichStateRepo:
             "suspend --requester vehicle00 -m Tests",
         ):
             ran = demandops(*command.split(), "--dry-run", stdin=more)
-            assert (ran.code, ran.err) == (0, ""), f"{command}: needs no remote to write to"
+            assert ran.code == 0, f"{command}: {ran.err}"
         ran = demandops("request", "-", stdin=more)
         assert ran.code == 2
         assert "has no remote 'origin' to write to; give --state-repo" in ran.err
