@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from tests.kit.cli import Run
 from tests.kit.generator import wait_until
 from tests.kit.repo import POLICY, GitRepo, git, tip
-from tests.kit.ros import Served
+from tests.kit.ros import DEADLINE_S, Served
 
 POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 RECORDER: dict[str, Any] = {
@@ -152,6 +153,7 @@ def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: De
 def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
     shared: Served, vehicle: DemandClient, before: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    vehicle._sender._wait_until_discovered(time.monotonic() + DEADLINE_S)  # not by the goal itself
     known, lost = vehicle._sender._await, [DemandError("timeout", "the response was lost")]
 
     def lose_first(future: Any, deadline: float) -> Any:

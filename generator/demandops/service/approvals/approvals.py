@@ -385,6 +385,7 @@ class Approvals:
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
         self._proposals = {}
+        self._forge.close()
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:

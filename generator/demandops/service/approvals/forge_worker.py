@@ -50,6 +50,12 @@ class ForgeWorker:
         self._lock = runtime.lock()
         self._thread: Thread | None = None
         self._last_error = ""
+        self._closed = False
+
+    def close(self) -> None:
+        """End the thread once it has no task left; the pull requests stay."""
+        self._closed = True
+        self._due.set()
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
         """Open a pull request for a branch, unless that was requested before."""
@@ -85,7 +91,7 @@ class ForgeWorker:
 
     def _run(self) -> None:
         poll_at = self._runtime.monotonic() + POLL_S
-        while True:
+        while not self._closed:
             self._due.wait(max(0.0, poll_at - self._runtime.monotonic()))
             self._due.clear()
             if self._runtime.monotonic() >= poll_at:
