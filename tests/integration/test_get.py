@@ -16,7 +16,7 @@ from demandops.config.override import parse_time
 from demandops.runtime import REAL
 
 from tests.kit.cli import Run
-from tests.kit.goals import APP, EXPERIMENT, goal, perception, put
+from tests.kit.goals import APP, EXPERIMENT, perception, put
 from tests.kit.http import kubeconfig
 from tests.kit.kube_api import kube_api
 from tests.kit.repo import GitRepo, git
