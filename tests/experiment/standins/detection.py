@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import rclpy
 from geometry_msgs.msg import Pose, PoseArray
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
 from tests.experiment.clouds import Point, from_message
 
-from .running import spin
+from .running import spin, start
 
 _REACH_M = 3.0
 _FEWEST_POINTS = 5
@@ -39,7 +38,7 @@ def pose_at(x: float, y: float) -> Pose:
 
 def main(given: dict[str, str]) -> None:
     """Detect in each cloud of a topic."""
-    rclpy.init(args=[])
+    start()
     node = Node(given["node_name"])
     sender = node.create_publisher(PoseArray, given["object_list_topic"], 10)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import rclpy
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -12,7 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from .detection import pose_at
-from .running import spin
+from .running import spin, start
 
 _PERIOD_S = 0.2
 _SAME_M = 3.0
@@ -87,5 +86,5 @@ def _is_among(pose: Any, others: list[Any]) -> bool:
 
 def main(given: dict[str, str]) -> None:
     """Fuse until the program is asked to end."""
-    rclpy.init(args=[])
+    start()
     spin(Fusion(given))

@@ -11,7 +11,7 @@ import paho.mqtt.client as mqtt
 import rclpy
 from rclpy.node import Node
 
-from .running import message_class, spin
+from .running import message_class, spin, start
 
 TYPE_PREFIX = "mqtt_client/ros_msg_type/"
 _LOOK_S = 0.1
@@ -88,7 +88,7 @@ class MqttClient(Node):
 def main(given: dict[str, str]) -> None:
     """Carry until the program is asked to end."""
     ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params_file"]]
-    rclpy.init(args=["mqtt_client", "--ros-args", *ros_args])
+    start(["mqtt_client", "--ros-args", *ros_args])
     client = MqttClient()
     try:
         spin(client)

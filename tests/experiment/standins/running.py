@@ -6,8 +6,9 @@ from importlib import import_module
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from demandops_ros.ros_process import ExecutorThread, stop_signals
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 
 def message_class(type_name: str) -> Any:
@@ -16,13 +17,15 @@ def message_class(type_name: str) -> Any:
     return getattr(import_module(f"{package}.msg"), name)
 
 
+def start(args: list[str] | None = None, domain: int | None = None) -> None:
+    """Initialize ROS for :func:`spin`, which handles the signals."""
+    rclpy.init(args=args or [], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+
+
 def spin(node: Node) -> None:
-    """Spin until the program is asked to end."""
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
-    try:
-        executor.spin()
-    except (ExternalShutdownException, KeyboardInterrupt):
-        pass
-    finally:
-        rclpy.try_shutdown()
+    """Run a node's callbacks until Ctrl-C or SIGTERM, then shut ROS down."""
+    with stop_signals() as wait_for_signal:
+        thread = ExecutorThread(node)
+        wait_for_signal()
+        thread.close()
+    rclpy.try_shutdown()

@@ -12,11 +12,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-import rclpy
 import zenoh
 from rclpy.node import Node
 
-from .running import message_class, spin
+from .running import message_class, spin, start
 
 _LOOK_S = 0.1
 
@@ -64,7 +63,7 @@ def main() -> None:
     parser.add_argument("-c", dest="config", type=Path, required=True)
     config = json.loads(parser.parse_args().config.read_text())
     plugin = config.pop("plugins")["ros2dds"]
-    rclpy.init(args=[], domain_id=plugin["domain"])
+    start(domain=plugin["domain"])
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
         spin(Bridge(plugin, session))
 
