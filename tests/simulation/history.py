@@ -287,7 +287,7 @@ class History:
     def spoil_network(self) -> None:
         machine = self.chance.choice(self.world.machines)
         kind = self.chance.randrange(7)
-        if kind < 3:
+        if kind < 2:
             machine.losses += self.chance.randrange(1, 4)
         elif kind == 2:
             machine.rejections += 1
