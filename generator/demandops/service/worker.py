@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 from demandops.config.config import Config
 from demandops.decision import Decision
-from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError, Unsound
+from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError, Unsound, Withdrawn
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
 from demandops.service.fault_log import FaultLog
 from demandops.service.remote_status import RemoteMonitor
-from demandops.service.ticket import Receipt, Ticket
+from demandops.service.ticket import Ticket
 from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
 from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.service.timing.own_work import OwnWork
@@ -231,6 +231,7 @@ class Worker:
         tip = self._repository.tip()
         results = self._evaluator.published_before(str(tip), batch)
         published = {ticket for ticket, _ in results}
+        certain = len(results)
         left = [ticket for ticket in batch if ticket not in published]
         part, left = left[: backoff.max_demands], left[backoff.max_demands :]
         self._approvals.remove_released(part, self.snapshot.state)
@@ -242,6 +243,8 @@ class Worker:
             self._require_time()
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluated(commits, ticket))
+            if commits.is_empty:
+                certain = len(results)
         if not left:
             for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
                 results.append(self._evaluated(commits, ticket))
@@ -251,7 +254,7 @@ class Worker:
             self._tip_is_fresh = True
             if self._repository.refresh() != commits.start.commit:
                 return None
-        if self._publish_commits(commits, results):
+        if self._publish_commits(commits, results, certain):
             batch[:] = left
             backoff.published()
             return None
@@ -276,15 +279,22 @@ class Worker:
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
-    def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
+    def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
         """Publish a commit batch and answer; return False if another writer was first.
 
-        If the remote rejects the push for another reason, all demands get that error as the answer.
+        If the remote rejects the push for another reason, that is the answer to each demand with a
+        commit, and to each demand that was decided on top of such a commit.
+
+        Args:
+            commits: the commits of the demands.
+            results: the demands and their results, in the order of evaluation.
+            certain: how many of the first results rest on published commits alone.
         """
         try:
             published = commits.publish()
         except PushDenied as error:
-            results[:] = [(t, error if isinstance(r, Receipt) else r) for t, r in results]
+            denied = [(t, r if isinstance(r, Withdrawn) else error) for t, r in results[certain:]]
+            results[certain:] = denied
             self.remote.record_push_denied(str(error))
         else:
             if not published:

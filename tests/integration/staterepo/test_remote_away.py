@@ -124,16 +124,19 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
     rig.assert_sound(bare)
 
 
-def test_a_declined_push_is_told_to_all_of_its_batch_but_not_to_those_refused_before(
+def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_its_commits(
     url: str, bare: Path
 ) -> None:
+    """The ledger that contradicts ``moved`` is never published, so that is no reason to refuse."""
     gate = Gate()
     hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
+    moved = goal(7)
+    moved["apps"][0]["header"] = {"id": "edge/fusion-2", "node_id": "cloud"}
     with rig.running(url) as generator:
         tickets = [generator.submit(goal(1), listener=gate)]
         assert gate.reached.wait(rig.PATIENCE_S)
-        tickets += [generator.submit(goal(number)) for number in (2, 3)]
         refused = generator.submit(rig.impossible())
+        tickets += [generator.submit(made) for made in (goal(2), goal(3), moved)]
         gate.open.set()
         for ticket in tickets:
             with pytest.raises(StateRepoError, match="rejects the push"):
