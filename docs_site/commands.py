@@ -1,4 +1,4 @@
-"""The page of commands, from click's own objects."""
+"""Makes the page of commands from click's own objects."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from demandops.cli.main import COMMANDS, ExitCode, cli, load
 
 
 def page() -> str:
-    """Return the page."""
+    """Return the page as Markdown."""
     group = click.Context(cli, info_name="demandops", **cli.context_settings)
     parts = [
         "# Commands",

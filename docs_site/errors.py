@@ -1,4 +1,8 @@
-"""The page of messages: those that the tests hold the program to, and those that it raises."""
+"""Makes the page of error messages.
+
+The messages are those in the tests' list of mistakes, and those that :mod:`.raised` finds in the
+source.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,11 @@ from pathlib import Path
 from docs_site import raised
 
 MESSAGES = Path(__file__).parents[1] / "tests" / "unit" / "messages" / "messages.txt"
-_END = "# fields"  # the forms of fields follow, which the page of schemas has
+_END = "# fields"  # the rest, the forms of fields, is on the page of schemas
 
 
 def page() -> str:
-    """Return the page: a section for each kind of input, a row for each mistake."""
+    """Return the page as Markdown: a section for each kind of input, a row for each mistake."""
     _, *sections = re.split(r"(?m)^# ", MESSAGES.read_text().partition(f"\n{_END}\n")[0])
     parts = [
         "# Errors and remedies",
@@ -37,6 +41,6 @@ def page() -> str:
 
 
 def _code(message: str) -> str:
-    """Return a message as code of a table's cell, with no mark of markdown left in it."""
+    """Return a message as code for a table's cell, with all marks of Markdown escaped."""
     text = re.sub(r"[^\w\s]", lambda mark: f"&#{ord(mark[0])};", message.strip())
     return f"<code>{text}</code>"

@@ -1,7 +1,8 @@
 """What mkdocs runs while it builds the site (mkdocs.yml).
 
-It adds the pages that are generated from the code and those of the project's root, lists the
-decisions, and makes the build fail on a link or a list that would be lost.
+It adds the pages that are generated from the code and those of the project's root, and lists the
+decisions. It warns of links, lists and tables that the site would not show as such. A warning makes
+the build fail.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ OF_THE_ROOT = {
     "tests/e2e/PROOF.md": "project/e2e-proof.md",
     "tests/e2e/rig/README.md": "project/e2e-rig.md",
 }
-"""Pages and files outside of docs/ that pages link, and where the site has them."""
+"""The pages and files outside of docs/ that pages link to, each with its path on the site."""
 
 _LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)(#[^)\s]*)?(?=\))")
 _CODE = re.compile(r"^```[\s\S]*?^```|^(?: {4}|\t).*$|`[^`\n]+`", re.MULTILINE)
 _BAR = re.compile(r"`[^`\n]*\\\|[^`\n]*`")
-# The path above a file, which forges need because they show no title of a block.
+# The path above a file's block. Forges need it, because they do not show the block's title.
 _PATH = re.compile(r"^`([^`\n]+)`:\n\n(?=```\w* title=\"\1\")", re.MULTILINE)
-# A paragraph that begins like a list or holds a table's bar: markdown has not read it as one.
+# A paragraph that begins like a list or a table: Markdown did not recognize the list or table.
 _LOST = re.compile(r"<p>(?:[-*|] |\d+\. )|<p>[^<]*\n(?:[-*|] |\d+\. )")
 _OTHER_HOST = re.compile(
     r"<(?:script|link|img|iframe|source)\b[^>]*(?:src|href)=\"?(?:https?:)?//[^ >]*"
@@ -54,7 +55,7 @@ _log = logging.getLogger("mkdocs.hooks.docs_site")
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """List a folder of the navigation (`decisions/`) by its files."""
+    """Replace each folder in the navigation, such as `decisions/`, by its files."""
     config["nav"] = _with_folders(config.nav, Path(config.docs_dir))
     return config
 
@@ -82,9 +83,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
-    """Let links out of docs/ lead to the site's page; show `\\|` in a table as the forges do.
+    """Adapt a page's Markdown to the site.
 
-    A file's path stands above it for the forges; here its block has it as the title.
+    A link out of docs/ leads to the site's page. In code, `\\|` becomes `|`, as the forges show it.
+    The path above a file's block, which only the forges need, is removed: here it is the block's
+    title.
     """
     if page.file.src_uri not in (*OF_THE_ROOT.values(), *GENERATED):
         markdown = _moved(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
@@ -93,7 +96,10 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
 
 
 def _moved(markdown: str, source: str, path: str) -> str:
-    """Rewrite the links of a page that the repository has at one path and the site at another."""
+    """Return a page's Markdown with the links changed for the site.
+
+    ``source`` is the page's path in the repository, ``path`` its path on the site.
+    """
 
     def rewritten(link: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(posixpath.dirname(source), link[1]))
@@ -135,7 +141,7 @@ def on_page_content(html: str, page: Page, **_: object) -> str:
 
 
 def on_post_page(output: str, page: Page, **_: object) -> str:
-    """Warn of what a browser would fetch from another host."""
+    """Warn of everything that a browser would fetch from another host."""
     for found in _OTHER_HOST.finditer(output):
         _log.warning("%s: is fetched from another host: %s", page.file.src_uri, found[0])
     return output

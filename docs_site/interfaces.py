@@ -1,4 +1,7 @@
-"""The page of the ROS 2 interfaces and parameters, from their files and the node's own table."""
+"""Makes the page of the ROS 2 interfaces and parameters.
+
+Their sources are the interface files and the node's own table of parameters.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ INTERFACES = Path(__file__).parents[1] / "ros_bridge" / "interfaces"
 
 
 def page() -> str:
-    """Return the page."""
+    """Return the page as Markdown."""
     parts = [
         "# ROS 2 interfaces and parameters",
         "Generated from the interface files and from the node.",

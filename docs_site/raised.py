@@ -1,4 +1,4 @@
-"""The messages of what the program raises outside of checks, read from its source."""
+"""Collects the messages of errors that the program raises outside of checks, from its source."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SECTIONS = {
     "service": "The generator",
     "cli": "The command line",
 }
-"""The rooms whose messages no list of mistakes has, and the title of each."""
+"""The folders whose messages are in no list of mistakes, each with the title of its section."""
 
 _RAISED = (
     "StateRepoError",
@@ -58,7 +58,7 @@ def _of(module: ast.Module) -> Iterator[str]:
 
 
 def _text(node: ast.expr) -> str:
-    """Return what is fixed in the text that an expression gives."""
+    """Return the text that an expression gives; ``…`` stands for each part that is computed."""
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):

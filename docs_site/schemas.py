@@ -1,4 +1,4 @@
-"""The page of file formats, from the pydantic models that read the files."""
+"""Makes the page of file formats from the pydantic models that read the files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from demandops.cli.repo import schema as command
 
 
 def page() -> str:
-    """Return the page: each file with its fields, and each part of it with its own."""
+    """Return the page as Markdown.
+
+    It has a table of fields for each file, and for each part of a file.
+    """
     parts = [
         "# File formats",
         "Generated from the models that read the files. A field that is not listed is refused. "
@@ -29,7 +32,7 @@ def page() -> str:
 
 
 def json_files() -> dict[str, str]:
-    """Return the JSON Schemas as files of the site."""
+    """Return the JSON Schemas, by their paths on the site."""
     return {f"schemas/{name}.json": command.text(name) for name in command.SCHEMAS}
 
 
@@ -39,7 +42,7 @@ def _place(name: str) -> str:
 
 
 def _described(schema: dict[str, Any]) -> str:
-    """Return a model's description, without the marks of Sphinx."""
+    """Return the first paragraph of a model's description, without the marks of Sphinx."""
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", str(schema.get("description", "")))
     return " ".join(text.replace("``", "`").split("\n\n")[0].split())
 
@@ -61,7 +64,7 @@ def _json(value: object) -> str:
 
 def _default(field: dict[str, Any]) -> str:
     default = field.get("default")
-    if default is None or "$ref" in field:  # the part's own table has its defaults
+    if default is None or "$ref" in field:  # the part's own table shows the defaults
         return ""
     return _json(default)
 

@@ -1,4 +1,7 @@
-"""Fixtures of general use. No test touches the data folder or the Git set-up of its user."""
+"""Fixtures that all tests share.
+
+No test touches the data folder or the Git configuration of the user who runs it.
+"""
 
 from __future__ import annotations
 
@@ -34,37 +37,40 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
     sync.force(False)
     _keep_files_in_memory()
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a shell's background job
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background job
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _keep_files_in_memory() -> None:
-    """Make the tests' folders in memory if it has room: a run makes a third of a million files."""
+    """Put the tests' temporary folders in memory if it has enough room.
+
+    A whole run makes a third of a million files.
+    """
     named = {"TMPDIR", "PYTEST_DEBUG_TEMPROOT"} & os.environ.keys()
     if not named and _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free >= _ROOM_IN_MEMORY:
         os.environ["PYTEST_DEBUG_TEMPROOT"] = str(_MEMORY)
 
 
 def pytest_collection_finish() -> None:
-    """Leave what was collected out of each garbage collection: a seventh of the suite's time."""
+    """Exclude the collected tests from garbage collection; this saves a seventh of the run time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Start more workers than processors: many tests wait for git, other processes and clocks."""
+    """Return more workers than processors, as many tests wait for git and other processes."""
     return (os.cpu_count() or 1) * 3 // 2
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep journals, clones and git away from the set-up of this machine's user."""
+    """Isolate the tests from the user's journals, clones, contexts and Git configuration."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("home")))
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
         patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
-        patch.setenv(HELM_BIN, "/nowhere/helm")  # so `check` prints the same on each machine
+        patch.setenv(HELM_BIN, "/nowhere/helm")  # so `check` never finds Helm
         for name, value in repo.NO_GIT_CONFIG.items():
             patch.setenv(name, value)
         yield
@@ -80,7 +86,7 @@ def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def synced(request: pytest.FixtureRequest) -> bool:
-    """Force writes to disk in tests marked so, and in no others; tell which this is."""
+    """Force writes to disk only in tests marked `synced`; return whether this test is marked."""
     on = request.node.get_closest_marker("synced") is not None
     sync.force(on)
     return on
@@ -88,14 +94,14 @@ def synced(request: pytest.FixtureRequest) -> bool:
 
 @pytest.fixture
 def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commit as Petra."""
+    """Make Petra the author and committer of each commit."""
     for name, value in repo.GIT_ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
 
 
 @pytest.fixture(autouse=True)
 def limited(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Turn a deadlock into a failure, with the stack of every thread."""
+    """Fail a test that exceeds its time limit, and print the stack of every thread."""
     marker = request.node.get_closest_marker("limit")
     seconds = float(marker.args[0]) if marker else _LIMIT_S
 
@@ -125,7 +131,7 @@ def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str], Path]:
-    """Make bare state repos by name."""
+    """Return a function that makes a bare state repo with a name and returns its path."""
 
     def make(name: str) -> Path:
         made = Path(shutil.copytree(bare_template, tmp_path / name))
@@ -143,25 +149,25 @@ def bare(new_repo: Callable[[str], Path]) -> Path:
 
 @pytest.fixture
 def state(bare: Path) -> GitRepo:
-    """The same state repo, to look into."""
+    """The state repo `bare`, with methods that read its content."""
     return GitRepo(bare)
 
 
 @pytest.fixture(params=["embedded", "file-url"])
 def address(request: pytest.FixtureRequest, bare: Path) -> str:
-    """The same state repo, used in place and as a remote."""
+    """The address of the state repo `bare`: once its path, once its URL as a remote."""
     return str(bare) if request.param == "embedded" else bare.as_uri()
 
 
 @pytest.fixture
 def url(bare: Path) -> str:
-    """The same state repo as a remote that is cloned, fetched and pushed to."""
+    """The URL of the state repo `bare`, as a remote to clone, fetch from and push to."""
     return bare.as_uri()
 
 
 @pytest.fixture
 def person(bare: Path, tmp_path: Path) -> Person:
-    """A person with a clone of the same state repo."""
+    """A person with a clone of the state repo `bare`."""
     return Person(bare, tmp_path / "person")
 
 
@@ -188,13 +194,13 @@ def generator(bare: Path) -> Iterator[Generator]:
 
 @pytest.fixture
 def demandops(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run a command in this process."""
+    """Return a function that runs a command of `demandops` in this process."""
     return runner(capsys, monkeypatch)
 
 
 @pytest.fixture
 def request_json(demandops: Run, state: GitRepo) -> Callable[..., Ran]:
-    """Send goals through ``demandops request --output json``."""
+    """Return a function that sends goals through ``demandops request --output json``."""
 
     def send(*goals: object, more: tuple[str, ...] = ()) -> Ran:
         text = yaml.safe_dump_all(goals, sort_keys=False, allow_unicode=True)
@@ -214,7 +220,7 @@ def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
 
 @pytest.fixture
 def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
-    """Start generators in processes of their own; those left running are killed at the end."""
+    """Return what starts generators as processes; the end of the test kills those that run."""
     _all_drivers.synced = synced
     yield _all_drivers
     _all_drivers.kill_runs()

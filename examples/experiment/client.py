@@ -1,7 +1,7 @@
 """A ROS 2 action client for DeploymentRequest goals from YAML files.
 
-It reads one path of a file from each line of standard input. It prints one line of JSON for each
-feedback and one for the result. It works with any server of the action.
+The client reads the path of one file from each line of standard input. It prints one line of JSON
+for each feedback and one for the result. It works with any server of the action.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ def git(*args: str) -> str:
 
 
 class Client:
-    """The client process."""
+    """The process of ``client.py``."""
 
     def __init__(self) -> None:
         command = [sys.executable, str(HERE / "client.py"), ACTION]
@@ -81,7 +81,7 @@ class Client:
 
 
 def run_step(client: Client, step: int, file: Path) -> bool:
-    """Send a request and show its effect; return whether it is the paper's."""
+    """Send a request and show its effect; return whether the bookkeeping equals the paper's."""
     out.rule(f"[bold]step {step}: {paper.STEPS[step - 1]}")
     stages, result = client.send(file)
     out.print(f"[dim]request[/]  {file.relative_to(HERE.parent.parent)}")
@@ -109,7 +109,7 @@ def run_step(client: Client, step: int, file: Path) -> bool:
 
 
 def main() -> int:
-    """Play all steps and return the exit code."""
+    """Run all steps and return the exit code."""
     shutil.rmtree(BUILD, ignore_errors=True)
     BUILD.mkdir(parents=True)
     # a separate ROS graph, and no files in the user's home

@@ -1,7 +1,8 @@
 """The paper's table: who requests which service and connection after each of eight steps.
 
-The detection on the station's point cloud and the connection of that cloud have the same
-requesters. So do those of vehicle00.
+The detection on the station's point cloud and the connection of this cloud have the same
+requesters. The detection on vehicle00's point cloud and the connection of that cloud have the same
+requesters, too.
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ STEPS = (
 
 S, V0, V1, V2, V3 = "station00", "vehicle00", "vehicle01", "vehicle02", "vehicle03"
 
-# the requesters of the detection on the station's cloud, of the detection on vehicle00's cloud and
-# of the fusion; the vehicles 1 to 3 that have a connection
+# a row for each step: the requesters of the detection on the station's cloud, those of the
+# detection on vehicle00's cloud, those of the fusion, and which of vehicle01 to vehicle03 have a
+# connection
 _TABLE: tuple[tuple[set[str], set[str], set[str], tuple[str, ...]], ...] = (
     ({S, V0}, {S, V0}, {S, V0}, ()),
     ({S, V0, V1}, {S, V0}, {S, V0, V1}, (V1,)),
@@ -50,7 +52,10 @@ def expected(step: int) -> dict[str, list[str]]:
 
 
 def observed(books: dict[str, Any]) -> dict[str, list[str]]:
-    """Return the same for the output of ``demandops bookkeeping --output json``."""
+    """Return the requesters of each subject in a bookkeeping.
+
+    ``books`` is the output of ``demandops bookkeeping --output json``.
+    """
     rows = {}
     for entry in books["services"].values():
         target = entry["source"] or ", ".join(entry["applications"])

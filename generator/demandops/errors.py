@@ -37,7 +37,7 @@ class Fault:
     line: int | None = None
 
     def __post_init__(self) -> None:
-        """Quote the message, which may name any value; ``file`` and ``field`` stay exact."""
+        """Escape the message, which may contain any text; ``file`` and ``field`` stay exact."""
         object.__setattr__(self, "message", one_line(self.message))
 
     def __str__(self) -> str:
@@ -63,10 +63,13 @@ def place_text(file: str, line: int | None) -> str:
 
 
 class DemandOpsError(Exception):
-    """Base of every error that this program raises on purpose. Its text is one line."""
+    """Base of every error that this program raises on purpose.
+
+    The text is one line; that of :class:`InvalidInput` has one line for each fault.
+    """
 
     def __str__(self) -> str:
-        """Return the text, which may name any value, as one line."""
+        """Return the text as one line; it may contain any text, so it is escaped."""
         return one_line(super().__str__())
 
 
@@ -82,17 +85,20 @@ class InvalidInput(DemandOpsError):
         return "\n".join(str(fault) for fault in self.faults)
 
     def text_with_codes(self) -> str:
-        """Return ``<code>: <field>: <remedy>``, one line for each fault."""
+        """Return one line for each fault: ``<code>: `` and the fault's text."""
         return "\n".join(f"{fault.code}: {fault}" for fault in self.faults)
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
-        """Return the error with one fault."""
+        """Return an error that carries one fault, made from the arguments."""
         return cls([Fault(code, field, message, file)])
 
 
 def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
-    """Yield the first faults of each file, shortened, then a fault that counts the others."""
+    """Yield the first faults of each file, then one fault for each file that counts its others.
+
+    Long field names are shortened.
+    """
     counts: dict[str, int] = {}
     for fault in faults:
         count = counts[fault.file] = counts.get(fault.file, 0) + 1
@@ -152,7 +158,7 @@ def fault(field: str, message: str, *, code: str = "invalid", line: int | None =
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is most similar to ``word``, or None."""
+    """Return the known word that is most similar to ``word``, or None if none is similar."""
     close = get_close_matches(word, _neighbors(word, sorted(known)), n=1)
     return close[0] if close else None
 
@@ -163,9 +169,10 @@ def sentences(problems: Iterable[str]) -> str:
 
 
 def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
-    """Return ``; did you mean 'x'?`` for a similar word, else the known words.
+    """Return ``; did you mean 'x'?`` if a known word is similar to ``word``.
 
-    Return an empty string if no words are known.
+    Otherwise return ``; known: …`` with at most ``most`` known words. Return an empty string if no
+    words are known.
     """
     names = sorted(known)
     close = closest(word, names)
@@ -178,10 +185,11 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
 
 
 def _neighbors(word: str, names: list[str]) -> list[str]:
-    """Return the names next to a word in alphabetical order, and in the order of reversed names.
+    """Return the names that are worth comparing with a word.
 
-    Comparing a word with thousands of names is slow, and one file or goal may have thousands of
-    unknown words.
+    These are the word's neighbors in two orders: the alphabetical order, and the alphabetical order
+    of the names read backwards. To compare a word with thousands of names is slow, and one file or
+    goal may have thousands of unknown words. A short list of names is returned whole.
     """
     if len(names) <= _COMPARED:
         return names

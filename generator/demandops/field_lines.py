@@ -14,9 +14,10 @@ from demandops.strict_yaml import LOADER, load_all
 
 
 def lines(text: str, document: int = 0) -> dict[str, int]:
-    """Return the line of each field of a document, by its path: ``nodes[3].cluster``.
+    """Return field → line, for each field of a document; a field is like ``nodes[3].cluster``.
 
-    The result is empty if :func:`load_all` refuses the text; a refusal already names its line.
+    The result is empty if :func:`load_all` refuses the text. The error of :func:`load_all` already
+    names the line. ``document`` counts from 0.
     """
     found: dict[str, int] = {}
     with suppress(InvalidInput, yaml.YAMLError):
@@ -40,7 +41,7 @@ def _add_lines(node: yaml.Node | None, path: str, found: dict[str, int]) -> None
 
 
 class FieldLines:
-    """The lines of the fields of files, each of which is read once."""
+    """Finds the lines of fields in files; reads each file only once."""
 
     def __init__(self, text_of: Callable[[str], str | None]) -> None:
         """Read files with ``text_of``, which returns a file's text, or None if there is none."""
@@ -48,14 +49,17 @@ class FieldLines:
         self._known: dict[str, Mapping[str, int]] = {}
 
     def of(self, file: str, field: str) -> int | None:
-        """Return the line of a field, or of the nearest part around it, if any is known."""
+        """Return the line of a field, else of the nearest enclosing part, else None."""
         if field and file not in self._known:
             self._known[file] = lines(self._text_of(file) or "")
         return nearest(field, self._known.get(file, {}))
 
 
 def nearest(field: str, known: Mapping[str, int]) -> int | None:
-    """Return the line of a field, or of the nearest part around it."""
+    """Return the line of a field, else of the nearest enclosing part, else None.
+
+    ``known`` maps fields to lines.
+    """
     while field and field not in known:
         field = field[: max(field.rfind("."), field.rfind("["), 0)]
     return known[field] if field else None

@@ -1,7 +1,7 @@
 """Pull requests of proposals at a forge: GitHub, and Gitea or Forgejo.
 
-It knows pull requests and HTTP, but not demands or Git: the branch is already pushed. GitLab
-needs no call: it opens a merge request because of the push's options
+This module knows pull requests and HTTP, but not demands or Git: the branch is already pushed.
+GitLab needs no call, because it opens a merge request if the push has the right options
 (:mod:`demandops.staterepo.write.proposal_branch`).
 """
 
@@ -69,12 +69,16 @@ class Forge(ABC):
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Return whether a pull request was merged; raise a lookup error for other data."""
+        """Return whether the forge's JSON is about a merged pull request.
+
+        Raises KeyError or TypeError if ``data`` is not about a pull request.
+        """
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the pull request for a branch; open one if there is none.
+        """Return the pull request for a branch, in any state; open one if there is none.
 
-        A branch gets only one pull request, so a closed one is not opened again.
+        A branch gets only one pull request. If it is closed, it is returned, and no other is
+        opened.
         """
         existing = self.find(branch, target)
         if existing is not None:
@@ -180,9 +184,10 @@ class Gitea(Forge):
 
 
 def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
-    """Return the forge that ``demandops.yaml`` names, or ``None`` if its API is not supported.
+    """Return the forge that ``demandops.yaml`` names, or None if this module does not support it.
 
-    Each call reads the token again, so that it can be replaced while the generator runs.
+    Each call of this function reads the token from its file, so that a person can replace the token
+    while the generator runs.
 
     Raises:
         ForgeError: if the token cannot be read.

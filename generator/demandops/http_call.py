@@ -1,8 +1,9 @@
 """HTTP calls to other services: the only module that imports httpx.
 
-A call trusts the certificates of ``SSL_CERT_FILE``, else the system's; the usual variables name a
-proxy. It follows no redirect, because credentials must not reach another host. The answer's length
-and duration are limited. No error contains the URL or a header, because they may hold secrets.
+A call trusts the certificates of ``SSL_CERT_FILE``, else the system's. It uses the proxy that the
+usual environment variables name. It follows no redirect, because credentials must not reach another
+host. The answer's length and duration are limited. No error contains the URL or a header, because
+they may hold secrets.
 """
 
 from __future__ import annotations
@@ -56,13 +57,14 @@ def call(
     """Send a request and return the answer, whatever its status.
 
     Args:
-        timeout: seconds to connect, to send and to wait for each part of the answer; the body must
-            be complete within twice this time.
+        method, url, headers, body: the request.
+        timeout: how many seconds it may take to connect, to send, and to receive each part of the
+            answer. The answer must be complete within twice this time.
 
     Raises:
-        NoAnswer: if there is no answer, or it is too long or too slow.
+        NoAnswer: if there is no answer, or if the answer is too long or too slow.
     """
-    import httpx  # noqa: PLC0415 - a tenth of a second; only when used
+    import httpx  # noqa: PLC0415 - the import takes a tenth of a second, so do it only when used
 
     headers = {"User-Agent": f"demandops/{__version__}", "Accept-Encoding": "identity", **headers}
     end = REAL.monotonic() + 2 * timeout
@@ -92,7 +94,7 @@ def _too_slow(timeout: float) -> str:
 
 
 def _cause(error: httpx.TransportError) -> str:
-    """Return why there is no answer, without any part of the request."""
+    """Return the reason why there is no answer; it contains no part of the request."""
     if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
         return "the URL or a header is not valid; check them"
     text = one_line(str(error) or type(error).__name__)

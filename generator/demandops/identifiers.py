@@ -1,4 +1,4 @@
-"""The rules for ids, topic names and message types, and the patterns of other fields in words."""
+"""The rules for ids, topic names and message types, and descriptions of other fields' patterns."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ import unicodedata
 from demandops.quoting import is_visible, quoted
 
 MAX_ID = 1024
-"""The longest id, in characters; file and object names are shortened and hashed."""
+"""The maximum length of an id, in characters.
+
+The name of a file or object that is made from a long id is shortened, and gets a hash.
+"""
 
 MAX_TOPIC = 247
-"""The longest topic name, in characters: ``RMW_TOPIC_MAX_NAME_LENGTH`` of ROS 2's rmw."""
+"""The maximum length of a topic name, in characters: ROS 2's ``RMW_TOPIC_MAX_NAME_LENGTH``."""
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
@@ -35,7 +38,7 @@ def control_character(text: str) -> str:
 def id_problem(value: str) -> str:
     """Return the problem of an id, or an empty string.
 
-    Nearly all text is valid. Invisible characters and paths out of a folder are not.
+    Nearly all text is valid. Not valid are invisible characters, white space at an end, and ``..``.
     """
     if not value:
         return "is empty; give an id"
@@ -117,4 +120,4 @@ PATTERN_WORDS = {
         "a topic that begins with '/', such as /{instance}_objects"
     ),
 }
-"""What a person may write in a field, by the field's pattern."""
+"""Pattern of a field → description of what a person may write in the field."""

@@ -1,4 +1,4 @@
-"""The files that a person names on the command line or for the service: texts and secrets."""
+"""Reads files that a person names for a command or for the service: texts and secrets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from demandops.errors import InvalidInput
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
-    """Return the name of a file for messages, and its text; ``-`` is standard input.
+    """Return (name, text) of a file; the name is the one for messages. ``-`` is standard input.
 
     Raises:
         InvalidInput: if the file cannot be read or is not UTF-8.

@@ -2,8 +2,8 @@
 
 A name depends on its own subject only. Two different ids never give the same object name: if an id
 must be shortened or changed to fit, a hash of the exact id is appended. Object names follow
-DNS-1123 and have at most 53 characters, Helm's limit for a release name. Parts of topics are those
-of the reference, where ``a/b`` and ``a-b`` are both ``a_b``.
+DNS-1123 and have at most 53 characters, Helm's limit for a release name. Topic names are made as
+the reference makes them, so the ids ``a/b`` and ``a-b`` both give ``a_b`` there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MAX_TOKEN = 120
 
 
 def digest(*ids: str) -> str:
-    """Return a hash of a list of ids; it differs from the hash of their joined text."""
+    """Return a hash of a list of ids; ``a-b``, ``c`` and ``a``, ``b-c`` give different hashes."""
     exact = json.dumps(ids, ensure_ascii=True)
     return hashlib.sha256(exact.encode()).hexdigest()[:_HASH]
 
@@ -52,9 +52,10 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    An id that gives no valid name in this way gets a hash. ``extra`` keeps names with the same id
-    apart, for example two point clouds of one source. The name gets ``extra`` as a slug with a
-    hash. The result is cached, because a release names all its inputs each time.
+    If an id gives no valid name in this way, its name gets a hash. ``extra`` distinguishes names
+    with the same id, for example those of two point clouds of one source. The name then contains
+    ``extra`` as a slug, and a hash. Results are cached, because each release asks for the names of
+    all its inputs.
     """
     plain = re.sub("[-/]", "_", id)
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):

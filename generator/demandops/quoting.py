@@ -1,8 +1,8 @@
-"""Text from outside as text that people and programs read line by line.
+"""Makes text from outside safe to print, for people and programs that read line by line.
 
-A value of a goal, a file, a commit, a remote or an exception may hold anything. Code that prints it
-asks this module, so that the value cannot begin a line, control a terminal, reorder or hide text,
-or fill a screen. Visible text stays as it is.
+A value from a goal, a file, a commit, a remote or an exception may hold any text. Code that prints
+the value uses this module, so that the value cannot begin a line, control a terminal, reorder or
+hide text, or fill a screen. Visible text stays as it is.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def clipped(text: str, most: int) -> str:
 
 
 def one_line(text: str, most: int = LONGEST_LINE) -> str:
-    """Return text on one line, escaped and not too long."""
+    """Return text on one line: escaped, and cut to at most ``most`` characters."""
     return clipped(escaped(text[: most + 1]), most)
 
 
@@ -55,12 +55,15 @@ def lines(text: str) -> str:
 
 
 def quoted(value: str, most: int = 80) -> str:
-    """Return a value in quotes, on one line and not too long."""
+    """Return a value in quotes, on one line, cut to at most ``most`` characters."""
     return f"'{one_line(value, most)}'"
 
 
 def json_escaped(text: str) -> str:
-    """Return JSON text of the same data, with JSON's own escapes for what is not visible."""
+    """Return JSON text with each invisible character replaced by JSON's escape for it.
+
+    Line breaks stay. The result has the same data.
+    """
     if is_visible(text.replace("\n", "")):
         return text
     return "".join(
@@ -73,7 +76,7 @@ def _json_escape(char: str) -> str:
 
 
 class OneLineFormatter(logging.Formatter):
-    """Formats a log record as one line; only a traceback has more."""
+    """Formats a log record as one line. A traceback follows on lines of its own."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         """Return the record's line: the lines of its message are joined by ``; ``."""
@@ -81,5 +84,5 @@ class OneLineFormatter(logging.Formatter):
         return super().formatMessage(record)
 
     def formatException(self, info: Any) -> str:  # noqa: ANN401 - as the base class has it
-        """Return a traceback, indented, so that no line of it passes for a record."""
+        """Return a traceback, indented, so that none of its lines looks like a log record."""
         return lines(super().formatException(info)).replace("\n", "\n  ")

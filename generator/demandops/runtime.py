@@ -1,11 +1,11 @@
-"""Time, chance and threads: the only module that asks the machine for them.
+"""Time, random numbers and threads: only this module takes them from the machine.
 
 The service and the cluster's watchers take a :class:`Runtime`. A test can pass its own, with a
 clock that it moves, numbers from a seed, and threads that take turns. An object with a state repo
 uses the repo's runtime. Commands, git's processes and locks, HTTP and ROS's executors always use
 :data:`REAL`.
 
-It also supervises the threads, so that no thread fails unnoticed.
+This module also supervises the threads, so that no thread fails unnoticed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ _LONGEST_REASON = 300
 class Runtime:
     """The runtime of this machine; a subclass overrides the methods that it replaces.
 
-    ``unsound`` says why the process must end, if it must; then ``when_unsound`` is called.
+    ``unsound`` is the error for which the process must end, or None. ``when_unsound`` is called
+    after such an error.
     """
 
     def __init__(self) -> None:
@@ -42,7 +43,7 @@ class Runtime:
         self.when_unsound: Callable[[], object] = lambda: None
 
     def now(self) -> datetime:
-        """Return the time in UTC; a person may set this clock."""
+        """Return the time in UTC. It may jump, because a person may set the clock."""
         return datetime.now(timezone.utc)
 
     def monotonic(self) -> float:
@@ -62,7 +63,7 @@ class Runtime:
         return str(uuid.uuid4())
 
     def lock(self) -> threading.Lock:
-        """Return a lock that is held only briefly, never during a wait."""
+        """Return a new lock. The caller must hold it only briefly, and never while it waits."""
         return threading.Lock()
 
     def event(self) -> threading.Event:
@@ -70,11 +71,14 @@ class Runtime:
         return threading.Event()
 
     def condition(self) -> threading.Condition:
-        """Return a lock whose holders may wait for a change; a wait may end without a change."""
+        """Return a new condition variable; a wait for it may end without a notification."""
         return threading.Condition()
 
     def start_thread(self, name: str, target: Callable[[], object]) -> Thread:
-        """Start a thread that ends with the process at the latest, and return it."""
+        """Start a thread that runs ``target``, and return the thread.
+
+        The thread ends with the process at the latest.
+        """
         thread = Thread(target=target, name=f"demandops-{name}", daemon=True)
         thread.start()
         return thread
@@ -89,7 +93,10 @@ class Runtime:
         return {name: text for name, (text, at) in known if now - at < _STEADY_S}
 
     def failed(self, name: str, error: Exception) -> None:
-        """Record that the work of a thread failed; log a new failure with its trace."""
+        """Record that the work of a thread failed, and log the error.
+
+        A failure that repeats the last one is logged for debugging only.
+        """
         is_known = self.failures.get(name) == _reason(error)
         self._failures[name] = (_reason(error), self.monotonic())
         if is_known:
@@ -105,9 +112,10 @@ class Runtime:
             log.info("%s works again", name)
 
     def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
-        """Start a thread and return it; if it fails, start it again after a pause that grows.
+        """Start a thread that runs ``target``, and return the thread.
 
-        After :class:`Unsound` it is not started again: the process must end.
+        If ``target`` raises an error, the thread pauses and runs it again. The pause grows with
+        each error. After :class:`Unsound` the thread ends, because the process must end.
         """
         return self.start_thread(name, lambda: self._supervise(name, target))
 

@@ -1,7 +1,7 @@
-"""Constants of the program, and the locations of its own files.
+"""Constants of the program, and the locations of the program's own files.
 
-Files carry the versions below. A generator refuses files of a newer format, and a state
-repo of another render version.
+Files of a state repo name the versions below. A generator refuses a file with a newer version of
+the format, and a state repo with another render version.
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ LEDGER_API_VERSION = "demandops.ledger/v2"
 """``apiVersion`` of every claim file."""
 
 RENDER_VERSION = 2
-"""Increased whenever the same ledger and configuration render to different bytes."""
+"""The version of rendering.
+
+It is increased whenever the same ledger and configuration render to other bytes than before.
+"""
 
 MAIN_BRANCH = "main"
 """The branch that Flux and Argo CD read and the generator writes."""
@@ -46,7 +49,7 @@ SCHEMAS_ROOT = "schemas"
 
 
 def modeline(path: str, schema: str) -> str:
-    """Return the comment by which editors check a file of the state repo with a schema."""
+    """Return the comment line that makes editors check a file of the state repo with a schema."""
     up = "../" * path.count("/")
     return f"# yaml-language-server: $schema={up}{SCHEMAS_ROOT}/{schema}.json\n"
 
@@ -80,7 +83,7 @@ def documentation() -> Path | None:
 
 
 def forge_token_file() -> Path | None:
-    """Return the forge token's file, which ``DEMANDOPS_FORGE_TOKEN_FILE`` names."""
+    """Return the file of the forge's token, which ``DEMANDOPS_FORGE_TOKEN_FILE`` names, or None."""
     named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
     return Path(named).expanduser() if named else None
 
@@ -91,7 +94,7 @@ def data_home(state_repo: str) -> Path:
     It is inside ``DEMANDOPS_DATA_HOME`` or else ``$XDG_STATE_HOME/demandops``. Its name is a digest
     of the state repo's address, because the address may contain a password.
     """
-    if Path(state_repo).exists():  # every spelling of a path gives one folder
+    if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())
     root = os.environ.get("DEMANDOPS_DATA_HOME")
     if root:

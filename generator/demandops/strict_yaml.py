@@ -37,7 +37,10 @@ _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, Recursi
 _MISFIT = "not valid YAML: a tag or number is not allowed there"
 
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-"""Matches a text, or the digits of a JSON number like ``1e-09``, which YAML 1.1 reads as text."""
+"""Matches a quoted text, or the digits before the ``e`` of a JSON number like ``1e-09``.
+
+YAML 1.1 would read such a number as text.
+"""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -49,7 +52,7 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes, from a cache, because words repeat often."""
+    """Return the tag of a scalar without quotes. It is cached, because words repeat often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -75,14 +78,14 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a stand-in is not the value of a field, but, for example, part of a text."""
+    """Raised if a stand-in for a list is not a field's value, for example if it is in a text."""
 
 
 class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
-    It refuses a text that is nested so deeply that code which reads the values could fail.
-    ``lists`` are the lists that replace the stand-ins in the text.
+    It refuses a deeply nested text, because code that reads the values could fail. ``lists`` maps
+    each stand-in in the text to the list that it stands for.
     """
 
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
@@ -157,7 +160,10 @@ _SEQUENCE = yaml.SequenceStartEvent(None, None, True, flow_style=False), yaml.Se
 
 
 def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
-    """Yield the events that write a value. A value that occurs twice is written twice."""
+    """Yield PyYAML's events that write a value.
+
+    A part that occurs twice in the value is written twice, without an anchor.
+    """
     if isinstance(value, str):
         yield _text(value)
     elif isinstance(value, list | tuple):
@@ -182,7 +188,7 @@ def _number(value: object) -> str:
 
 @lru_cache(16_384)
 def _text(text: str) -> yaml.ScalarEvent:
-    """Return the event of a text, in quotes if a parser could misread it."""
+    """Return PyYAML's event that writes a text, in quotes if a parser could misread the text."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return yaml.ScalarEvent(None, None, (True, False), text)
     style = "|" if _readable_block(text) else '"'
@@ -190,7 +196,7 @@ def _text(text: str) -> yaml.ScalarEvent:
 
 
 def _readable_block(text: str) -> bool:
-    """Return whether a literal block can hold ``text`` unchanged."""
+    """Return whether a literal block (``|``) can hold a text of several lines unchanged."""
     return (
         text.endswith("\n")
         and not text.endswith("\n\n")
@@ -244,13 +250,17 @@ _LISTED = re.compile(
 )
 """Matches a field with a list of plain texts, as :func:`to_json` writes it."""
 _LONG = 200
-"""From this length on, the json module reads a list, because PyYAML takes 20 times as long."""
+"""The length in characters from which the json module reads a list; PyYAML is 20 times slower."""
 _STAND_IN = "demandops-list"
-"""Stands for a long list while PyYAML reads what is around it."""
+"""The prefix of stand-ins: words that replace long lists while PyYAML reads the other text."""
 
 
 def _load_around_lists(text: str) -> list[Any]:
-    """Return a list with the only document of a text that has long lists, else an empty list."""
+    """Read a document with PyYAML, but its long lists with the json module.
+
+    Return a list with the document. If the text has no long lists, or cannot be read in this way,
+    return an empty list.
+    """
     lists: dict[str, list[str]] = {}
 
     def stand_in(match: re.Match[str]) -> str:
@@ -312,7 +322,7 @@ def _block(value: Any, indent: str) -> str:  # noqa: ANN401
 
 
 def _item(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return an item of a list, whose first line follows the dash."""
+    """Return the text of a list's item after the dash; the item's first line follows the dash."""
     if isinstance(value, str):
         return f" {_scalar(value)}"
     inner = f"{indent}  "
@@ -366,7 +376,7 @@ def set_key(text: str, key: str, value: object) -> str:
 
 
 def to_json(value: object) -> str:
-    """Return ``value`` as JSON that is also valid YAML; a template's ``{{ … }}`` writes this.
+    """Return ``value`` as JSON that is also valid YAML; ``{{ … }}`` in a template gives this text.
 
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
     """

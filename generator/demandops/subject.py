@@ -7,7 +7,11 @@ from enum import Enum
 from typing import TypeAlias
 
 TopicKey: TypeAlias = "tuple[str, ...]"
-"""The identity of a topic within its subject: role, topic and source, or the source topic."""
+"""The identity of a topic within its subject.
+
+For an application, it is role, topic and source. For a connection, it is the topic's name on the
+source node.
+"""
 
 
 class SubjectKind(Enum):

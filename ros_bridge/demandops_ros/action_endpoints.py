@@ -1,4 +1,4 @@
-"""The client of an action, with deep queues, and a search for other nodes that serve the action."""
+"""A client that sends goals of an action, and a search for other nodes that serve the action."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ DEEP_QOS = QoSProfile(depth=2000)
 for a burst, because a client's queue also gets the answers to other clients."""
 
 _UNHEARD_S = 5.0
-"""Seconds without a response until a goal counts as lost; a node responds within milliseconds."""
+"""How many seconds to wait for the node's response to a goal before the goal is sent again. A node
+normally responds within milliseconds."""
 
 _ASK_AGAIN_S = 0.2
 
 
 class DemandError(Exception):
-    """Raised when a demand fails. ``code`` is a word for programs, such as ``unknown-node``."""
+    """Raised when a demand fails. ``code`` is the reason for programs, such as ``unknown-node``."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -35,12 +36,13 @@ class DemandError(Exception):
 
 
 def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
-    """Ask a node to cancel a goal that nobody has sent, and return the future of the answer.
+    """Send a node a request without effect, and return the future of the node's answer.
 
-    The answer shows that the node has discovered the client.
+    The request asks the node to cancel a goal that does not exist. The answer shows that the node
+    has discovered the client.
 
-    A client discovers the node before the node discovers the client, and an answer to a client
-    that is not discovered yet is lost.
+    A client discovers the node before the node discovers the client. Until then, the node's answers
+    to the client are lost.
     """
     nobodys = UUID(uuid=list(bytes.fromhex(REAL.fresh_id().replace("-", ""))))
     return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
@@ -66,8 +68,8 @@ class GoalSender:
             action: the action's class.
             action_name: the name under which a node serves the action.
             node_name: the name of the client's own ROS node.
-            timeout_s: how long to wait for the node, and for each answer.
-            domain_id: the ROS domain; the environment's if left out.
+            timeout_s: how many seconds one call of :meth:`send` may take.
+            domain_id: the ROS domain; by default that of the environment.
         """
         self.timeout_s = timeout_s
         self._action_name = action_name
@@ -100,8 +102,8 @@ class GoalSender:
         """Send a goal and wait for its result.
 
         Returns:
-            Whether the goal succeeded, its result, and whether an earlier attempt was lost. A lost
-            attempt may have succeeded as well.
+            Whether the goal succeeded, its result, and whether an earlier attempt to send it got no
+            response. The node may have carried out that attempt too.
 
         Raises:
             DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
@@ -121,7 +123,7 @@ class GoalSender:
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
 
     def _wait_until_discovered(self, deadline: float) -> None:
-        """Wait until a node answers, but not after the deadline; then the goal times out."""
+        """Wait until the node has discovered this client, but only until ``deadline``."""
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
                 self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
@@ -135,10 +137,10 @@ class GoalSender:
         on_feedback: Callable[[Any], None],
         deadline: float,
     ) -> tuple[Any, bool]:
-        """Send a goal until a node responds; return the goal's handle and if an attempt was lost.
+        """Send a goal until a node responds; return its handle, and whether an attempt was lost.
 
-        The response is lost if a new node replaced the old one and has not discovered this client
-        yet. Sending again is harmless: a demand that is put twice counts once.
+        A response is lost if a new node replaced the old one and has not yet discovered this
+        client. Sending the goal again is harmless: a demand that is put twice counts once.
         """
         lost = False
         while True:
@@ -163,7 +165,7 @@ class GoalSender:
 
 
 class OtherServers:
-    """Finds other nodes that serve the same actions, and logs when they come and go."""
+    """Finds other nodes that serve the same actions as ``node``, and logs changes."""
 
     def __init__(self, node: Node, actions: Iterable[str]) -> None:
         self._node = node
@@ -171,7 +173,7 @@ class OtherServers:
         self._found = {node.resolve_service_name(action): list[str]() for action in actions}
 
     def find(self) -> dict[str, list[str]]:
-        """Return the other nodes known to serve each action, by action."""
+        """Return, for each action, the names of the other nodes that serve it."""
         for action, others in self._found.items():
             now = self._others(action)
             if now and now != others:
@@ -189,5 +191,5 @@ class OtherServers:
         publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
         names = [f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers]
         if self._own in names:
-            names.remove(self._own)  # only once, because another node may have this name
+            names.remove(self._own)  # one entry only: another node may have this name
         return sorted(names)

@@ -34,7 +34,10 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 
 
 class DeploymentRequestAdapter:
-    """The reference's action, whose results and feedback are plain text."""
+    """The adapter for the reference's action ``DeploymentRequest``.
+
+    The action's results and feedback are plain text.
+    """
 
     action: Any = DeploymentRequest
 
@@ -65,7 +68,7 @@ class DeploymentRequestAdapter:
 
 
 class DemandAdapter(DeploymentRequestAdapter):
-    """DemandOps' own action."""
+    """The adapter for DemandOps' own action ``Demand``."""
 
     action = Demand
 
@@ -78,15 +81,18 @@ class DemandAdapter(DeploymentRequestAdapter):
         return str(goal.demand_id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level that the goal names."""
+        """Return the level that the goal names, or None if its number stands for no level."""
         return ANSWER_LEVELS[goal.answer] if goal.answer < len(ANSWER_LEVELS) else None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
-        """Return stage and text."""
+        """Return feedback with the stage and the text."""
         return Demand.Feedback(stage=stage, message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return code and text, and the receipt's fields if there is a receipt."""
+        """Return a result with a code and a text.
+
+        After success, the result also has the fields of the receipt.
+        """
         result = Demand.Result(code=_code(outcome), message=_text(outcome))
         if isinstance(outcome, Receipt):
             result.outcome, result.commit, result.reached = outcome.outcome, outcome.commit, reached

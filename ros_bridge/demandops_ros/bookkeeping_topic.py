@@ -1,4 +1,4 @@
-"""The bookkeeping over ROS 2: a service and a latched topic, with the command line's JSON."""
+"""The bookkeeping over ROS 2, as the command line's JSON: on a service and on a latched topic."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    """Fill and return the response: the bookkeeping at ``request.at``, by default at the tip."""
+    """Fill the response with the bookkeeping at the revision ``request.at``, and return it.
+
+    If ``request.at`` is empty, the revision is the newest commit. If the bookkeeping cannot be
+    computed, the response has the reason.
+    """
     try:
         snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
         response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
@@ -46,9 +50,10 @@ _PAUSE_FACTOR = 20
 
 
 class BookkeepingTopic:
-    """Publishes the bookkeeping on ``~/bookkeeping`` after each change, also for late subscribers.
+    """Publishes the bookkeeping on the latched topic ``~/bookkeeping`` after each change.
 
-    The work grows with the ledger. So a separate thread does it, then pauses 20 times as long.
+    The larger the ledger, the longer it takes to compute the bookkeeping. So a separate thread
+    computes it, and then pauses for 20 times as long as the computation took.
     """
 
     def __init__(

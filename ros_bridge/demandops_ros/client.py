@@ -69,10 +69,10 @@ class DemandClient:
 
         Args:
             requesters: the requesters of every demand.
-            action_name: the node's action.
+            action_name: the name of the action ``Demand`` of the node.
             node_name: the name of the client's own ROS node.
-            timeout_s: how long to wait for the node, and for each answer.
-            domain_id: the ROS domain; the environment's if left out.
+            timeout_s: how many seconds one call, such as :meth:`put`, may take.
+            domain_id: the ROS domain; by default that of the environment.
         """
         self.requesters = requesters
         self.timeout_s = timeout_s
@@ -101,13 +101,15 @@ class DemandClient:
         request: str = "",
         on_stage: StageListener = lambda stage, text: None,
     ) -> Answer:
-        """Replace the content of a demand; return when the change is published.
+        """Replace the content of a demand, and return the answer.
+
+        By default, the call returns when the change is published.
 
         Args:
             demand: the demand's id.
             applications, connections: as in a YAML document of the kind ``Demand``.
-            answer: when to return: pushed, reconciled or healthy.
-            lease: seconds, or a duration like ``10m``; the access domain's if left out.
+            answer: when to return: once the change is pushed, reconciled or healthy.
+            lease: seconds, or a duration like ``10m``; by default the access domain's lease.
             request: free text for the commit.
             on_stage: called with each stage and its text.
 
@@ -129,7 +131,7 @@ class DemandClient:
         """Renew a demand's leases, and return the answer.
 
         Raises:
-            DemandError: as :meth:`put`; ``not-held`` if the demand has ended.
+            DemandError: as in :meth:`put`; with the code ``not-held`` if the demand has ended.
         """
         return self.send({"operation": "renew", "demand": demand})
 
@@ -137,12 +139,15 @@ class DemandClient:
         """Release all that a demand holds, and return the answer.
 
         Raises:
-            DemandError: as :meth:`put`; ``not-held`` if the demand holds nothing.
+            DemandError: as in :meth:`put`; with the code ``not-held`` if the demand holds nothing.
         """
         return self.send({"operation": "release", "demand": demand})
 
     def demand(self, demand: str, *args: Any, **options: Any) -> HeldDemand:  # noqa: ANN401
-        """Return a demand for a ``with`` block, from the arguments of :meth:`put`."""
+        """Return a demand that is held during a ``with`` block.
+
+        The arguments are those of :meth:`put`.
+        """
         return HeldDemand(self, demand, lambda: self.put(demand, *args, **options))
 
     def send(
@@ -177,7 +182,7 @@ class HeldDemand:
         self._renewer: Thread | None = None
 
     def __enter__(self) -> HeldDemand:
-        """Put the demand and start to renew it."""
+        """Put the demand, start to renew its lease, and return this object."""
         lease_s = self._put_and_remember().lease_s
         if lease_s:
             self._renewer = REAL.keep_running("lease", partial(self._renew_until_over, lease_s))

@@ -43,7 +43,7 @@ def _of_state_repo(generator: Generator) -> DiagnosticStatus:
     if remote.push_denied:
         level, text = DiagnosticStatus.ERROR, remote.push_denied
     if remote.unreachable:
-        # if no demand waits, only people's changes are delayed, which is no error
+        # while no demand waits, an unreachable repo delays only people's changes: no error
         level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
         text = remote.unreachable
     values = {
@@ -88,7 +88,7 @@ def _of_actions(generator: Generator, others: dict[str, list[str]]) -> Diagnosti
 def status(
     name: str, address: str, level: bytes, text: str, values: dict[str, str]
 ) -> DiagnosticStatus:
-    """Return a status whose text and values are one line each."""
+    """Return a diagnostic status, with its text and each of its values put on one line."""
     pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
     message = one_line(text)
     return DiagnosticStatus(

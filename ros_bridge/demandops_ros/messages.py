@@ -1,4 +1,4 @@
-"""Converts ROS messages to plain data and back; it needs the messages only, not rclpy."""
+"""Converts ROS messages to plain data and back; it imports message packages, but not rclpy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _OPERATIONS = ("put", "release", "renew")
 _TYPES = ("auto", "mqtt", "zenoh", "ros", "none")
 ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
-# the fields of a document, by the message's names
+# name of a document's field → name of the message's field
 _DEMAND = {
     "demand": "demand_id",
     "request": "request_id",
@@ -61,8 +61,8 @@ _ROUTE |= {name: name for name in RouteOptions.model_fields}
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return a ``Demand.Goal`` as plain data for :func:`demandops.demand.demand_goal.parse`.
 
-    A number that the message does not define becomes text. The parser refuses the text and names
-    the field.
+    The message has numbers where a document has words. A number without a word becomes text, such
+    as ``"9"``. The parser refuses that text and names the field.
     """
     data = {
         "apiVersion": API_VERSION,
@@ -74,7 +74,7 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
         "positions": [_data(position, _POSITION) for position in goal.positions],
         "answer": _word(ANSWER_LEVELS, goal.answer),
     }
-    if goal.lease.sec or goal.lease.nanosec:  # a part of a second counts as a whole one
+    if goal.lease.sec or goal.lease.nanosec:  # rounded up to whole seconds
         data["lease"] = goal.lease.sec + bool(goal.lease.nanosec)
     return data
 
@@ -141,7 +141,7 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
 
 def _pair(text: str) -> tuple[str, str]:
-    """Return the service and the node of ``service=node``; without ``=`` there is no node."""
+    """Return the service and the node in ``service=node``; without ``=``, the node is empty."""
     service, _, node = text.partition("=")
     return service, node
 
@@ -175,7 +175,11 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 def _fields(
     data: Mapping[str, Any], names: Mapping[str, str], more: set[str], what: str
 ) -> dict[str, Any]:
-    """Return the fields of ``data``, renamed to those of a message; refuse an unknown field."""
+    """Return the fields of ``data`` that ``names`` lists, under their names in the message.
+
+    Raises:
+        ValueError: for a field of ``data`` that is neither in ``names`` nor in ``more``.
+    """
     known = {*more, *names}
     for name in data:
         if name not in known:

@@ -2,7 +2,8 @@
 
 A goal is accepted once its demand is in the generator's journal. Many goals may be open without
 blocking the executor: events from the generator's threads are queued, and a guard condition wakes
-the executor to handle them. A goal is executed, in ROS's sense, when its outcome is known.
+the executor to handle them. The execute callback of a goal runs only once the goal's outcome is
+known.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
 _RESULT_KEPT_S = 900
-"""How long a client may ask for a result, instead of rclpy's ten seconds."""
+"""How many seconds a client may ask for a goal's result; rclpy's default is only ten."""
 _DEFAULT_DEPTH = 10
-"""How many answers ROS 2 queues for a client by default; it drops older answers."""
+"""How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
     f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
     f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
@@ -48,7 +49,7 @@ _MOST_READERS = 4
 class _Goal:
     """A goal, its demand and, after the acceptance, its handle.
 
-    ``feedback`` keeps the feedback that comes before the handle.
+    ``feedback`` collects the feedback that is made before the handle exists.
     """
 
     adapter: DeploymentRequestAdapter
@@ -82,15 +83,15 @@ class DemandNode(Node):  # type: ignore[misc]
         Args:
             generator: takes the demands.
             action_name, demand_action_name: the names of the two actions.
-            level: when to answer a goal that names no level.
-            timeout_s: after how many seconds to answer in any case.
+            level: the level at which to answer a goal that names no level.
+            timeout_s: how many seconds a rollout may take to reach its level; then its goal fails.
             status: watches rollouts; None without access to the clusters.
         """
         super().__init__("demandops")
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
         self._goals: dict[int, _Goal] = {}
-        """The goals without a result, by the identity of their messages."""
+        """The goals without a result, by ``id()`` of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
         # a separate callback group, so that a waiting service call does not block the events
@@ -120,7 +121,7 @@ class DemandNode(Node):  # type: ignore[misc]
             goal_callback=partial(self._accept_or_reject, adapter),
             handle_accepted_callback=self._accepted,
             cancel_callback=self._cancel,
-            callback_group=ReentrantCallbackGroup(),  # goals come while others are journaled
+            callback_group=ReentrantCallbackGroup(),  # goals arrive while others are journaled
             goal_service_qos_profile=DEEP_QOS,
             result_service_qos_profile=DEEP_QOS,
             cancel_service_qos_profile=DEEP_QOS,
@@ -138,7 +139,10 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer a call of the service in another thread, because an old revision takes seconds."""
+        """Answer a call of the service in another thread.
+
+        The call may take seconds, if it reads an old revision.
+        """
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response
@@ -177,12 +181,12 @@ class DemandNode(Node):  # type: ignore[misc]
                 lambda future: self._in_executor(partial(journaled.set_result, future.result()))
             )
             if await journaled:
-                if len(self._goals) > _DEFAULT_DEPTH:  # a burst may be journaled together
+                if len(self._goals) > _DEFAULT_DEPTH:  # not ==: a burst may be journaled together
                     self.get_logger().warning(_SHALLOW, once=True)
                 self.executor.create_task(self._forget_unless_accepted, goal)
                 return GoalResponse.ACCEPT
             error = goal.ticket.future.exception()
-            if isinstance(error, Unsound):  # answer nobody; the process ends
+            if isinstance(error, Unsound):  # send no answer: the process ends
                 await Future(executor=self.executor)
             self.get_logger().error(f"{goal} rejected: {one_line(str(error))}")
         except Exception as error:
@@ -191,7 +195,10 @@ class DemandNode(Node):  # type: ignore[misc]
         return GoalResponse.REJECT
 
     def _accepted(self, handle: ServerGoalHandle) -> None:
-        """Give a goal its handle, which rclpy makes only after the goal is accepted."""
+        """Store the handle of an accepted goal, and publish the feedback that was made before.
+
+        rclpy makes the handle only after the goal is accepted.
+        """
         goal = self._goals[id(handle.request)]
         goal.handle = handle
         for feedback in goal.feedback:
@@ -210,7 +217,7 @@ class DemandNode(Node):  # type: ignore[misc]
             )
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Withdraw a demand and accept the cancel, unless the demand is committed."""
+        """Withdraw a demand and accept the cancel; reject it if the demand is already committed."""
         goal = self._goals.get(id(handle.request))
         if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT
@@ -237,9 +244,10 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- an accepted goal, in the executor's thread ----
 
     def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
-        """When a future is done, call ``step`` with its result or error, in the executor.
+        """Make the executor call ``step`` once a future is done.
 
-        There is no coroutine, because rclpy's executor would resume all of them at each event.
+        ``step`` gets the goal, and the result or the error of the future. A coroutine would be
+        slower: rclpy's executor would resume all waiting coroutines at each event.
         """
 
         def take() -> None:
@@ -252,7 +260,7 @@ class DemandNode(Node):  # type: ignore[misc]
         future.add_done_callback(lambda _: self._in_executor(take))
 
     def _answer(self, goal: _Goal, outcome: Receipt | BaseException) -> None:
-        if isinstance(outcome, Unsound):  # answer nobody; the process ends
+        if isinstance(outcome, Unsound):  # send no answer: the process ends
             return
         level = goal.adapter.answer_level(goal.message) or self._level
         if not isinstance(outcome, Receipt) or level == "pushed":
@@ -284,10 +292,13 @@ class DemandNode(Node):  # type: ignore[misc]
         goal.outcome, goal.reached = outcome, reached
         goal.handle.execute()
 
-    # ---- from other threads into the executor's ----
+    # ---- events that other threads pass to the executor's thread ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Send feedback; log a refusal now, because a crash may prevent the result."""
+        """Send a stage as feedback, but log a refusal at once.
+
+        The result reports the refusal too, but a crash may prevent the result.
+        """
         if stage == "refused":
             goal.is_refused = True
             self.get_logger().error(f"{goal}: {_one_line(text)}")

@@ -96,7 +96,7 @@ def read(given: Mapping[str, str | None]) -> dict[str, Any]:
 
 
 def descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
-    """Return a parameter's descriptor; a fetch interval may be of any type."""
+    """Return a parameter's descriptor; only ``fetch_interval`` may be of any type."""
     choices = _CHOICES.get(name)
     return ParameterDescriptor(
         description=_DESCRIPTIONS[name],

@@ -26,10 +26,11 @@ _LAST_CALLBACK_S = 20.0
 
 
 class ExecutorThread:
-    """Runs a node's callbacks in a thread that ends before the node, and before Python.
+    """Runs a node's callbacks in a thread that ends before the node is destroyed and Python exits.
 
-    The thread ends itself, because rclpy's ``shutdown`` waits for no callback and destroys what the
-    thread may need. A thread that still waits for ROS when Python ends aborts the process.
+    The thread ends itself. rclpy's ``shutdown`` does not wait for running callbacks and destroys
+    what the thread may need. If the thread still waits for ROS when Python exits, the process
+    aborts.
     """
 
     def __init__(self, node: Node, name: str = "executor") -> None:
@@ -37,18 +38,21 @@ class ExecutorThread:
         self._executor.add_node(node)
         self._over = REAL.event()
         self._thread = REAL.keep_running(name, self._spin)
-        atexit.register(self.close)  # in case no caller does
+        atexit.register(self.close)  # in case no caller closes it
 
     def call(self, callback: Callable[[], object]) -> None:
         """Call ``callback`` in the thread."""
         self._executor.create_task(callback)
 
     def close(self) -> None:
-        """End the thread; then the caller may destroy the node. A second call does nothing."""
+        """End the thread. A second call does nothing.
+
+        After the first call, the node may be destroyed.
+        """
         atexit.unregister(self.close)
         if not self._over.is_set():
             self._over.set()
-            self.call(lambda: None)  # wakes it
+            self.call(lambda: None)  # wakes the thread
             self._thread.join(_LAST_CALLBACK_S)
             self._executor.shutdown(timeout_sec=0)
 
@@ -60,13 +64,16 @@ class ExecutorThread:
 
 @contextmanager
 def stop_signals() -> Iterator[Callable[[], None]]:
-    """Yield a function that waits for Ctrl-C or SIGTERM; a second signal stops the process."""
+    """Yield a function that waits for Ctrl-C or SIGTERM.
+
+    After the function has returned, a further signal ends the process at once.
+    """
     over = REAL.event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
 
     def wait() -> None:
-        while not over.wait(_POLL_S):  # the kernel may deliver a signal to another thread
+        while not over.wait(_POLL_S):  # poll: another thread may get the signal
             pass
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
@@ -88,7 +95,7 @@ class RosLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a record at the matching ROS level."""
-        text = self.format(record)  # rclpy allows only one level for each line that logs
+        text = self.format(record)  # rclpy allows each line of code one level only
         if record.levelno >= logging.ERROR:
             self._log.error(text)
         elif record.levelno >= logging.WARNING:
@@ -103,10 +110,10 @@ class RosLogHandler(logging.Handler):
 def started(
     arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
 ) -> Iterator[list[str]]:
-    """Run the block with ROS initialized by `--ros-args`; yield the arguments for ROS.
+    """Run the block with ROS initialized from ``arguments``, and yield these as a list.
 
     Raises:
-        click.UsageError: if there are other arguments.
+        click.UsageError: if ``arguments`` begin with anything but ``--ros-args``.
     """
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
@@ -114,7 +121,7 @@ def started(
             f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
         )
     if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
-        # ROS's log library does not start in a container without a home
+        # ROS's log library does not start in a container without a home folder
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     rclpy.init(args=["demandops", *ros_args], signal_handler_options=signals)
     try:

@@ -121,7 +121,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
                 "fetch_interval": fetch_interval,
             }
         )
-        # the generator may publish demands of the journal before the node exists
+        # before the generator starts: it may publish demands of the journal, and then logs them
         ros_process.log_to(get_logger("demandops"), settings["log_level"])
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = clusters_file.read(access_file).clusters if access_file else {}
@@ -141,7 +141,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
         parts.callback(trigger.close)
         generator.on_publish(trigger)
-        trigger(generator.snapshot.state.config)  # an earlier run may have ended after a push
+        trigger(generator.snapshot.state.config)  # an earlier run may have ended right after a push
         if webhook:
             push_webhook = PushWebhook(webhook, secret, generator.fetch_now)
             parts.callback(push_webhook.close)
@@ -152,7 +152,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         if status is not None:
             parts.callback(status.close)
         if leader_lease:
-            # publish the journal's demands before those of clients, unless they must wait
+            # lead only once the journal's demands are published, or cannot be published now
             leadership = Leadership(
                 leader_lease,
                 lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
@@ -172,7 +172,11 @@ def _page(
     settings: dict[str, Any],
     clusters: Mapping[str, clusters_file.ClusterAccess],
 ) -> WebServer:
-    """Start and return the web page, which fetches the state repo itself, as often as the node."""
+    """Start the server of the web page, and return it.
+
+    The page fetches the state repo on its own, as often as the node does, and after each
+    publication.
+    """
     interval = parse_interval(settings["fetch_interval"])
     follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
     generator.on_publish(lambda config: follower.wake())
@@ -197,10 +201,10 @@ def _run(
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
-        # read only, because the parameters are read at the start
+        # read only, because a later change would have no effect
         node.declare_parameter(name, shown, node_parameters.descriptor(name, read_only=True))
     ros_process.log_to(node.get_logger(), settings["log_level"])
-    # a thread of its own, so that the main thread notices a signal at once
+    # the node runs in another thread, so that the main thread notices a signal at once
     thread = ros_process.ExecutorThread(node)
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
@@ -217,7 +221,11 @@ def _drain(
     generator: Generator,
     status: RolloutWatcher | None,
 ) -> None:
-    """Send the results of all open goals before the node is destroyed."""
+    """Finish the open goals before the node is destroyed.
+
+    The generator publishes waiting demands for some seconds. Then the results of all open goals are
+    sent.
+    """
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
     published = generator.stop().result()
     if status is not None:
@@ -237,10 +245,11 @@ def _drain(
 
 
 class _Signals:
-    """Ctrl-C and SIGTERM stop the program after the open goals; a second one stops it at once.
+    """Handles Ctrl-C and SIGTERM: the first signal stops the program after its open goals.
 
-    The kernel may deliver a signal to any thread. Python writes it to a wake-up pipe, which the
-    main thread reads, so the main thread notices it at once.
+    A second signal stops the program at once. The kernel may deliver a signal to any thread. Python
+    writes the signal to a wake-up pipe. The main thread reads this pipe, so it notices the signal
+    at once.
     """
 
     def __init__(self) -> None:
@@ -263,15 +272,16 @@ class _Signals:
         signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Wait for a signal, or until ``until()`` is true; after :meth:`wake`, check again.
+        """Wait until a signal comes or ``until()`` is true.
 
-        If :class:`Unsound` was raised, because a demand could be lost, end the process.
+        Each call of :meth:`wake` makes this method check ``until()`` again. If :class:`Unsound` was
+        raised in any thread, a demand could be lost. Then this method ends the process.
         """
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)
         if REAL.unsound is not None:
             errors.print(f"error: {REAL.unsound}")
-            os._exit(ExitCode.PROGRAM_ERROR)  # an orderly end could still answer goals
+            os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
 
     def wake(self) -> None:
         """Make :meth:`wait` check again; any thread may call this."""

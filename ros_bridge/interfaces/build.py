@@ -186,7 +186,10 @@ def _missing_tools(environ: Mapping[str, str]) -> dict[str, str]:
 
 
 def _build_somewhere(build_dir: Path | None, digest: str) -> None:
-    """Build in a folder, which is kept if the caller named it or a stage fails."""
+    """Build in ``build_dir``, or in a temporary folder if it is None.
+
+    The temporary folder is kept only if a stage fails.
+    """
     folder = build_dir or Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
     folder.mkdir(parents=True, exist_ok=True)
     keep = build_dir is not None
@@ -275,7 +278,10 @@ def _environ() -> dict[str, str]:
 
 
 def _remove_installed(package: str) -> None:
-    """Remove an earlier build, because its interfaces may have had other names."""
+    """Remove the files of an earlier build of a package.
+
+    Its interfaces may have had other names, so the new build may not overwrite its files.
+    """
     index = PREFIX / "share" / "ament_index" / "resource_index"
     for path in (
         PREFIX / "share" / package,

@@ -1,4 +1,4 @@
-"""The example `examples/lane-detection`, played as its page says."""
+"""The example `examples/lane-detection` does what its page says."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PAGE = (EXAMPLE / "README.md").read_text()
 
 
 def blocks(language: str) -> dict[str, str]:
-    """Return the page's blocks of a language by their first line."""
+    """Return the code blocks of one language on the page, each by its first line."""
     found = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
     return {text.partition("\n")[0].lstrip("# "): text for text in found}
 

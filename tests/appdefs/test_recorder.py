@@ -1,6 +1,6 @@
-"""Further types of applications: folders of YAML and templates, demanded like the first.
+"""Further types of applications need only folders of YAML and templates, and no code.
 
-``recorder`` and ``monitor`` share a driver that runs where the sensor is.
+``recorder`` and ``monitor`` share a driver that runs on the node of the sensor.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ADDITIONS = {
     for path, text in configuration(["recorder", "monitor"]).items()
     if path not in skeleton() or path.startswith("registry/")
 }
-"""What a platform engineer adds to a state repo: the folders and two registry lists."""
+"""What a platform engineer adds to a state repo: the appdefs' folders and two registry files."""
 
 
 @pytest.fixture
@@ -221,7 +221,7 @@ def test_all_three_kinds_run_side_by_side(books: MemoryRepo) -> None:
 
 
 class TestParameters:
-    """Each demand's value, merged as the appdef says; what cannot be merged is refused."""
+    """The appdef decides how values of several demands merge; without a rule they must be equal."""
 
     @staticmethod
     def demand(who: str, appdef: str = "recorder", **parameters: object) -> dict[str, Any]:
@@ -236,7 +236,7 @@ class TestParameters:
 
     @staticmethod
     def values(books: MemoryRepo, prefix: str = "rec-") -> dict[str, Any]:
-        """Return the values of the one release with a prefix."""
+        """Return the Helm values of the only release whose name starts with a prefix."""
         releases = books.objects("HelmRelease").items()
         (found,) = (one["spec"]["values"] for name, one in releases if name.startswith(prefix))
         return dict(found)
@@ -251,7 +251,7 @@ class TestParameters:
             ("rate", [10, 20], 20),
             ("rate", [2.5, 2], 2.5),
             ("rate", [-3, -2], -2),
-            ("rate", [0.5, None], 0.5),  # who says nothing does not say the default
+            ("rate", [0.5, None], 0.5),  # a demand without a rate is none for the default
             ("rate", [None, None], 1),
             ("quality", [10, 20], 10),
             ("quality", [0, 0.5], 0),
@@ -271,7 +271,7 @@ class TestParameters:
                 demand = self.demand(f"who{minute}", **parameters)
                 repo.send(demand, NOW + timedelta(minutes=minute))
         assert self.values(books)[name] == merged
-        if name != "title":  # of which the last one counts
+        if name != "title":  # of several titles the last one counts
             assert self.values(turned)[name] == merged
 
     def test_values_that_nobody_said_how_to_merge_must_agree(self, books: MemoryRepo) -> None:
@@ -288,7 +288,7 @@ class TestParameters:
     def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
         self, books: MemoryRepo, recorder: dict[str, int], monitor: int
     ) -> None:
-        """Nor does it fall back to the default of one kind."""
+        """If one kind's demand gives no rate, that kind's default does not count either."""
         books.send(self.demand("a", "recorder", **recorder))
         books.send(self.demand("b", "monitor", rate=monitor))
         assert self.values(books, "drv-")["rate"] == 20

@@ -1,4 +1,4 @@
-"""Replicas as docs/appdef.md says: by what is demanded, by a size, or by an autoscaler."""
+"""The number of replicas follows the demands, a size or an autoscaler, as docs/appdef.md says."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ROWS = [
 
 
 def books(scaling: str, *, gitops: Literal["flux", "argocd"] = "flux", **files: str) -> MemoryRepo:
-    """Return a state repo whose recorder has this scaling."""
+    """Return a state repo whose recorder has the `scaling` of this YAML text."""
     text = ADDITIONS[APPDEF].replace("{min: 1, max: 3, per: {topics: 2}}", scaling)
     text = text.replace("parameters:\n", "parameters:\n  size: {default: small, merge: union}\n")
     assert scaling in text
@@ -66,21 +66,21 @@ def demand(
 
 
 def release(repo: MemoryRepo) -> dict[str, Any]:
-    """Return the recorder's HelmRelease or Application."""
+    """Return the recorder's HelmRelease, or its Application with Argo CD."""
     (path,) = (path for path in repo.rendered() if "/rec-" in path)
     found: dict[str, Any] = plain_yaml.load(repo.files[path])
     return found
 
 
 def fact(repo: MemoryRepo) -> str:
-    """Return what a commit message would say of the recorder's replicas."""
+    """Return what a commit message reports of the recorder's replicas."""
     (found,) = (plan for plan in repo.state.plans.values() if plan.name.startswith("rec-"))
     (told,) = (line for line in found.facts() if line.startswith("replicas "))
     return told.removeprefix("replicas ")
 
 
 def replicas_by_overrides(*replicas: int) -> dict[str, str]:
-    """Return overrides of the recorder's replicas, of which the last one wins."""
+    """Return one override's file for each number of replicas; the last one takes precedence."""
     return {
         f"overrides/o{rank}.yaml": override(
             {"services": ["recorder"]}, priority=rank, replicas=number
@@ -168,7 +168,7 @@ FOLLOWING = {
     .replace("prefix: od\n", f"prefix: od\n    scaling: {BY_WHO}\n")
     .replace("prefix: of\n", f"prefix: of\n    scaling: {BY_CLAIMS}\n")
 }
-"""Detections for each requester, fusions for each claim."""
+"""An appdef with one detection for each requester and one fusion for each claim."""
 
 
 @given(st.lists(demands(), max_size=14))
@@ -183,11 +183,14 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
 
 
 class TestRequesters:
-    """A change of requesters alone is planned where a definition or an override looks at them."""
+    """A service whose definition or override depends on requesters is planned when they change."""
 
     @staticmethod
     def changed(repo: MemoryRepo, requesters: int) -> tuple[list[str], set[str]]:
-        """Return the generated files that a second join changes, and the services planned anew."""
+        """Demand again with so many requesters.
+
+        Return the generated files that change, and the names of the services that are planned.
+        """
         before = repo.state
         decision = repo.send(demand(topics=3, requesters=requesters))
         keys = affected_keys(before, decision.state, decision.changes.claims)
@@ -225,7 +228,10 @@ class TestRequesters:
 
 
 class TestAutoscaler:
-    """A HorizontalPodAutoscaler owns the number: no controller sets it, and overrides bound it."""
+    """A HorizontalPodAutoscaler owns the number of replicas.
+
+    No GitOps controller sets the number, and an override sets both bounds.
+    """
 
     def test_flux_leaves_the_number_alone(self) -> None:
         repo = books(AUTOSCALED)
@@ -285,7 +291,7 @@ class TestAutoscaler:
 
 @pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
 def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: bool) -> None:
-    """The driver publishes; the recorder does not."""
+    """The report warns of the driver, which publishes, and not of the recorder, which does not."""
     driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
     doubled = override({"services": ["*"]}, replicas=2)
     repo = MemoryRepo({**ADDITIONS, DRIVER: driver, "overrides/two.yaml": doubled})

@@ -1,7 +1,8 @@
-"""What the auditor's questions cost: a fleet's state repo with thousands of commits, and the views.
+"""What an auditor's questions cost on the state repo of a fleet with thousands of commits.
 
-Vehicles join and leave at all edges in turn, each a commit by the generator itself. Prints seconds
-for each question; ``--keep FOLDER`` leaves the state repo there (and takes it up again).
+Vehicles join and leave at all edges in turn; the generator makes a commit of each join and leave.
+The benchmark prints the seconds of each question. ``--keep FOLDER`` makes the state repo in this
+folder and keeps it, or uses the one that is there.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ BATCH = 500
 
 
 def lay_down(folder: Path, releases: int, commits: int) -> Path:
-    """Make a state repo with ``commits`` demands behind it."""
+    """Make a state repo with a fleet and ``commits`` further demands; return its path."""
     laid = fleet.lay_down(folder / "state-repo.git", releases)
     generator = Generator(str(laid.path), data=folder / "data")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast
@@ -48,14 +49,14 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
 
 
 def timed(what: str, call: Callable[[], object]) -> None:
-    """Print how long a question takes."""
+    """Ask a question; print how long it takes, and the answer."""
     start = time.perf_counter()
     found = call()
     print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")
 
 
 def measure(repo: Path) -> None:
-    """Ask everything once."""
+    """Ask each question once, and print its time."""
     with reader.opened(str(repo)) as opened:
         tip = opened.commit()
         timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))
@@ -89,7 +90,7 @@ def _verify(opened: reader.Reader, *, whole: bool) -> int:
 
 
 def main() -> int:
-    """Lay down, measure, clean up."""
+    """Make the state repo unless it is there, and measure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--releases", type=int, default=RELEASES)
     parser.add_argument("--commits", type=int, default=COMMITS)

@@ -1,8 +1,9 @@
-"""What a commit costs: ``submit`` to durable commit, beside the floor, at 100 and 10,000 releases.
+"""What a commit costs from ``submit`` on, compared with a floor, at 100 and 10,000 releases.
 
-The floor writes the very blobs, trees and commit of the same demands with bare pygit2 and the same
-fsync, in the same repository and run, each right after the demand it repeats. GitPython's index
-commits the same files in a checked-out copy. Prints a table, writes ``build/bench.json``.
+The floor is the least that such a commit can cost: bare pygit2 writes the same blobs, trees and
+commit with the same fsync, in the same repository, right after each demand. GitPython's index
+commits the same files in a checked-out copy. The benchmark prints a table and writes
+``build/bench.json``.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ WARM_UP = 4
 
 
 def _changed(repo: pygit2.Repository, commit: pygit2.Commit) -> dict[str, str | None]:
-    """The files that one commit changed, with their texts."""
+    """Return path → text of the files that a commit changed; None for a removed file."""
     files: dict[str, str | None] = {}
     before, after = commit.parents[0].tree, commit.tree
     for path, _ in trees.differences(before, after):
@@ -45,7 +46,7 @@ def _changed(repo: pygit2.Repository, commit: pygit2.Commit) -> dict[str, str | 
 
 
 class Floor:
-    """The same objects, loose, by bare pygit2: what one file for each object cannot go below."""
+    """The floor: bare pygit2 writes the same objects, each into a file of its own."""
 
     def __init__(self, path: Path) -> None:
         self._repo, self._other = pygit2.Repository(str(path)), pygit2.Repository(str(path))
@@ -115,7 +116,10 @@ def _p99(values: list[float]) -> float:
 
 
 def _index(folder: Path, bare: Path, changes: list[dict[str, str | None]]) -> list[float]:
-    """Commit the same changes through GitPython's index, in a checked-out copy."""
+    """Commit the same changes through GitPython's index; return the seconds of each commit.
+
+    The index needs a checked-out copy.
+    """
     times = []
     start_at = f"HEAD~{ROUNDS + WARM_UP}"
     with git.Repo.clone_from(str(bare), folder / "work") as repo:

@@ -1,12 +1,15 @@
-"""What a join costs with every kind of decision configured, beside one with none of it.
+"""What a join costs with every kind of decision configured, compared with none of them.
 
-Two state repos have the same fleet. In the second, services request capacity of their nodes, scale
-by sources and come down later, have versions that may run apart, and are shared within a cluster by
-another application. Each edge is in a further access domain with rules, quotas and leases. Two
-generators in one process take turns, so both suffer alike from what else runs. A vehicle joins as
-the reference's clients do, and by a demand of ours that, in the second repo, leaves the node to the
-generator. The clock stops with the receipt; CPU time counts until the process is idle again. Prints
-the ratios of medians, writes ``build/configured.json``.
+Two state repos have the same fleet. In the second one, services request capacity of their nodes,
+scale by sources and keep replicas for a while, have versions that may run side by side, and are
+shared within a cluster with another application. Each edge is also in a further access domain with
+rules, quotas and leases.
+
+Two generators in one process take turns, so that other work on the machine affects both alike. A
+vehicle joins by a goal of the reference's action, and by a demand in DemandOps' own format. In the
+second repo, this demand leaves the node to the generator. The clock stops with the receipt; CPU
+time counts until the process is idle again. The benchmark prints the ratios of the medians and
+writes ``build/configured.json``.
 """
 
 from __future__ import annotations
@@ -116,7 +119,7 @@ Times = tuple[float, float]
 
 
 def _times(generator: Generator, goal: dict[str, Any]) -> Times:
-    """Return the milliseconds of a demand, by the clock and by CPU time of all threads."""
+    """Book a goal; return its milliseconds by the clock, and the CPU time of all threads."""
     clock, cpu = time.perf_counter(), time.process_time()
     generator.submit(goal).future.result()
     clock = time.perf_counter() - clock
@@ -124,7 +127,7 @@ def _times(generator: Generator, goal: dict[str, Any]) -> Times:
 
 
 def _when_idle() -> float:
-    """Return the CPU time of the process when it has nothing left to do."""
+    """Wait until the process has nothing left to do; return its CPU time so far."""
     before = time.process_time()
     while True:
         time.sleep(_IDLE_S)
@@ -135,13 +138,13 @@ def _when_idle() -> float:
 
 
 def reference(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return the reference's join and shutdown, which name a node in either repo."""
+    """Return the reference's join and shutdown, which always name a node."""
     join = fleet.goal(fleet.edge_id(edge), fleet.spare_id(edge))
     return [join, join | {"shutdown": True}]
 
 
 def demand(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a demand of ours and its release; ``placed`` leaves the node to the generator."""
+    """Return a demand in our own format and its release; ``placed`` leaves out the node."""
     who, node = fleet.spare_id(edge), fleet.edge_id(edge)
     made = goals.put(f"of-{who}", who, topic=(f"/{who}/ego", who), node="" if placed else node)
     made["applications"][0]["connect"] = "mqtt"

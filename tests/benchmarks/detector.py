@@ -1,8 +1,8 @@
 """What the event detector costs: the engine alone, then the node with messages over ROS 2.
 
-The engine gets 2,000 entities at 10 Hz, with 100 areas, a rule on pairs and one on a count. The
-node gets poses of more and more entities at 10 Hz until it loses some: first each entity has a
-topic of its own, then all share one.
+The engine gets 2,000 entities at 10 Hz, with 100 areas, a rule on pairs and a rule on a count. The
+node gets poses of more and more entities at 10 Hz until it loses messages. First each entity has a
+topic of its own, then all entities share one topic.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ONE_TOPIC = {
 
 
 def rules() -> list[dict[str, Any]]:
-    """100 intersections in a square of 10 km, pairs, and a count."""
+    """Return rules for 100 intersections in a square of 10 km, for pairs, and for a count."""
     areas = [
         rule(
             f"near-{number}",
@@ -52,7 +52,7 @@ def rules() -> list[dict[str, Any]]:
 
 
 def engine() -> None:
-    """Drive 2,000 entities at 50 km/h."""
+    """Measure the engine with 2,000 entities that drive at 50 km/h; print the result."""
     run = EventEngine(rule_file.read(text_of(*rules()), "rules.yaml"))
     chance = random.Random(1)
     cars = [
@@ -78,7 +78,10 @@ def engine() -> None:
 
 
 def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
-    """Return how many messages were sent and read, and the share of a core of the detector."""
+    """Send poses of ``entities`` to the detector over ROS.
+
+    Return how many messages were sent, how many the detector read, and its share of a core.
+    """
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseStamped

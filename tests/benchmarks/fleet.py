@@ -1,8 +1,8 @@
-"""A fleet of any size, laid down at once: what the benchmarks measure on.
+"""State repos with a fleet of any size, made at once, for the benchmarks.
 
-Regions, each a cluster, of ten edges with ten vehicles each; every vehicle has a connection (two
-releases) and a detection on its edge, every edge a fusion. Nodes, claims and rendered files are
-what the generator itself writes.
+A region is a cluster of ten edges with ten vehicles each. Each vehicle has a connection (two
+releases) and a detection on its edge, and each edge has a fusion. The code of the generator itself
+makes the claims and the rendered files.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
 
 @dataclass(frozen=True)
 class Fleet:
-    """A state repo with a fleet in it."""
+    """The state repo of a fleet, and how many edges, releases and nodes the fleet has."""
 
     path: Path
     edges: int
@@ -50,14 +50,14 @@ def vehicle_id(edge: int, number: int) -> str:
 
 
 def spare_id(edge: int) -> str:
-    """A vehicle that is in the inventory and demands nothing yet."""
+    """Return the id of a vehicle at an edge that is in the inventory and demands nothing yet."""
     return f"newcomer{edge:05d}"
 
 
 def goal(
     edge: str, vehicle: str, *, ego: Sequence[str] = (), shutdown: bool = False
 ) -> dict[str, Any]:
-    """One vehicle's demand for perception on one edge; ``ego`` are its topics beside the cloud."""
+    """Return a vehicle's goal for perception; ``ego`` has its topics besides the cloud."""
     ego, points = ego or [f"/{vehicle}/ego_data"], f"/{vehicle}/points"
     app = goals.application(
         f"{edge}/fusion",
@@ -95,7 +95,7 @@ def _file(kind: str, **lists: object) -> str:
 
 
 Configure = Callable[[dict[str, str]], object]
-"""Changes the files of a configuration."""
+"""A function that changes the files of a configuration."""
 
 
 def lay_down(
@@ -104,20 +104,23 @@ def lay_down(
     edges_per_cluster: int = 10,
     configure: Configure = lambda files: None,
 ) -> Fleet:
-    """Make a bare state repo with about ``releases`` releases running, by regions."""
+    """Make a bare state repo in which about ``releases`` releases run; return the fleet."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
     nodes = _lay_down(path, edges, edges_per_cluster, VEHICLES_PER_EDGE, 0, configure)
     return Fleet(path, edges, edges * RELEASES_PER_EDGE, nodes)
 
 
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
-    """Make a bare state repo where vehicles hold one application; ``further`` may join."""
+    """Make a bare state repo in which ``vehicles`` hold one application; return its path.
+
+    The inventory has ``further`` vehicles that hold nothing yet.
+    """
     _lay_down(path, 1, 1, vehicles, further)
     return path
 
 
 def lay_down_idle(path: Path, edges: int, vehicles: int) -> Fleet:
-    """Make a bare state repo with edges and their vehicles, of which none demands anything yet."""
+    """Make a bare state repo with edges and vehicles that demand nothing yet; return the fleet."""
     _lay_down(path, edges, edges, 0, vehicles)
     return Fleet(path, edges, 0)
 
@@ -160,7 +163,7 @@ def _lay_down(
 
 
 def table(title: str, rows: Sequence[Mapping[str, object]]) -> Table:
-    """Return figures as people read them; the columns are the keys of the first row."""
+    """Return figures as a table for people; the columns are the keys of the first row."""
     made = Table(title=title)
     for column in rows[0]:
         made.add_column(column.replace("_", " "), justify="right")

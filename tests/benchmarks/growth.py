@@ -1,10 +1,10 @@
-"""What a demand costs as what it touches grows: vehicles on one application, topics in one goal.
+"""How the cost of a demand grows with the vehicles on its application and its own topics.
 
-A vehicle joins and leaves an application that 10, 100 and 1,000 others hold. One goal lists 10,
-1,000 and 8,000 topics. Each figure is the time from ``submit`` to the receipt in one running
-generator, by the clock and of the processor; its start is reported beside it. The sizes take turns
-in one process, so that they share what else the machine does. Prints two tables, writes
-``build/growth.json``.
+A vehicle joins and leaves an application that 10 to 1,000 other vehicles hold. A goal lists 10,
+1,000 or 8,000 topics. Each figure is the time from ``submit`` to the receipt in a running
+generator, by the clock and of the processor. The time of the generator's start is given too. The
+sizes take turns in one process, so that other work on the machine affects all of them alike. The
+benchmark prints two tables and writes ``build/growth.json``.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def _costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
 
 
 def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Row]:
-    """Measure a further vehicle on applications of several sizes, by turns in one process.
+    """Return a row of figures for each size: the join and the leave of one more vehicle.
 
-    ``sizes`` has how many vehicles hold each application, ``ego`` gives the topics of a goal for a
-    size and a number.
+    ``sizes`` has how many vehicles hold the application of each size. ``ego`` returns the ego
+    topics of a goal from the size and the number of the goal.
     """
     generators: dict[int, Generator] = {}
     rows: dict[int, Row] = {}
@@ -73,12 +73,12 @@ def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Ro
 
 
 def vehicles_rows(folder: Path, vehicles: Sequence[int]) -> list[Row]:
-    """Measure one more vehicle on an application that so many hold."""
+    """Return rows of figures: one more vehicle on an application that so many vehicles hold."""
     return _rows(folder, {size: size for size in vehicles}, ROUNDS, lambda size, number: [])
 
 
 def topics_rows(folder: Path, topics: Sequence[int]) -> list[Row]:
-    """Measure one goal with so many topics, and its shutdown."""
+    """Return rows of figures: a goal with so many topics, and its shutdown."""
 
     def ego(size: int, number: int) -> list[str]:
         return [f"/t{number}/n{index}" for index in range(size)]

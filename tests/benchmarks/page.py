@@ -1,9 +1,9 @@
 """What the page costs with a large fleet: on the server, and in the browser's main thread.
 
-A fleet of about 10,000 releases on 3,900 nodes is looked at in a headless Chromium. For each view:
-how long the server works on it, its size, and the longest time that the browser's main thread was
-busy while it came up. Then a demand is booked, and the views are measured as they update
-themselves. Prints a table, writes ``build/page.json``.
+A headless Chromium opens the page of a fleet with about 10,000 releases on 3,900 nodes. For each
+view, the benchmark measures how long the server works on it, its size, and the longest time that
+the browser's main thread was busy while the view came up. Then a demand is booked, and the update
+of the open view is measured. The benchmark prints a table and writes ``build/page.json``.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Row = dict[str, float]
 
 
 def _on_server(url: str) -> tuple[float, int]:
-    """Return how long the server takes for a view that it has shown before, and its bytes."""
+    """Return the server's seconds for a view that it has served before, and the view's bytes."""
     for _ in range(2):
         start = time.perf_counter()
         with urllib.request.urlopen(url) as answer:  # noqa: S310 - the page on this machine
@@ -56,7 +56,11 @@ def _on_server(url: str) -> tuple[float, int]:
 
 
 def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -> Row:
-    """Measure a view; of several rounds the best, so that other work on the machine counts less."""
+    """Return the figures of a view.
+
+    Those of the browser are the best of several rounds, so that other work on the machine counts
+    less.
+    """
     server_s, size = _on_server(server.url + view)
     first, updates = list[float](), list[tuple[float, float]]()
     for _ in range(ROUNDS):
@@ -100,7 +104,7 @@ def measure(releases: int) -> dict[str, Row]:
 
 
 def main() -> None:
-    """Print the figures, and whether the aim is reached."""
+    """Print the figures of all views, and the longest task beside the aim."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--releases", type=int, default=10_000)
     rows = measure(parser.parse_args().releases)

@@ -1,4 +1,4 @@
-"""Each command of the documentation is run by a test, or says why it is not."""
+"""A test runs each command of the documentation, or a comment above the command says why not."""
 
 from __future__ import annotations
 

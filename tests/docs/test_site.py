@@ -1,4 +1,4 @@
-"""The site of the documentation is complete by itself, and its build refuses what would be lost."""
+"""The documentation's site is complete, and its build reports faults such as broken links."""
 
 from __future__ import annotations
 

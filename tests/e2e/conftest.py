@@ -18,7 +18,7 @@ pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.ste
 
 @pytest.fixture(autouse=True)
 def limited() -> None:
-    """Set no limit: each wait here has its own."""
+    """Set no limit on a test, because each wait in these tests has its own."""
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +48,7 @@ def requester(ros_domain: int) -> Iterator[DemandClient]:
 
 @pytest.fixture
 def edge_is_full(rig: Rig) -> Iterator[Callable[[], None]]:
-    """Schedule no pod on the edge, until the returned function is called."""
+    """Let no pod be scheduled on the edge; return the function that lifts this."""
     (edge,) = rig.kube.find("Node", selector="node_id=edge")
 
     def unschedulable(value: bool | None) -> None:

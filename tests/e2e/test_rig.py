@@ -45,7 +45,7 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 
 
 class Domain:
-    """An access domain of a state repo: a namespace, its service account, a source."""
+    """An access domain of a small state repo, with namespace, account, source and Kustomization."""
 
     def __init__(self, rig: Rig, folder: Path, say: Report) -> None:
         self.rig, self.kube, self.say = rig, rig.kube, say
@@ -114,7 +114,7 @@ class Domain:
         self.lap("Kustomization ready")
 
     def push(self, files: dict[str, str | None]) -> None:
-        """Push and trigger the source; its new artifact triggers the Kustomization."""
+        """Push files, trigger the source, and wait until the Kustomization has applied them."""
         commit = self.clone.push(files)
         token = self.kube.reconcile("GitRepository", "state", self.name)
 

@@ -1,4 +1,4 @@
-"""The rig's parts that need no cluster: building programs, watching processes, serving Git."""
+"""The parts of the rig that need no cluster: program builds, process control, the Git server."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ esac
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file that lists the builds of a fake Go on PATH, with an empty cache."""
+    """Put a fake Go on PATH, with an empty cache; return the file that lists its builds."""
     program = tmp_path / "bin" / "go"
     program.parent.mkdir()
     program.write_text(FAKE_GO)
@@ -58,7 +58,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def quiet(_: str) -> None:
-    """Report nothing."""
+    """Ignore a line of progress."""
 
 
 def test_a_program_is_built_once_with_its_crds(runs: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_process_that_ignores_sigterm_is_killed_with_its_children(
 def test_a_process_outlives_the_thread_that_started_it(
     processes: Processes, tmp_path: Path
 ) -> None:
-    note = tmp_path / "note"  # once it exists, the kernel watches the parent
+    note = tmp_path / "note"  # once it exists, the process is bound to its parent
     component = shell(
         "long", f"touch {note}; sleep 60", lambda: None if note.exists() else "not yet"
     )
@@ -214,7 +214,7 @@ def git_port(tmp_path: Path) -> Iterator[int]:
 
 
 def test_a_large_push_and_a_partial_clone(git_port: int, tmp_path: Path) -> None:
-    """A pack above one megabyte arrives in chunks, and blobs can be left out of a fetch."""
+    """Git sends a pack above one megabyte in chunks, and a fetch can leave out blobs."""
     address = f"{net.url(git_port)}/a/state.git"
     noise = os.urandom(3_000_000).hex()
     commit = Clone(address, tmp_path / "one").push({"big": noise, "small": "s"})

@@ -1,1 +1,4 @@
-"""The paper's experiment without scripted demands: `make experiment` (docs/experiment.md)."""
+"""The paper's experiment with the event detector in place of scripted demands.
+
+`make experiment` runs it; see docs/experiment.md.
+"""

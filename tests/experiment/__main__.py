@@ -24,7 +24,7 @@ from .rules import Near
 
 
 def main() -> int:
-    """Run, and return the exit code."""
+    """Run the experiment and write its report; return 0 if all checks pass, else 1."""
     parser = argparse.ArgumentParser(prog="make experiment EXPERIMENT=…", description=__doc__)
     parser.add_argument("--gitops", choices=("flux", "argocd"), default="flux")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""The vehicles' ways as somebody recorded them: poses in a bag, MCAP or sqlite3."""
+"""Read the vehicles' tracks from the poses in a recorded bag, MCAP or sqlite3."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ def bag_tracks(bag: Path, near: Near) -> tuple[Track, ...]:
     """Return the track of each vehicle in a bag.
 
     Raises:
-        InvalidInput: if it is not a bag that can be read, or has none of the rules' topics.
-        SystemExit: if the experiment cannot play it.
+        InvalidInput: if the bag cannot be read, or has none of the rules' topics.
+        SystemExit: if it has a vehicle that the experiment lacks, or a vehicle that begins near
+            the station.
     """
     reader = RecordedBag(bag, rule_file.read(RULES.read_text(), RULES.name))
     try:

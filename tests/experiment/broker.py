@@ -1,4 +1,4 @@
-"""A real MQTT broker on loopback, and what it carries."""
+"""A real MQTT broker on loopback, with counts of the messages that it carries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _START_S = 10.0
 
 
 class Broker:
-    """mosquitto, and a client of it that counts all messages."""
+    """A mosquitto, and a client that counts the messages and bytes of each topic."""
 
     def __init__(self, folder: Path) -> None:
         self.port = free_port()
@@ -54,7 +54,7 @@ class Broker:
         self.messages[message.topic] += 1
 
     def close(self) -> None:
-        """End both."""
+        """End the client and mosquitto."""
         self._counter.disconnect()
         self._counter.loop_stop()
         self._process.terminate()

@@ -1,4 +1,4 @@
-"""What must hold of a run. Pure."""
+"""The checks that a run must pass. Pure functions."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from .participants import EGO_DATA
 from .routes import VEHICLES
 
 _SLACK_S = 3.0
-"""How long a message may be under way, or a client may take to end."""
+"""How many seconds after the end of a connection's pods its messages may still arrive."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """Something that must hold, and the difference if it does not."""
+    """A check of a run: `name` says what must hold, `fault` what is wrong, or nothing."""
 
     name: str
     fault: str = ""
 
     @property
     def holds(self) -> bool:
-        """Return whether it does."""
+        """Whether the check passes."""
         return not self.fault
 
 
@@ -54,7 +54,7 @@ def checks(outcome: Outcome) -> list[Check]:
 
 
 def differ(expected: object, found: object) -> str:
-    """Return the difference, or an empty text."""
+    """Return a text with both values if they differ, otherwise an empty text."""
     return "" if expected == found else f"expected {expected}, found {found}"
 
 
@@ -75,7 +75,11 @@ def _as_in_the_paper(outcome: Outcome) -> Iterator[Check]:
 
 
 def _inputs(outcome: Outcome) -> Iterator[str]:
-    """Look for each set of inputs, in order; the fusion may pass through others in between."""
+    """Yield what is wrong with the topics that the fusion read, and with the number of its starts.
+
+    The right sets of topics must come in the order of the demands. Between two of them, the fusion
+    may read other sets for a moment.
+    """
     seen = [topics for at, topics in outcome.inputs if at >= outcome.set_off]
     inside: set[str] = set()
     for formed in outcome.formed:
@@ -93,7 +97,7 @@ def _inputs(outcome: Outcome) -> Iterator[str]:
 
 
 def _stays(joins: Iterable[bool]) -> int:
-    """Return how often somebody came when nobody was near."""
+    """Return how often a vehicle joined while no other vehicle was near."""
     count = inside = 0
     for joined in joins:
         count += joined and inside == 0
@@ -117,7 +121,7 @@ def _arrivals(outcome: Outcome) -> Iterator[str]:
 
 
 def check_nodes(outcome: Outcome) -> Iterator[str]:
-    """Yield the pods that ran elsewhere than they should."""
+    """Yield a text for each pod that did not run on its own node."""
     for pod in outcome.pods:
         kind, *rest = pod.service.split("-")
         is_first = kind in ("od", "of", "zenoh") or rest[2] == "source"

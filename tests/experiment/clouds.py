@@ -1,4 +1,4 @@
-"""Point clouds of what a sensor sees, and their message."""
+"""Point clouds of the objects around a sensor, and their conversion to and from messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SPREAD_M = 0.4
 
 
 def points_of(objects: Iterable[tuple[float, float]], chance: random.Random) -> list[Point]:
-    """Return points on the surfaces of objects, which are about as large as a car."""
+    """Return random points around the centre (x, y) of each object, which is as large as a car."""
     return [
         (chance.gauss(x, _SPREAD_M), chance.gauss(y, _SPREAD_M), chance.uniform(0.2, 1.6))
         for x, y in objects
@@ -25,7 +25,7 @@ def points_of(objects: Iterable[tuple[float, float]], chance: random.Random) -> 
 
 
 def to_message(points: list[Point]) -> PointCloud2:
-    """Return a cloud in the map's frame; its stamp is left to set."""
+    """Return the message of a cloud in the frame `map`, without a stamp."""
     message = PointCloud2()
     message.header.frame_id = "map"
     message.height, message.width = 1, len(points)
@@ -40,5 +40,5 @@ def to_message(points: list[Point]) -> PointCloud2:
 
 
 def from_message(message: PointCloud2) -> Iterator[Point]:
-    """Yield a cloud's points."""
+    """Yield the points in the message of a cloud."""
     yield from _POINT.iter_unpack(bytes(message.data))

@@ -1,4 +1,7 @@
-"""The larger experiment's world: many vehicles, three intersections with an edge each. Pure."""
+"""The inventory, rules and checks of the larger experiment. Pure functions.
+
+There are many vehicles, and three intersections with an edge and a station each.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +20,20 @@ from .routes import MIDDLES
 from .rules import RULES, Event, Near, Pose, events_of
 
 FLEET = "vehicles"
-"""The cluster of the vehicles; the others are in that of the skeleton."""
+"""The cluster of the vehicles; all other nodes are in the skeleton's cluster."""
 EDGES = tuple(f"edge{number:02}" for number in range(len(MIDDLES)))
 STATIONS = tuple(f"station{number:02}" for number in range(len(MIDDLES)))
 NODES = (*EDGES, *STATIONS, "cloud")
 
 
 def crossings(near: Near) -> tuple[Near, ...]:
-    """Return the intersections; the first is the paper's."""
+    """Return the condition of being near for each intersection; the first is the paper's."""
     (x, y) = near.point
     return tuple(replace(near, point=(x + dx, y + dy)) for dx, dy in MIDDLES)
 
 
 def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
-    """Return the inventory; `clusters` is `inventory/clusters.yaml` of the skeleton."""
+    """Return the inventory as path → text; `clusters` is the skeleton's `clusters.yaml`."""
     places: dict[str, Any] = yaml.safe_load(clusters)
     places["clusters"].append({"name": FLEET})
     kinds = dict.fromkeys(vehicles, "vehicle") | {node: node.rstrip("0123456789") for node in NODES}
@@ -48,7 +51,10 @@ def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
 
 
 def rules(near: Near) -> str:
-    """Return a rule for each intersection: that of the example for vehicles without a lidar."""
+    """Return the text of a rule file with a rule for each intersection.
+
+    Each is a copy of the example's last rule, which is for vehicles without a lidar.
+    """
     found: dict[str, Any] = yaml.safe_load(RULES.read_text())
     text = yaml.safe_dump(found["rules"][-1])
     found["rules"] = []
@@ -68,7 +74,7 @@ def rules(near: Near) -> str:
 
 
 def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> list[Event]:
-    """Return who joins and leaves until a time, each at the intersection that it passes."""
+    """Return the events before `until`, by time; `passing` has each vehicle's intersection."""
     own: defaultdict[Near, list[Pose]] = defaultdict(list)
     for pose in poses:
         own[passing[pose.vehicle]].append(pose)
@@ -77,7 +83,10 @@ def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> 
 
 
 def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
-    """Return who requests what while these vehicles are near, each at an intersection."""
+    """Return the requesters of each service and connection while these vehicles are near.
+
+    `inside` has the number of each vehicle's intersection.
+    """
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
         here = sorted(vehicle for vehicle, at in inside.items() if at == number)
@@ -94,7 +103,7 @@ def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
 
 
 def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
-    """Return the checks of a run without data."""
+    """Return the checks of a run without containers, so without data."""
     return [
         Check("the detector formed the demands that a plain script over the poses gives",
               differ(_by_vehicle(outcome.events), _by_vehicle(outcome.formed))),
@@ -107,7 +116,10 @@ def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
 
 
 def _by_vehicle(found: Iterable[Event] | Iterable[Formed]) -> dict[str, list[bool]]:
-    """Return who joins and leaves how often; those of different vehicles may overtake."""
+    """Return the joins (true) and leaves (false) of each vehicle, in their order.
+
+    The order among different vehicles does not count.
+    """
     by_vehicle: defaultdict[str, list[bool]] = defaultdict(list)
     for one in found:
         by_vehicle[one.vehicle].append(one.joins)

@@ -1,4 +1,4 @@
-"""One run: a cluster, brokers, vehicles, the generator and the detector, and what was seen."""
+"""One run of the experiment: it starts all parts, lets the vehicles drive, and observes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from .standins.image import image
 ROOT = Path(__file__).resolve().parents[2]
 _PATIENCE_S = 120.0
 _STAND_S = 0.5
-"""How long before something happens the vehicles stand, if they have to."""
+"""How many seconds before the cause of the next event the vehicles stop, if they must wait."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
 
 
@@ -43,7 +43,7 @@ Say = Callable[[str], object]
 
 
 class Experiment:
-    """The parts of a run, started one after the other."""
+    """A run of the experiment; it starts its parts one after the other."""
 
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         self._settings, self._folder, self._say = settings, folder, say
@@ -51,7 +51,7 @@ class Experiment:
         self._stack = ExitStack()
 
     def run(self) -> Outcome:
-        """Play, and return what was seen."""
+        """Run the experiment and return all that was observed."""
         with self._stack:
             self._start_cluster()
             self._start_fleet()
@@ -95,7 +95,7 @@ class Experiment:
             self._stack.callback(observer.close)
 
     def _deploy_initially(self) -> None:
-        """Bring the vehicles' poses to the cloud, and start the detector there."""
+        """Deploy connections for the vehicles' poses to the cloud; start the detector there."""
         record = self._folder / "poses.jsonl"
         plan = Plan(
             self._routes,
@@ -125,7 +125,7 @@ class Experiment:
         self._detect(rules)
 
     def _detect(self, rules: Path) -> None:
-        """Start the detector in the cloud, and wait until it knows what is booked."""
+        """Start the detector in the cloud, and wait until it detects."""
         options = ["detect", str(rules)]
         self._detector = self._start("detector", "demandops.cli.main", *options, domain="cloud")
         self._wait("the detector's start", lambda: "detecting; rules: " in self._log("detector"))
@@ -147,7 +147,7 @@ class Experiment:
                 self._say(f"'{event}' did not have all its consequences; the drive goes on")
         self._wait("the last demands", lambda: self._released(first_commit, len(happens)))
         self._wait_until_as_before(_PATIENCE_S)
-        time.sleep(2.0)  # messages that should not come had time to come
+        time.sleep(2.0)  # time for messages that must not come
         over, left = time.time(), self._world.domain.lines()
         self._end(self._detector)
         self._participants.send_signal(signal.SIGTERM)
@@ -178,7 +178,7 @@ class Experiment:
             before=self._before,
         )
 
-    # --- looking ----------------------------------------------------------------------------
+    # --- observing --------------------------------------------------------------------------
 
     def _events(self) -> list[Event]:
         return events_of(poses_in(self._folder / "poses.jsonl"), self._near, time.time())
@@ -192,11 +192,16 @@ class Experiment:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
 
     def _released(self, since: str, expected: int) -> bool:
-        """Return whether all demands are there, and nobody requests the fusion any longer."""
+        """Return whether all demands are committed, and only the initial deployment is left."""
         return len(self._commits(since)) >= expected and not self._books(self._world.tip())
 
     def _is_settled(self, number: int, since: str) -> bool:
-        """Return whether what the first events demand has been deployed, and works."""
+        """Return whether the first `number` events have had their consequences.
+
+        Their demands are committed, and the fusion reads the right topics. If the last event is a
+        join, the vehicle's data is fused; if it is a leave, the clients of the vehicle's connection
+        have ended.
+        """
         events = self._events()[:number]
         inside: set[str] = set()
         for event in events:
@@ -213,7 +218,7 @@ class Experiment:
         return any(at >= event.at and own & set(seen) for at, seen in list(self._edge.tracks))
 
     def _runs(self, event: Event) -> bool:
-        """Return whether a client of the vehicle's connection runs."""
+        """Return whether a communication client of the vehicle's connection to the edge runs."""
         carrier = self._settings.connections
         running = [pod for pod in list(self._runner.pods.values()) if pod.ended is None]
         return any(fleet.is_client(pod.service, event.vehicle, carrier) for pod in running)
@@ -238,7 +243,10 @@ class Experiment:
             raise AssertionError(f"after {seconds:.0f} s too much: {stays}, missing: {lacks}")
 
     def _books(self, commit: str) -> dict[str, list[str]]:
-        """Return who requests what after a commit, without the initial deployment."""
+        """Return the requesters of each service and connection after a commit.
+
+        The initial deployment is left out.
+        """
         repository = str(self._rig.repository(self._world.name))
         options = ("--state-repo", repository, "--at", commit, "--output", "json")
         books = json.loads(demandops(self._made("reader"), "bookkeeping", *options))
@@ -246,7 +254,7 @@ class Experiment:
         return {row: who for row, who in rows.items() if not row.endswith(" to cloud")}
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demands, from what changed in the bookkeeping from commit to commit."""
+        """Yield a demand for each vehicle that a commit adds as a requester or removes."""
         stages, inside = self._cloud.commits(), set()
         for commit in self._commits(since):
             books = self._books(commit)
@@ -280,7 +288,7 @@ class Experiment:
         return process
 
     def _drive_until(self, moment: float) -> None:
-        """Let the vehicles drive until a moment of their ways."""
+        """Let the vehicles drive until a moment, in seconds of driving."""
         self._participants.stdin.write(f"{moment}\n")
         self._participants.stdin.flush()
 
@@ -326,7 +334,10 @@ _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 
 
 def _stand(happens: list[float], number: int) -> float:
-    """Return when the vehicles stand at the latest, after so many things have happened."""
+    """Return until when the vehicles may drive after `number` causes of events have happened.
+
+    This is shortly before the next cause, or infinity after the last one.
+    """
     if number == len(happens):
         return math.inf
     before, after = happens[number - 1 : number + 1]

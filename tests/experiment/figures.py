@@ -11,7 +11,7 @@ _WIDTH = 900
 
 
 def draw(plots: Mapping[str, str], folder: Path) -> None:
-    """Write each plot as `experiment-<name>.png`."""
+    """Write each plot as an image, `experiment-<name>.png`."""
     with chromium() as browser:
         page = browser.new_page(viewport={"width": _WIDTH, "height": 600}, device_scale_factor=1.5)
         for name, plot in plots.items():

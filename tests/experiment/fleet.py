@@ -1,6 +1,6 @@
-"""The state repo of the experiment: the skeleton's, with what differs on one machine.
+"""The state repo of the experiment: the skeleton's files, changed to run on one machine.
 
-Connections to the edge are of MQTT, as in the paper, or of Zenoh. Those to the cloud are of MQTT.
+Connections to the edge use MQTT, as in the paper, or Zenoh. Connections to the cloud use MQTT.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ STATION_CLOUD_TARGET = f"/stations/{S}/pointcloud"
 def files(
     nodes: str, images: str, domains: dict[str, int], ports: dict[str, int]
 ) -> dict[str, str]:
-    """Return the files that a person changes.
+    """Return the files that differ from the skeleton's, as path → text.
 
     Args:
         nodes, images: `inventory/nodes.yaml` and `registry/images.yaml` of the skeleton.
@@ -63,7 +63,11 @@ def files(
 
 
 def rules(carrier: Carrier) -> str:
-    """Return the rules of the example; with Zenoh, which renames no topic and needs no broker."""
+    """Return the text of the example's rules, with connections of the carrier's type.
+
+    Zenoh renames no topics and needs no broker. So the rules for Zenoh name no broker, and each
+    source topic is the target topic.
+    """
     text = RULES.read_text()
     if carrier == "mqtt":
         return text
@@ -76,16 +80,16 @@ def rules(carrier: Carrier) -> str:
 
 
 def station_cloud(carrier: Carrier) -> str:
-    """Return the topic on which the station publishes."""
+    """Return the topic on which the station publishes its point cloud."""
     return STATION_CLOUD if carrier == "mqtt" else STATION_CLOUD_TARGET
 
 
 CLIENTS: dict[Carrier, int] = {"mqtt": 2, "zenoh": 1}
-"""How many clients only one vehicle's connection to an edge has."""
+"""How many communication clients serve only one vehicle's connection to the edge."""
 
 
 def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
-    """Return whether a service is one of these clients."""
+    """Return whether a service is a client that only the vehicle's connection to the edge has."""
     if carrier == "zenoh":
         return service == f"zenoh-{vehicle}"
     return service.startswith(f"mqtt-{vehicle}-edge")
@@ -113,7 +117,10 @@ def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
 
 
 def requesters(inside: Collection[str]) -> dict[str, list[str]]:
-    """Return who requests what while these vehicles are near; the paper's table in general."""
+    """Return the requesters of each service and connection while these vehicles are near.
+
+    This is the paper's table for any set of vehicles.
+    """
     if not inside:
         return {}
     everybody = sorted({S, *inside})

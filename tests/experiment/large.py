@@ -1,7 +1,8 @@
-"""The larger experiment: many vehicles by their poses alone, three intersections, two clusters.
+"""The larger experiment: many vehicles, three intersections, two clusters.
 
-One process sends the poses in the cloud's ROS domain. The detector, the node, Git, the controllers
-and the clusters are those of the experiment; no container runs, so no data flow.
+The vehicles send only poses. One process sends all of them, in the cloud's ROS domain. The
+detector, the generator's ROS node, Git, the GitOps controllers and the clusters are the same as in
+the paper's experiment. No containers run, so no data flows.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""At how many commits the whole bookkeeping is compared."""
+"""After about how many commits the whole bookkeeping is compared."""
 
 
 class PodWatch(ProcessRunner):
-    """Notes when pods get their nodes and end; it starts nothing."""
+    """Records when pods get their nodes and when they end; it starts no containers."""
 
     def _prepare(self) -> None:
         self.pods |= self._waiting
@@ -46,7 +47,7 @@ class PodWatch(ProcessRunner):
 
 
 class LargeExperiment(Experiment):
-    """The parts of a run, started one after the other."""
+    """A run of the larger experiment; it starts its parts one after the other."""
 
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         super().__init__(settings, folder, say)
@@ -83,7 +84,7 @@ class LargeExperiment(Experiment):
         access, self._watches = {}, []
         for name, rig in self._rigs.items():
             domain = world.bootstrap(name, rig)
-            domain.wait_lines(WITHOUT_DEMANDS)  # also what Kubernetes adds to a namespace, later
+            domain.wait_lines(WITHOUT_DEMANDS)  # waits also for what Kubernetes adds to a namespace
             namespace = domain.namespace
             rights = limited(
                 rig.kube, rig.kubeconfig, self._made(f"access-{name}"), documented_roles("flux")
@@ -166,7 +167,7 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demands, as the commits name them; look at some commits' bookkeeping."""
+        """Yield the demands, as the commits' trailers name them; only some get their `books`."""
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
         for commit in commits:

@@ -1,4 +1,4 @@
-"""What was measured in a run: the times of each event, and what running on demand saves. Pure."""
+"""Measures of a run: the times of each event, and what running on demand saves. Pure functions."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ STAGES = ("demand", "commit", "pods", "fused")
 
 @dataclass(frozen=True)
 class Step:
-    """An event, and when it had which consequence.
+    """An event, and the times of its consequences; None if a consequence did not come.
 
-    For a vehicle that joins: `demand` was accepted, `commit` was published, the last of the `pods`
-    of its connection had its node, and the `first` fused message had its ego data; `gone` is when
-    these pods ended. For one that leaves, `pods` is when the pods ended.
+    If the vehicle joins: `demand` is when its demand was accepted, `commit` is when the commit was
+    published, `pods` is when the last pod of its connection got its node, `first` is when the first
+    fused message had its ego data, and `gone` is when all these pods had ended. If the vehicle
+    leaves, `pods` is when all these pods had ended, and `first` and `gone` are None.
     """
 
     event: Event
@@ -32,13 +33,13 @@ class Step:
     gone: float | None = None
 
     def delays(self) -> dict[str, float]:
-        """Return the seconds from the event to each consequence."""
+        """Return the seconds from the event to each consequence, by its name in `STAGES`."""
         found = zip(STAGES, (self.demand, self.commit, self.pods, self.first), strict=True)
         return {name: at - self.event.at for name, at in found if at is not None}
 
 
 def steps(outcome: Outcome) -> list[Step]:
-    """Return each event with its consequences, as far as the detector formed the same demands."""
+    """Return the events with their consequences, except events for which no demand was formed."""
     formed: defaultdict[str, list[Formed]] = defaultdict(list)
     for one in outcome.formed:
         formed[str(one)].append(one)
@@ -71,7 +72,7 @@ def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
 
 
 def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | None:
-    """Return when the first message of the fusion had a place that only this vehicle sent."""
+    """Return when the fusion first published a position of this vehicle; None if it never did."""
     places = {
         (pose.x, pose.y)
         for pose in outcome.poses
@@ -83,7 +84,7 @@ def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | 
 
 @dataclass(frozen=True)
 class Saving:
-    """A quantity on demand and with the same services always on, as means over the drive."""
+    """A quantity if services run on demand, and if they always run; means over the drive."""
 
     name: str
     unit: str
@@ -92,15 +93,15 @@ class Saving:
 
     @property
     def saved(self) -> float:
-        """Return the part that is saved."""
+        """The share of the always-on quantity that running on demand saves."""
         return 1 - self.on_demand / self.always if self.always else 0.0
 
 
 def savings(outcome: Outcome) -> list[Saving]:
-    """Return what the drive took on demand, beside the same services always on.
+    """Return what the drive took on demand, and what it would take if services were always on.
 
-    Always on means: each service that ran at all, from the first to the last moment, and each of
-    their topics carried whole, as it was published.
+    Always on means: each service that ran at all runs from the first to the last moment, and each
+    topic that was carried to the edge is carried completely, as it was published.
     """
     seconds = outcome.over - outcome.set_off
     services: dict[str, RunningPod] = {pod.service: pod for pod in outcome.pods}
@@ -142,7 +143,7 @@ def _payload(outcome: Outcome) -> dict[str, int]:
 
 
 def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
-    """Yield how many pods ran, at each time when the number changed."""
+    """Yield the time and the number of running pods, at each change of the number."""
     changes = [(pod.bound, 1) for pod in outcome.pods]
     changes += [(pod.ended, -1) for pod in outcome.pods if pod.ended is not None]
     count = 0

@@ -1,4 +1,4 @@
-"""Who looks at the ROS graphs of the edge and the cloud from outside, and keeps what happens."""
+"""ROS nodes that observe the ROS graphs of the edge and the cloud, and record what happens."""
 
 from __future__ import annotations
 
@@ -39,23 +39,23 @@ class Observer:
         self.arrivals: dict[str, list[float]] = defaultdict(list)
 
     def watch(self, kind: Any, topic: str) -> None:
-        """Keep when messages of a topic arrive."""
+        """Record in `arrivals` when messages of a topic arrive."""
         arrived = self.arrivals[topic]
         self.node.create_subscription(kind, topic, lambda _: arrived.append(time.time()), 10)
 
     def start(self) -> None:
-        """Begin."""
+        """Start to spin."""
         self._thread = ExecutorThread(self.node)
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Leave the ROS graph."""
         self._thread.close()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
 
 class EdgeObserver(Observer):
-    """Sees what arrives on the edge, what the fusion reads, and what it gives."""
+    """Records what arrives on the edge, which topics the fusion reads, and what it publishes."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
@@ -73,7 +73,7 @@ class EdgeObserver(Observer):
         self.node.create_timer(_LOOK_S, self._look)
 
     def _weigh(self, kind: Any, topic: str) -> None:
-        """Count the bytes of a topic."""
+        """Count the bytes of a topic's messages in `bytes`."""
 
         def count(data: bytes) -> None:
             self.bytes[topic] += len(data)
@@ -89,10 +89,10 @@ class EdgeObserver(Observer):
         self.tracks.append((time.time(), places))
 
     def _look(self) -> None:
-        """Ask the ROS graph what the fusion subscribes to."""
+        """Record the topics that the fusion subscribes to, if they have changed."""
         found: list[Any] = []
         if FUSION_NODE in self.node.get_node_names():
-            with suppress(Exception):  # it may leave meanwhile
+            with suppress(Exception):  # the fusion may leave meanwhile
                 found = self.node.get_subscriber_names_and_types_by_node(FUSION_NODE, "/")
         topics = frozenset(name for name, _ in found if name not in _NO_INPUTS)
         if topics != self.inputs[-1][1]:
@@ -100,7 +100,7 @@ class EdgeObserver(Observer):
 
 
 class CloudObserver(Observer):
-    """Sees the poses that arrive in the cloud, and the stages of each demand."""
+    """Records the poses that arrive in the cloud, and the stages of each demand."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
@@ -119,7 +119,7 @@ class CloudObserver(Observer):
         self.stages[bytes(message.goal_id.uuid)].setdefault(stage, (time.time(), rest.strip()))
 
     def commits(self) -> dict[str, dict[str, float]]:
-        """Return when each stage of a demand came, by its commit."""
+        """Return commit → stage → time for each demand that was committed."""
         return {
             stages["committed"][1]: {stage: at for stage, (at, _) in stages.items()}
             for stages in list(self.stages.values())

@@ -1,4 +1,4 @@
-"""What an experiment plays, and all that was seen."""
+"""The settings of a run, and all that was observed in it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Settings:
-    """What to play: routes by a seed, or the tracks of a bag."""
+    """What to play: routes made from a seed, or the tracks of a bag."""
 
     gitops: Gitops = "flux"
     connections: Carrier = "mqtt"
@@ -30,7 +30,7 @@ class Settings:
     tracks: tuple[Way, ...] = ()
 
     def routes(self) -> tuple[Way, ...]:
-        """Return who drives where."""
+        """Return the way of each vehicle."""
         if self.tracks:
             return self.tracks
         if self.large:
@@ -41,13 +41,13 @@ class Settings:
 
 @dataclass(frozen=True)
 class Formed:
-    """A demand that the detector formed: its commit, its stages, and what was booked after it."""
+    """A demand of the detector: its commit, its stages' times, and the bookkeeping after it."""
 
     commit: str
     vehicle: str
     joins: bool
     stages: dict[str, float]
-    books: dict[str, list[str]] | None  # None: nobody looked
+    books: dict[str, list[str]] | None  # None: the bookkeeping was not read
 
     def __str__(self) -> str:
         return f"{self.vehicle} {'joins' if self.joins else 'leaves'}"
@@ -55,7 +55,7 @@ class Formed:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was seen. Times are seconds since 1970."""
+    """All that was observed in a run. Times are seconds since 1970."""
 
     settings: Settings
     routes: tuple[Way, ...]
@@ -78,4 +78,4 @@ class Outcome:
     left: frozenset[str]
     before: frozenset[str]
     crossings: tuple[Near, ...] = ()
-    """All intersections, if there are more."""
+    """All intersections of the larger experiment; empty in the paper's."""

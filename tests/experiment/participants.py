@@ -1,12 +1,12 @@
-"""The vehicles and the station as one ROS program; each talks in the ROS domain of its node.
+"""The vehicles and the station as one ROS program; each is in the ROS domain of its node.
 
     python -m tests.experiment.participants PLAN
 
 PLAN is a JSON file with the fields of `Plan`. The program publishes from its start, with all
-vehicles at rest. A line on standard input says until which moment of their ways they drive; there
-they stand, and go on publishing, until the next line. The first one sends them off. The program's
-last words are the messages and bytes that each topic had since then, and for how long the vehicles
-stood, as JSON.
+vehicles at rest. Each line on standard input is a moment, in seconds of driving. The vehicles drive
+until that moment, then stand until the next line; they publish all the time. The first line makes
+them set off. At its end, the program prints a line of JSON: the messages and bytes that each topic
+had since the vehicles set off, and for how many seconds they stood.
 """
 
 from __future__ import annotations
@@ -42,17 +42,19 @@ POSE_HZ = 10
 POSES_PER_CLOUD = 2
 TICKS_PER_POSE_OF_MANY = 2
 RANGE_M = 120.0
-"""How far a lidar sees."""
+"""How far a lidar sees, in metres."""
 WITH_LIDAR = (VEHICLES[0],)
-"""The vehicles that share a point cloud, as in the paper."""
+"""The vehicles that publish a point cloud, as in the paper."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What to play: the ways, the ROS domain of each node, and the file of what was sent.
+    """What to play.
 
-    `origin` is where the intersection is on the map, `station_cloud` the topic of the station. With
-    `poses_only` one ROS node sends all poses, and nothing else, in the cloud's domain.
+    `routes` has each vehicle's way, `origin` the position of the intersection on the map, and
+    `domains` the ROS domain of each node. The program writes all poses that it sends to the file
+    `record`. `station_cloud` is the topic of the station's point cloud. With `poses_only`, one ROS
+    node in the cloud's domain sends all poses, and nothing else is sent.
     """
 
     routes: tuple[Route | Track, ...]
@@ -64,13 +66,13 @@ class Plan:
     poses_only: bool = False
 
     def write(self, file: Path) -> None:
-        """Write it for the program."""
+        """Write the plan to a file for the program."""
         routes = [vars(route) for route in self.routes]
         file.write_text(json.dumps(vars(self) | {"routes": routes}))
 
     @classmethod
     def read(cls, file: Path) -> Plan:
-        """Read what :meth:`write` wrote."""
+        """Return the plan that :meth:`write` wrote to a file."""
         data = json.loads(file.read_text())
         routes = tuple(
             Track(**route) if "points" in route else Route(**route) for route in data.pop("routes")
@@ -92,7 +94,7 @@ class Participant:
         self.messages: Counter[str] = Counter()
 
     def send(self, topic: str, message: Any, now: float) -> None:
-        """Publish a message with this stamp, and count it."""
+        """Publish a message with the stamp `now`, and count it."""
         message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(type(message), topic, 10)
@@ -108,7 +110,7 @@ class Participant:
 
 
 class Participants:
-    """All of them, and the time since the vehicles set off."""
+    """All participants, and the time since the vehicles set off."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan, self._chance = plan, random.Random(plan.seed)
@@ -124,7 +126,7 @@ class Participants:
         self._ticks = 0
 
     def tick(self) -> None:
-        """Publish what everybody has to say now."""
+        """Publish what each participant sends at this moment."""
         now, elapsed = time.time(), self._pass_time()
         self._ticks += 1
         if self._plan.poses_only and self._ticks % TICKS_PER_POSE_OF_MANY:
@@ -141,7 +143,7 @@ class Participants:
             self._send_clouds(where, elapsed, now)
 
     def _pass_time(self) -> float:
-        """Return the moment of the ways that it is now."""
+        """Return for how many seconds the vehicles have driven by now; -1 before they set off."""
         passed, self._last = time.monotonic() - self._last, time.monotonic()
         if self.set_off is not None:
             driven = min(passed, max(0.0, self.until - self._elapsed))
@@ -175,14 +177,14 @@ class Participants:
         return clouds.to_message(clouds.points_of(near, self._chance))
 
     def go(self) -> None:
-        """Let the vehicles set off, and count from now on."""
+        """Let the vehicles set off, and start to count messages anew."""
         self.set_off, self._elapsed, self._last = time.time(), 0.0, time.monotonic()
         for participant in set(self._by_name.values()):
             participant.sent.clear()
             participant.messages.clear()
 
     def close(self) -> dict[str, Any]:
-        """Stop, and return how many messages and bytes each topic had since they set off."""
+        """Leave the ROS graphs; return each topic's messages and bytes since :meth:`go`."""
         everybody = set(self._by_name.values())
         for participant in everybody:
             participant.close()
@@ -195,7 +197,7 @@ class Participants:
 
 
 def main(plan: Path) -> None:
-    """Play until SIGTERM."""
+    """Publish until SIGTERM or the end of standard input, then print the counts."""
     over: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: over.append(number))
     participants = Participants(Plan.read(plan))

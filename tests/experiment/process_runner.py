@@ -1,10 +1,11 @@
 """Runs the containers of a namespace's pods as processes of this machine, as a kubelet would.
 
-It watches the API server: a pod that got a node starts, one that is deleted ends. Each container
-runs its own command, arguments and environment; a container that ends is started again, later and
-later. ConfigMaps are files, and change when they change. A path below a mount becomes the path of
-the volume's folder, because the processes share this machine's file system. A pod's account is a
-kubeconfig, in KUBECONFIG, for the containers that mount its token.
+It watches the API server: it starts a pod that got a node, and ends a pod that is deleted. Each
+container runs its own command with its own arguments and environment. A container that ends is
+started again after a pause, which becomes longer each time. ConfigMaps become files, which change
+with the ConfigMap. The processes share this machine's file system, so a path below a mount becomes
+a path below the volume's folder. A container that mounts the token of the pod's account gets a
+kubeconfig for this account, in KUBECONFIG.
 """
 
 from __future__ import annotations
@@ -34,30 +35,30 @@ from .running_pod import Container, RunningPod, path_in_pod, program_of
 
 _TICK_S = 0.1
 _NOT_YET = (LookupError, ApiException, HTTPError, OSError)
-"""What is missing, or an API server that is away."""
+"""Errors if an object does not exist yet, or if the API server cannot be reached."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105 - a folder
 
 
 class ProcessRunner:
-    """The kubelet of all nodes, for one namespace."""
+    """Acts as the kubelets of all nodes, for the pods of one namespace."""
 
     def __init__(
         self, kube: Kube, namespace: str, image: Path, folder: Path, environment: dict[str, str]
     ) -> None:
-        """Start to watch.
+        """Start to watch pods and ConfigMaps, and to run the pods.
 
         Args:
             kube: the cluster.
-            namespace: whose pods run.
-            image: the working directory of all containers, first on their PATH.
-            folder: where volumes and logs go.
-            environment: what every container finds in its image.
+            namespace: the namespace of the pods.
+            image: the working directory of all containers; it is first on their PATH.
+            folder: the folder for volumes and logs.
+            environment: the environment variables that every container gets from its image.
         """
         self._kube, self._namespace, self._image, self._folder = kube, namespace, image, folder
         path = os.pathsep.join([str(image), os.environ.get("PATH", os.defpath)])
         self._environment = environment | {"PATH": path}
-        self.pods: dict[str, RunningPod] = {}  # by uid; those that ended stay
+        self.pods: dict[str, RunningPod] = {}  # by uid; includes pods that have ended
         self._waiting: dict[str, RunningPod] = {}
         self._ending: list[tuple[subprocess.Popen[bytes], float]] = []
         self._events: queue.Queue[tuple[str, Manifest]] = queue.Queue()
@@ -73,7 +74,7 @@ class ProcessRunner:
             thread.start()
 
     def close(self) -> None:
-        """End all processes."""
+        """End the processes of all containers."""
         self._closed.set()
         self._runner.join(30)
 
@@ -85,7 +86,7 @@ class ProcessRunner:
     # --- watching ---------------------------------------------------------------------------
 
     def _watch(self, kind: str, method: str) -> None:
-        """Pass on what happens to the objects of a kind, for ever."""
+        """Queue each change of the objects of a kind, until the runner is closed."""
         read: Any = getattr(CoreV1Api(self._kube.api), method)
         while not self._closed.is_set():
             with suppress(Exception):  # the server may be away; the next round reads all again
@@ -123,7 +124,7 @@ class ProcessRunner:
             self._waiting.setdefault(uid, RunningPod(item, folder, time.time()))
 
     def _prepare(self) -> None:
-        """Let the pods start whose volumes can be filled; the others are tried again."""
+        """Prepare the waiting pods whose volumes can be filled; leave the others for later."""
         for uid, pod in list(self._waiting.items()):
             with suppress(*_NOT_YET):
                 pod.containers = list(self._containers(pod))
@@ -151,12 +152,15 @@ class ProcessRunner:
             )
 
     def _entry_point(self, image: str) -> list[str]:
-        """Return an image's own program, if one stands in for it; else its arguments are one."""
+        """Return the stand-in for an image's own program, or nothing if there is none.
+
+        Without one, the container's arguments are its whole command.
+        """
         program = program_of(image)
         return [program] if (self._image / program).exists() else []
 
     def _fill(self, pod: RunningPod, volume: dict[str, Any]) -> Path:
-        """Write a volume's files, each at once."""
+        """Write the files of a volume, each atomically; return the volume's folder."""
         folder = pod.folder / volume["name"]
         folder.mkdir(parents=True, exist_ok=True)
         account = pod.manifest["spec"].get("serviceAccountName", "default")
@@ -170,11 +174,11 @@ class ProcessRunner:
         for pod in self.pods.values():
             for volume in pod.manifest["spec"]["volumes"] if pod.ended is None else ():
                 if volume.get("configMap", {}).get("name") == config_map:
-                    with suppress(*_NOT_YET):  # it may be gone by now
+                    with suppress(*_NOT_YET):  # the ConfigMap may be gone
                         self._fill(pod, volume)
 
     def _kubeconfig(self, account: Path) -> Path:
-        """Write the pod's account as a kubeconfig; the token stays in its file."""
+        """Write a kubeconfig with the token of the pod's account; return its path."""
         server = self._kube.api.configuration.host
         cluster = {"server": server, "certificate-authority": str(account / "ca.crt")}
         names = {"cluster": "c", "user": "u", "namespace": self._namespace}
@@ -234,7 +238,7 @@ class ProcessRunner:
         for process, deadline in list(self._ending):
             if process.poll() is None and time.monotonic() < deadline:
                 continue
-            _signal(process, signal.SIGKILL)  # also what is left of its group
+            _signal(process, signal.SIGKILL)  # also ends the rest of its process group
             process.wait(10)
             self._ending.remove((process, deadline))
 

@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page with its plots inside. Pure."""
+"""The report of a run: one HTML page that contains its plots. Pure functions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .routes import FAR_M
 _COLORS = ("#0b6e99", "#c2571a", "#4b8b3b", "#8a4fa3")
 _WIDTH, _LEFT = 900, 150
 _MOST_ROWS = 8
-"""More vehicles are drawn as a crowd."""
+"""The most vehicles that are drawn one by one; more are drawn as a crowd."""
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; }
 table { border-collapse: collapse; margin: 1em 0; } th, td { padding: .2em .9em .2em 0;
@@ -36,12 +36,12 @@ _DELAYS = (
 
 
 def plots(outcome: Outcome) -> dict[str, str]:
-    """Return the plots as images, by their names."""
+    """Return the plots as SVG texts, by their names."""
     return {"map": _map(outcome), "timeline": _timeline(outcome), "delays": _delays(outcome)}
 
 
 def page(outcome: Outcome, checks: Iterable[Check]) -> str:
-    """Return the page."""
+    """Return the report as an HTML text."""
     settings, images = outcome.settings, plots(outcome)
     poses = f"the poses of {settings.bag}" if settings.bag else f"seed {settings.seed}"
     title = f"The experiment with {settings.gitops} and {settings.connections}, {poses}"
@@ -115,7 +115,7 @@ def _line(x1: float, y1: float, x2: float, y2: float, color: str = "#ccc") -> st
 
 
 def _map(outcome: Outcome) -> str:
-    """Draw what the vehicles sent, and the rules' distances around each station."""
+    """Return an SVG of the poses that the vehicles sent and the rules' distances."""
     middles = [near.point for near in outcome.crossings or (outcome.near,)]
     west, north = min(x for x, _ in middles) - 1.1 * FAR_M, max(y for _, y in middles) + 1.1 * FAR_M
     wide = max(x for x, _ in middles) + 1.1 * FAR_M - west
@@ -193,7 +193,7 @@ def _timeline(outcome: Outcome) -> str:
 
 
 def _bars(outcome: Outcome, rows: Sequence[str], x: Callable[[float], float]) -> Iterator[str]:
-    """Yield when each vehicle was near, and when its data arrived."""
+    """Yield SVG elements that show when each vehicle was near and when its data arrived."""
     for row, vehicle in enumerate(rows):
         y, color = 12 + 24 * row, _COLORS[row % len(_COLORS)]
         yield _text(_LEFT - 8, y + 10, vehicle, "end")
@@ -207,7 +207,7 @@ def _bars(outcome: Outcome, rows: Sequence[str], x: Callable[[float], float]) ->
 
 
 def _crowd(outcome: Outcome, x: Callable[[float], float]) -> Iterator[str]:
-    """Yield how many vehicles were near."""
+    """Yield SVG elements that show how many vehicles were near over time."""
     count, counts = 0, [(outcome.set_off, 0)]
     for event in outcome.events:
         count += 1 if event.joins else -1

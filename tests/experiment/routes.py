@@ -1,7 +1,7 @@
-"""The vehicles' routes through the intersection, by a seed or as recorded: where each is at a time.
+"""The vehicles' routes through the intersection: made from a seed, or recorded.
 
-Pure. The intersection, with the station, is the origin of the map; distances are metres and times
-seconds since the vehicles set off.
+Pure functions. The intersection, where the station is, is the origin of the map. Distances are in
+metres, times in seconds since the vehicles set off.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from typing import Protocol
 RADIUS_M = 84.0
 """The paper's distance at which a vehicle is near the intersection."""
 FAR_M = 105.0
-"""Where a vehicle waits until its route begins, and where it ends."""
+"""The distance from the intersection at which a route begins and ends."""
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
 STATION = "station00"
 
 LEAD_S = 2.0
-"""When a recording begins after the vehicles have set off."""
+"""How many seconds after the start of the drive a recording begins."""
 MIDDLES = ((0.0, 0.0), (1000.0, 0.0), (0.0, 1000.0))
 SPACING_S = 1.2
 _SILENCE_S = 0.6
-"""Where a recording has no pose for longer, its vehicle is silent."""
+"""A vehicle is silent when its recording has no pose within this time."""
 
 _PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
-"""The paper's order: 0 is the vehicle that joins, -0 the same vehicle when it leaves."""
+"""The paper's order of events: `0` means that vehicle 0 joins, `-0` that it leaves."""
 _SHORTEST_STAY = 3  # slots
 _JITTER = 0.2  # of a slot
 _ARMS = tuple(math.radians(degrees) for degrees in (0, 90, 180, 270))
@@ -40,15 +40,15 @@ class Way(Protocol):
 
     @property
     def vehicle(self) -> str:
-        """Who drives."""
+        """The vehicle's id."""
 
     @property
     def ends(self) -> float:
-        """From when on nothing of interest happens."""
+        """The time after which nothing of interest happens."""
 
     @property
     def label(self) -> str:
-        """What the report says of it."""
+        """The report's text about this way."""
 
     def position(self, time: float) -> tuple[float, float]:
         """Return where the vehicle is."""
@@ -59,10 +59,11 @@ class Way(Protocol):
 
 @dataclass(frozen=True)
 class Route:
-    """A vehicle's way along one arm of the intersection to its middle, and out along another.
+    """A vehicle's way along one arm of the intersection to its middle, and out along another arm.
 
-    It is within ``RADIUS_M`` from ``enters`` to ``leaves``, and sends nothing from ``vanishes`` on.
-    ``middle`` is where the intersection is.
+    The vehicle is within ``RADIUS_M`` of the middle from the time ``enters`` to the time
+    ``leaves``. It sends nothing from the time ``vanishes`` on. ``arm_in`` and ``arm_out`` are
+    angles in radians. ``middle`` is the position of the intersection.
     """
 
     vehicle: str
@@ -75,17 +76,17 @@ class Route:
 
     @property
     def speed(self) -> float:
-        """Metres per second."""
+        """The vehicle's speed in metres per second."""
         return 2 * RADIUS_M / (self.leaves - self.enters)
 
     @property
     def ends(self) -> float:
-        """When it has left."""
+        """When the vehicle leaves or vanishes."""
         return min(self.leaves, self.vanishes)
 
     @property
     def label(self) -> str:
-        """How fast it is, and whether it vanishes."""
+        """The vehicle's speed, and whether it falls silent."""
         silent = ", falls silent" if math.isfinite(self.vanishes) else ""
         return f"{self.speed * 3.6:.0f} km/h{silent}"
 
@@ -108,9 +109,9 @@ class Route:
 
 @dataclass(frozen=True)
 class Track:
-    """A recorded way: times, and the place at each; between them the vehicle goes straight.
+    """A recorded way: points of time, x and y, with straight lines between them.
 
-    It waits at the first place, and is silent where the recording is.
+    The vehicle waits at the first point until its time. It is silent in the gaps of the recording.
     """
 
     vehicle: str
@@ -143,7 +144,10 @@ class Track:
 def tracks(
     poses: Iterable[tuple[float, str, float, float]], origin: tuple[float, float]
 ) -> tuple[Track, ...]:
-    """Return the tracks of recorded poses: time, vehicle and place on the map each."""
+    """Return the track of each vehicle from recorded poses: time, vehicle, x and y.
+
+    ``origin`` is the position of the intersection in the recording.
+    """
     found: dict[str, list[tuple[float, float, float]]] = {}
     first: float | None = None
     for at, vehicle, x, y in poses:
@@ -155,7 +159,8 @@ def tracks(
 def four(seed: int, gap: float) -> tuple[Route, ...]:
     """Return the routes of four vehicles, with about ``gap`` seconds from one event to the next.
 
-    Seed 0 has the paper's order of events; each other seed has an order, arms and times of its own.
+    Seed 0 has the paper's order of events. Every other seed has an order of its own. Arms and exact
+    times depend on the seed.
     """
     chance = random.Random(seed)
     order = _PAPER if seed == 0 else _shuffled(chance)
@@ -192,10 +197,10 @@ def many(seed: int, count: int) -> tuple[Route, ...]:
 
 
 def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
-    """Return the routes, with a vehicle that falls silent while it is near.
+    """Return the routes, changed so that ``vehicle`` falls silent while it is near.
 
-    It does so in the middle of the longest time in which nothing else happens: while the vehicles
-    stand because of another event, it would not.
+    It falls silent in the middle of the longest time without other events. Close to another event,
+    all vehicles may stand, and a vehicle that stands does not fall silent.
     """
     (lost,) = (route for route in routes if route.vehicle == vehicle)
     moments = sorted(
@@ -210,7 +215,7 @@ def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
 
 
 def _shuffled(chance: random.Random) -> list[str]:
-    """Return an order in which every vehicle stays for a while."""
+    """Return a random order of events; no stay is shorter than ``_SHORTEST_STAY`` slots."""
     numbers = range(len(VEHICLES))
     events = [*(str(number) for number in numbers), *(f"-{number}" for number in numbers)]
     while True:

@@ -1,6 +1,6 @@
-"""The rules of `examples/experiment/`, and a plain script that says what they demand of some poses.
+"""What the rules of `examples/experiment/` demand for given poses, by a plain script.
 
-It shares nothing with the event detector, so the two can be compared.
+The script shares no code with the event detector, so that the two can be compared.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ RULES = Path(__file__).resolve().parents[2] / "examples" / "experiment" / "rules
 
 @dataclass(frozen=True)
 class Near:
-    """A vehicle is near from `start` metres on, until it is `stop` away or silent for `timeout`."""
+    """When a vehicle is near `point`.
+
+    It becomes near at a distance of `start` metres. It stays near until it is more than `stop`
+    metres away, or silent for `timeout` seconds.
+    """
 
     point: tuple[float, float]
     start: float
@@ -30,7 +34,7 @@ class Near:
 
     @classmethod
     def read(cls) -> Near:
-        """Read what all rules of the experiment have in common."""
+        """Return the condition that all rules of the experiment have in common."""
         data: dict[str, Any] = yaml.safe_load(RULES.read_text())
         (source,) = data["sources"].values()
         (near,) = {json.dumps(rule["near"], sort_keys=True) for rule in data["rules"]}
@@ -41,7 +45,7 @@ class Near:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a vehicle said that it was, and when."""
+    """Where a vehicle reported to be, and when."""
 
     at: float
     vehicle: str
@@ -62,12 +66,12 @@ class Event:
 
 
 def poses_in(record: Path) -> list[Pose]:
-    """Return what the participants sent."""
+    """Return the poses that the participants wrote to their record."""
     return [Pose(**json.loads(line)) for line in record.read_text().splitlines()]
 
 
 def predicted(ways: Iterable[Way], near: Near, until: float) -> list[Pose]:
-    """Return the poses of a drive that nothing holds up, ten for each second."""
+    """Return the poses of a drive without stops, ten per second for each vehicle."""
     x0, y0 = near.point
     ways = tuple(ways)
     places = (
@@ -80,7 +84,11 @@ def predicted(ways: Iterable[Way], near: Near, until: float) -> list[Pose]:
 
 
 def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
-    """Return when something happens that leads to an event: a pose, or a vehicle's last one."""
+    """Return the times of the poses that cause events, in order.
+
+    An event is caused by the pose at its time. If a vehicle leaves because it is silent, the cause
+    is its last pose.
+    """
     poses = list(poses)
     sent = {(pose.at, pose.vehicle) for pose in poses}
     events = events_of(poses, near, until)
@@ -91,7 +99,7 @@ def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
 
 
 def events_of(poses: Iterable[Pose], near: Near, until: float) -> list[Event]:
-    """Return who joins and leaves until a time, in the order of time."""
+    """Return the events before `until`, in the order of time."""
     return sorted(_events(list(poses), near, until), key=lambda event: event.at)
 
 

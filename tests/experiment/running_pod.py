@@ -12,7 +12,7 @@ from typing import Any
 
 @dataclass
 class Container:
-    """A container, the starts of its process, and when it may start again."""
+    """A container: its process, the times of its starts, and when it may start again."""
 
     name: str
     command: list[str]
@@ -24,7 +24,7 @@ class Container:
 
 @dataclass
 class RunningPod:
-    """A pod on a node, and what became of it."""
+    """A pod that got a node at `bound`, with its containers; `ended` is when it ended."""
 
     manifest: dict[str, Any]
     folder: Path
@@ -39,33 +39,33 @@ class RunningPod:
 
     @property
     def service(self) -> str:
-        """The name of its release or connection client."""
+        """The name of the pod's release or connection client."""
         return str(self.manifest["metadata"]["labels"]["app.kubernetes.io/instance"])
 
     @property
     def node(self) -> str:
-        """The name of its cluster node."""
+        """The name of the cluster node on which the pod runs."""
         return str(self.manifest["spec"]["nodeName"])
 
     def requests(self) -> tuple[float, float]:
-        """Return the processor cores and the bytes of memory that it requests."""
+        """Return the processor cores and the bytes of memory that the pod requests."""
         found = [c["resources"].get("requests", {}) for c in self.manifest["spec"]["containers"]]
         cores = sum(quantity(each.get("cpu", "0")) for each in found)
         return cores, sum(quantity(each.get("memory", "0")) for each in found)
 
 
 def program_of(image: str) -> str:
-    """Return what stands for an image's own program: its name without registry and tag."""
+    """Return the name of an image's stand-in program: the image's name without registry and tag."""
     return image.rpartition("/")[2].partition("@")[0].partition(":")[0]
 
 
 def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
-    """Return the text with paths below mounts made paths of this machine."""
+    """Return the text in which each path below a mount is replaced by a path of this machine."""
     if not mounts:
         return text
     longest_first = sorted(mounts, key=len, reverse=True)
     below = "|".join(map(re.escape, longest_first))
-    # in one pass: a path of this machine may lie below a mount's name, such as /tmp
+    # in one pass: a replacement may itself begin with the path of a mount, such as /tmp
     return re.sub(rf"(?<![\w./-])({below})(?=/|$)", lambda hit: str(mounts[hit[1]]), text)
 
 
@@ -73,7 +73,7 @@ _UNITS = {"m": 1e-3, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 
 
 def quantity(text: str) -> float:
-    """Return a quantity of Kubernetes as a number."""
+    """Return a quantity of Kubernetes, such as `250m` or `1Gi`, as a number."""
     for unit, factor in _UNITS.items():
         if text.endswith(unit):
             return float(text.removesuffix(unit)) * factor

@@ -1,4 +1,4 @@
-"""Each check fails without its subject: a run that passes, and what breaks it."""
+"""A run without faults passes all checks, and each fault makes its check fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The larger experiment's world, and what its checks find. No ROS, no cluster."""
+"""The larger experiment's rules, checks and report, without ROS and without a cluster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The vehicles as the experiment starts them: a ROS program that stands where it is told to."""
+"""The participants' program: its vehicles stop where they shall stop, and drive on from there."""
 
 from __future__ import annotations
 

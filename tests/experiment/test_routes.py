@@ -1,4 +1,4 @@
-"""The routes, and what a plain script says of them. No ROS, no cluster."""
+"""The routes and the events that follow from them, without ROS and without a cluster."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_vehicles_drive_in_from_one_road_and_out_on_another() -> None:
 
 @pytest.mark.parametrize("vehicle", routes.VEHICLES)
 def test_a_vehicle_vanishes_while_nothing_else_happens(vehicle: str) -> None:
-    """Seed 5 let vehicle02 vanish 7 ms before another one came; the vehicles stood for both."""
+    """With seed 5, vehicle02 once vanished only 7 ms before another vehicle came near."""
     for seed in range(30):
         silent = routes.vanishing(routes.four(seed, GAP_S), vehicle)
         (moment,) = (route.vanishes for route in silent if route.vehicle == vehicle)
@@ -84,7 +84,7 @@ def test_a_vehicle_that_falls_silent_leaves_after_the_time_out() -> None:
 
 
 def test_a_vehicle_that_falls_silent_stands_before_it_does() -> None:
-    """Its last pose leads to its leaving, 5 seconds later."""
+    """The cause of its leave is its last pose, which is earlier by the rules' timeout."""
     silent = routes.vanishing(routes.one(0, GAP_S), "vehicle00")
     enters, vanishes = causes(drive(silent, 60), NEAR, 60)
     assert enters == pytest.approx(GAP_S, abs=0.11)

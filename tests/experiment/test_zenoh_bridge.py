@@ -22,7 +22,7 @@ from tests.kit.ros import reserved
 
 @pytest.fixture
 def nodes() -> Iterator[dict[str, Any]]:
-    """Two nodes, each in a ROS domain of its own."""
+    """Yield the ROS nodes `vehicle` and `edge`, each in a ROS domain of its own."""
     with reserved() as vehicle, reserved() as edge:
         made = {}
         for name, domain in (("vehicle", vehicle), ("edge", edge)):

@@ -28,7 +28,7 @@ from tests.faults.rig import Rig
 
 WORKERS = 2
 MEMORY = Path("/dev/shm")
-"""A disk on which a sync takes no time; what a sync means is the traces' part."""
+"""A file system in memory, where a sync takes no time; strace shows what is synced."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
 _RIGS: dict[tuple[bool, bool], Rig] = {}
 _FOLDER, _SHORT = Path(), True
@@ -36,7 +36,7 @@ _FOLDER, _SHORT = Path(), True
 
 @dataclass(frozen=True)
 class _Task:
-    """One part of the work; ``what`` are the arguments of its function."""
+    """One part of the work; ``what`` has the arguments of the function that does it."""
 
     part: str
     remote: bool
@@ -44,12 +44,12 @@ class _Task:
 
 
 def main() -> int:
-    """Run the parts and return the exit code."""
+    """Run the tasks and write the report; return 1 if a promise was broken, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", action="store_true", help="every call, and every fault at it")
     parser.add_argument("--only", default="", help="only tasks whose text contains this")
     chosen = parser.parse_args()
-    for module in walk_packages(demandops.__path__, "demandops."):  # none is imported under strace
+    for module in walk_packages(demandops.__path__, "demandops."):  # no import under strace
         import_module(module.name)
     began = time.monotonic()
     results: list[Result] = []

@@ -24,14 +24,17 @@ _ROOM = ("no room", os.strerror(28))
 
 
 def may_mount() -> bool:
-    """Have this process and those that it starts mount for themselves; return whether they may."""
+    """Give this process and its children mounts of their own; return whether that worked."""
     if ctypes.CDLL(None).unshare(_OWN_MOUNTS) != 0:
         return False
     return subprocess.run(["mount", "--make-rprivate", "/"], check=False).returncode == 0
 
 
 def full(rig: Rig, folder: Path, blocks: int) -> Result:
-    """Book a demand with so many blocks left for a folder, then again when there is room."""
+    """Book a demand when a folder's disk has ``blocks`` free blocks, then restart with more room.
+
+    Return what was wrong with both runs.
+    """
     rig.restore()
     with _small_disk(folder):
         filler = folder / "filler"
@@ -47,7 +50,7 @@ def full(rig: Rig, folder: Path, blocks: int) -> Result:
 
 @contextmanager
 def _small_disk(folder: Path) -> Iterator[None]:
-    """Have a folder on a small file system of its own."""
+    """Put a folder on a small file system of its own for the length of a block."""
     aside = folder.rename(folder.with_name("aside"))
     folder.mkdir()
     options = f"size={_SIZE},mode=0700"
@@ -61,7 +64,7 @@ def _small_disk(folder: Path) -> Iterator[None]:
 
 
 def interrupted(rig: Rig) -> None:
-    """Have a demand in the journal that is not published, and save this."""
+    """Kill a process when its demand is journaled and not yet published; save these files."""
     rig.restore()
     kill = ("-e", "trace=mkdir", "-e", "inject=mkdir:signal=KILL:when=1")
     ran = rig.book(DEMAND, Strace(kill, "demandops-writer"))
@@ -70,7 +73,7 @@ def interrupted(rig: Rig) -> None:
 
 
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
-    """Flip and cut bytes of each class of file, and start again."""
+    """Change a byte or cut a file of each class; yield what the next start makes of it."""
     rig.restore()
     classes: dict[str, tuple[Path, int]] = {}
     for path in sorted(rig.folder.rglob("*")):

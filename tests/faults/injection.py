@@ -1,4 +1,4 @@
-"""Errors and kills at the system calls of one demand, as strace found them."""
+"""Errors and kills at the system calls of one demand, which strace finds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.faults.trace import Call, file_class, parse
 EVERYTHING = "trace=%file,%desc,%process"
 CANNOT_FAIL = {
     "chdir",
-    "close",  # strace would not close it
+    "close",  # with an injected error, the file would stay open
     "execve",
     "fcntl",
     "fstat",
@@ -26,7 +26,7 @@ CANNOT_FAIL = {
     "mmap",
     "munmap",
 }
-"""Kinds of calls in which a fault of a disk does not show."""
+"""Calls at which no fault is injected, because a fault of a disk does not show there."""
 CHANGES = {
     "creat", "fallocate", "fchmod", "fdatasync", "fsync", "ftruncate", "link", "linkat", "mkdir",
     "mkdirat", "chmod", "pwrite64", "rename", "renameat", "renameat2", "rmdir", "symlink", "sync",
@@ -45,27 +45,31 @@ _NEED_ROOM = {
 _INTERRUPTIBLE = {"flock", "fsync", "open", "openat", "pread64", "pwrite64", "read", "write"}
 KILL = "SIGKILL"
 _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
-"""What the short form tries, without and with a remote."""
+"""The faults that the short form tries, without (false) and with (true) a remote."""
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often to count the calls again if one is missed: either thread may write the journal."""
-_KNOWN: dict[Path, list[Site]] = {}
-"""The calls of a demand, by the folder in which this process books it."""
-_OF_SERVER = ("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch")
-"""What is said if a process of git, here or at the server, does not say why it failed.
+"""How often a call that was missed is counted and tried again.
 
-A server that cannot read its references offers none.
+The counts vary, because either thread may write the journal.
+"""
+_KNOWN: dict[Path, list[Site]] = {}
+"""The calls that a demand makes in this process, by the rig's folder."""
+_OF_SERVER = ("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch")
+"""Messages of a git process, here or at the server, that do not give the reason of its failure.
+
+A server that cannot read its references offers none, so the remote "has no branch".
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
-"""What is said if libgit2 does not say why it could not read a file."""
+"""Messages about files that libgit2 could not read, without a reason."""
 
 
 @dataclass(frozen=True)
 class Site:
     """The n-th call of a kind in a thread or process, and the class of file that it touches.
 
-    ``which``: the how many-th process of its git command makes it; 0 for a thread.
+    ``role`` is the thread or the program. ``which`` is the number of the process among those of its
+    git command, from 1 on; it is 0 for a thread.
     """
 
     role: str
@@ -75,11 +79,11 @@ class Site:
     creates: bool = False
     which: int = 0
     place: int = 0
-    """How many calls of its class came before it."""
+    """How many calls of the same class came before this one."""
 
     @property
     def of_class(self) -> tuple[str, str, str, bool]:
-        """What it has in common with the other calls of its class."""
+        """What the call has in common with the other calls of its class."""
         return self.role, self.kind, self.file, self.creates
 
     @property
@@ -93,7 +97,10 @@ class Site:
         return self.kind in CHANGES or self.creates
 
     def faults(self) -> list[str]:
-        """Return what can happen at this call; a kill comes before it, so after the one before."""
+        """Return the faults that can be injected at this call.
+
+        A kill comes before the call, so it shows the state after the call before it.
+        """
         errors = ["EIO"]
         if self.kind in _BY_NAME:
             errors.append("EACCES")
@@ -115,7 +122,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """What one fault did. ``where``: the thread or program, the call and the class of file."""
+    """The problems that one fault caused.
+
+    ``where`` has the thread or program, the call and the class of file.
+    """
 
     part: str
     where: tuple[str, str, str]
@@ -124,7 +134,10 @@ class Result:
 
 
 def sites(rig: Rig) -> list[Site]:
-    """Book one demand under strace, once for the threads and once for git, and return its calls."""
+    """Return the calls of one demand, which is booked twice under strace.
+
+    One run traces the threads, the other one traces the processes of git.
+    """
     options = ["-s", "64", "-e", EVERYTHING]
     rig.restore()
     ran = rig.must(rig.book(DEMAND, Strace(["-f", *options]), PLENTY_S))
@@ -142,9 +155,10 @@ def sites(rig: Rig) -> list[Site]:
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return the same call as it is counted in this process, which may read more or fewer files.
+    """Return the same call with its number in this process.
 
-    If the thread did not make it this time, that of another thread on the same class of file.
+    The number may differ, because this process may read more or fewer files. If the thread did not
+    make the call this time, return the call of another thread on the same class of file.
     """
     known = _KNOWN[rig.folder]
     same = [each for each in known if (each.of_class, each.place) == (site.of_class, site.place)]
@@ -159,10 +173,10 @@ def _site(call: Call, rig: Rig, which: int = 0) -> Site:
 
 
 def _counted(rig: Rig, site: Site) -> tuple[int, list[str]]:
-    """Return the how many-th call it is for strace, and the options by which strace counts.
+    """Return the call's number for strace, and the options that limit what strace counts.
 
-    Of a thread's calls on the journal only those on the journal count: how many others there are,
-    such as those that wake a thread, is a matter of time.
+    For a thread's call on the journal, strace counts only calls on the journal. The number of other
+    calls, such as those that wake a thread, depends on timing.
     """
     if site.is_threads and site.file.endswith("/outbox.jsonl") and not site.creates:
         return site.place + 1, ["-P", str(next(rig.home.rglob("outbox.jsonl")))]
@@ -174,7 +188,7 @@ def _git_sites(rig: Rig, ran: Ran) -> list[Site]:
 
 
 def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
-    """Yield the calls of each process of git that was traced, and the how many-th it is."""
+    """Yield each traced call of git, after the number of its process (see ``Site.which``)."""
     for trace in ran.git:
         text = "".join(f"1 {line}\n" for line in trace.text.splitlines())
         for call in parse(text, {1: trace.command}, rig.folder, trace.folder):
@@ -182,9 +196,10 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 
 
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
-    """Return every fault at every call; if ``short``, at the last call of each class.
+    """Return every fault at every call.
 
-    Calls that only read meet fewer faults then, and none if there is a remote.
+    If ``short``, take only the last call of each class, and without a remote also the first call of
+    a class of syncs. A call that only reads then meets only EIO; with a remote, it meets no fault.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -209,7 +224,7 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
 
 
 def run(rig: Rig, job: Job) -> Result:
-    """Have one fault happen, and return what became of the demand."""
+    """Inject one fault; return what became of the demand."""
     if rig.folder not in _KNOWN:
         sites(rig)
     result = _run(rig, job, _here(rig, job.site))
@@ -244,10 +259,10 @@ def _run(rig: Rig, job: Job, site: Site) -> Result:
     told = [os.strerror(getattr(errno, job.fault, 0)), "no room", *_HIDDEN]
     if not site.is_threads:
         told += _OF_SERVER
-    own = site.is_threads and (not job.remote or "outbox" in site.file)  # a push: the remote's
+    own = site.is_threads and (not job.remote or "outbox" in site.file)  # the remote keeps a push
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
     problems = list(after_fault(ran, tuple(told), unsound=unsound))
-    if site.role == "git receive-pack":  # its operator mends that; until then the generator waits
+    if site.role == "git receive-pack":  # an operator removes its locks; the generator waits
         rig.unlock_server()
     problems += after_restart(rig, ran)
     return Result(part, where, job.fault, tuple(problems))

@@ -1,4 +1,4 @@
-"""What must hold after a fault: what was acknowledged is there, once, and nothing is half done."""
+"""What must hold after a fault: acknowledged demands are booked once, nothing is half done."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[s
     """Yield what is wrong with how a process met a fault.
 
     Args:
-        told: words of which its message must have one, if it did not book the demand.
-        unsound: a sync failed that the acknowledgement rests on.
+        ran: what the process did.
+        told: words; the process must print one of them if it did not book the demand.
+        unsound: whether a sync failed on which the acknowledgement depends.
     """
     if ran.hangs == "waits":
         if not ran.err.strip():
@@ -47,9 +48,10 @@ def after_restart(
     """Book another demand in a fresh process, and yield what is wrong with the state repo.
 
     Args:
-        ran: the process that the fault met.
-        journaled: the demand is in the journal, so it must be booked.
-        clones: the clones must be whole too.
+        rig: the state repo.
+        ran: what the process did that met the fault.
+        journaled: whether the journal has the demand, so that it must be booked.
+        clones: whether git must find no fault in the clones either.
     """
     found = rig.book(NEXT, limit=2 * rig.limit)
     if not found.commit:

@@ -1,8 +1,9 @@
 """Power loss, in the manner of ALICE: the disk as it may be when unsynced changes are gone.
 
-A model of the disk follows the calls of a demand. A change of a file is safe once the file was
-synced, a name once its folder was. At each sync and at the end the model writes out the disk with
-none of what is unsafe, with all of it, and with each single change missing.
+A model of the disk follows the system calls of a demand. A change of a file's content is safe once
+the file was synced. A change of a name is safe once its folder was synced. At each sync and at the
+end, the model writes out the disk in several states: without any unsafe change, with all of them,
+and with each single unsafe change missing.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class _Name:
 
     @property
     def scope(self) -> str | int:
-        """What must be synced for it: the folder."""
+        """What a sync must cover to make the change safe: the folder."""
         return self.path.rpartition("/")[0]
 
 
@@ -45,13 +46,13 @@ class _Data:
 
     @property
     def scope(self) -> str | int:
-        """What must be synced for it: the file."""
+        """What a sync must cover to make the change safe: the file."""
         return self.node
 
 
 @dataclass
 class _Change:
-    """One system call's changes; ``safe`` and ``lost``: which of them."""
+    """Changes by one call or by successive writes; ``safe`` and ``lost`` index ``parts``."""
 
     name: str
     parts: list[_Name | _Data]
@@ -60,12 +61,12 @@ class _Change:
 
     @property
     def is_safe(self) -> bool:
-        """Whether all of it is on the disk whatever happens."""
+        """Whether all parts are on the disk after a loss of power at any time."""
         return len(self.safe) == len(self.parts)
 
 
 class Disk:
-    """What a trace did to the files below a folder, and which of it is safe."""
+    """What a trace did to the files below a folder, and which changes are safe."""
 
     def __init__(self, root: Path, *, always_safe: str = "") -> None:
         self.root = root
@@ -85,7 +86,7 @@ class Disk:
         self._first_names = dict(self._names)
 
     def follow(self, call: Call) -> None:
-        """Take note of one call."""
+        """Apply one system call to the model."""
         path = call.paths[-1]
         if call.kind in SYNCS:
             self._sync(path, worked=not call.failed)
@@ -98,7 +99,7 @@ class Disk:
                 self._append(change)
 
     def _append(self, change: _Change) -> None:
-        """Add a change; writes to one file that follow each other are one."""
+        """Add a change; successive unsafe writes to one file become one change."""
         if self.changes and change.parts and not change.safe:
             last = self.changes[-1]
             parts = [*last.parts, *change.parts]
@@ -160,7 +161,10 @@ class Disk:
         return _Name(path, node)
 
     def _sync(self, path: str, *, worked: bool) -> None:
-        """Make what was changed safe; what a sync has failed for, no later one makes safe."""
+        """Mark the changes of a file or folder as safe, or as lost if the sync failed.
+
+        A later sync does not make a lost change safe.
+        """
         node = self._names.get(path, _GONE)
         scope = path if node == _FOLDER else node
         for change in self.changes:
@@ -169,7 +173,7 @@ class Disk:
                     (change.safe if worked else change.lost).add(index)
 
     def states(self) -> Iterator[tuple[str, list[_Change]]]:
-        """Yield what may be on the disk now: a title, and the changes that are missing."""
+        """Yield each state that the disk may have now: a title, and the missing changes."""
         unsafe = [change for change in self.changes if not change.is_safe]
         yield "nothing unsynced", unsafe
         yield "all", []
@@ -177,7 +181,7 @@ class Disk:
             yield f"without {change.name}", [change]
 
     def write(self, missing: Iterable[_Change]) -> None:
-        """Have the folder as the disk is without some changes' unsafe parts."""
+        """Write the folder as the disk has it without the unsafe parts of ``missing``."""
         left_out = {id(change) for change in missing}
         names = dict(self._first_names)
         data = {node: bytearray(text) for node, text in self._first_data.items()}
@@ -207,7 +211,7 @@ class Disk:
 
 
 def run(rig: Rig) -> Iterator[Result]:
-    """Book a demand, lose power at each sync and at the end, and yield what became of it."""
+    """Book a demand, lose power at each sync and at the end; yield the result for each state."""
     rig.restore()
     disk = Disk(rig.folder, always_safe=str(rig.state) if rig.remote else "")
     ran = rig.must(rig.book(DEMAND, Strace(_TRACE)))
@@ -235,7 +239,7 @@ def _lose(
             continue
         seen.add(state)
         part = "power loss, remote" if rig.remote else "power loss"
-        if rig.remote:  # the server lost no power: it ends what it began
+        if rig.remote:  # the server lost no power, so it leaves no locks
             rig.unlock_server()
         yield Result(part, (when, title, ""), "", tuple(after_restart(rig, ran)))
 
@@ -243,14 +247,14 @@ def _lose(
 def failed_sync(rig: Rig, number: int) -> Result:
     """Fail a sync of the branch or pack, start again, then lose power; nothing may be missing.
 
-    What a sync has failed for is gone, although the next start reads it, if that start does not
-    write it anew.
+    Data whose sync failed is gone after the power loss, even though the next start can read it. The
+    next start must write it again.
     """
     rig.restore()
     disk = Disk(rig.folder)
     broken = (*_TRACE, "-e", f"inject=fsync:error=EIO:when={number}")
     first = rig.book(DEMAND, Strace(broken))
-    again = rig.must(rig.book(0, Strace(_TRACE)))  # it is booked already, so nothing is published
+    again = rig.must(rig.book(0, Strace(_TRACE)))  # was booked: publishes nothing
     files = set()
     for ran in (first, again):
         for call in parse(ran.trace, ran.roles, rig.folder):

@@ -1,6 +1,6 @@
-"""One state repo at a fixed place, and processes that book demands in it, under strace or not.
+"""One state repo at a fixed place, and processes that book demands in it, with or without strace.
 
-A process is forked from this one, with all modules imported: that saves a second for each.
+Each process is a fork of this one, which has imported all modules. This saves a second for each.
 """
 
 from __future__ import annotations
@@ -26,17 +26,20 @@ from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""A demand takes half a second. One that waits for its disk is asked to end after this time."""
+"""The shortest time, in seconds, after which a process that books a demand gets SIGTERM.
+
+A demand takes half a second, but it may have to wait for its disk.
+"""
 PATIENCE = 20
-"""On a busy machine a demand gets so many times what one took at first, if that is longer."""
+"""On a busy machine, the limit is so many times what the first demand took."""
 PLENTY_S = 60.0
-"""The limit where nothing goes wrong."""
+"""The limit, in seconds, for commands that meet no fault."""
 END_S = 8.0
-"""After SIGTERM, it must end within this time."""
+"""How many seconds after SIGTERM a process is killed."""
 BEGIN = "/faults-begin"
 
 GIT = "git"
-"""Where strace runs if it is to trace each process of git by itself."""
+"""The value of ``Strace.at`` that traces each process of git by itself."""
 
 _GIT = """#!/bin/sh
 # Runs one of git's programs, under strace if it is the process that is asked for.
@@ -61,9 +64,10 @@ exec "$FAULTS_EXEC/$program" "$@"
 
 @dataclass(frozen=True)
 class Strace:
-    """How to run strace, and on what: a thread from its start, or processes of git.
+    """The options of strace, and what it traces: a thread from its start, or processes of git.
 
-    ``at``: a thread's name, :data:`GIT`, or the n-th process of one git command, ``git push 1``.
+    ``at`` is a thread's name, or :data:`GIT` for all processes of git, or one process by its
+    command and number, such as ``git push 1``.
     """
 
     options: Sequence[str]
@@ -71,13 +75,17 @@ class Strace:
 
     @property
     def is_of_git(self) -> bool:
-        """Whether it traces processes of git."""
+        """Whether strace traces processes of git."""
         return self.at.split()[0] == GIT
 
 
 @dataclass(frozen=True)
 class GitTrace:
-    """The calls of one process of git: ``git push``, the how many-th, and where it started."""
+    """The calls of one process of git.
+
+    ``which`` is its number among the processes of its ``command``, such as ``git push``. ``folder``
+    is where it started, and ``text`` is what strace wrote.
+    """
 
     command: str
     which: int
@@ -87,7 +95,7 @@ class GitTrace:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a process did."""
+    """What a process did: its exit code, its output, its traces, and how it hung if it did."""
 
     code: int
     out: str
@@ -109,7 +117,7 @@ class Ran:
 
 
 class Rig:
-    """A state repo in which one demand is booked; ``remote``: reached by a URL."""
+    """A state repo, and processes that book demands in it; ``remote``: they reach it by a URL."""
 
     def __init__(self, folder: Path, *, remote: bool) -> None:
         self.folder, self.remote = folder / "here", remote
@@ -127,7 +135,7 @@ class Rig:
         self.save()
 
     def _wrap_git(self) -> None:
-        """Have every program of git start by way of a script, those that git starts too."""
+        """Make git's programs start by a script that can trace them, even if git starts them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
         wrapper.write_text(_GIT)
         wrapper.chmod(0o755)
@@ -141,22 +149,22 @@ class Rig:
             lock.unlink()
 
     def must(self, ran: Ran) -> Ran:
-        """Return the process' result; it must have done its work."""
+        """Return what a process did; fail unless it succeeded."""
         assert ran.code == 0, f"{ran.code}: {ran.out}{ran.err}"
         return ran
 
     def save(self) -> None:
-        """Note the files as they are."""
+        """Copy all files, for :meth:`restore`."""
         shutil.rmtree(self._template, ignore_errors=True)
         shutil.copytree(self.folder, self._template, symlinks=True)
 
     def restore(self) -> None:
-        """Have the files as they were at :meth:`save`."""
+        """Replace all files by those of the last :meth:`save`."""
         shutil.rmtree(self.folder)
         shutil.copytree(self._template, self.folder, symlinks=True)
 
     def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
-        """Book a demand that is named by a number."""
+        """Book the demand of a number; return what the process did."""
         file = self.scratch / f"{number}.yaml"
         file.write_text(yaml.safe_dump(goal(number)))
         command = ("request", str(file), "--state-repo", self.address, "--output", "json")
@@ -165,7 +173,7 @@ class Rig:
     def demandops(
         self, *command: str, strace: Strace | None = None, limit: float = PLENTY_S
     ) -> Ran:
-        """Run a command in a process of its own."""
+        """Run a command in a process of its own; return what the process did."""
         paths = {name: self.scratch / name for name in ("out", "err", "trace")}
         for path in paths.values():
             path.unlink(missing_ok=True)
@@ -204,9 +212,12 @@ class Rig:
         paths: dict[str, Path],
         limit: float,
     ) -> Ran:
-        """Attach strace when the thread starts that it is for, and wait for the process' end."""
+        """Wait for the end of a process; return what it did.
+
+        When the thread starts that ``strace`` names, attach strace to it.
+        """
         roles: dict[int, str] = {}
-        alone = 0  # the thread that is traced; strace writes no numbers then
+        alone = 0  # the only traced thread, if any; strace then writes no thread numbers
         tracer: subprocess.Popen[str] | None = None
         hangs, status = "", 0
         deadlines = [(limit, signal.SIGTERM), (limit + END_S, signal.SIGKILL)]
@@ -250,7 +261,7 @@ class Rig:
 
 
 def goal(number: int) -> Goal:
-    """Return the demand of a number; each has its own requester."""
+    """Return the demand of a number; each demand has a requester of its own."""
     return numbered(number)
 
 
@@ -277,7 +288,7 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
 
 
 def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int) -> None:
-    """Run the command line in this forked process, and end."""
+    """Run the command line in this forked process, and end the process."""
     from demandops.cli import main
 
     code = 70
@@ -292,7 +303,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
         def begin(name: str) -> None:
             with one_begins:
                 if select.select([waits], [], [], 0)[0]:
-                    os.read(waits, 1)  # of the thread before: strace must count no read of this one
+                    os.read(waits, 1)  # for the thread before, whose own read strace would count
                 os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
                 select.select([waits], [], [])
             with suppress(OSError):
@@ -314,7 +325,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
 
 
 def demands(rig: Rig) -> dict[int, list[str]]:
-    """Return the commits of each demand that is booked, by its number."""
+    """Return number → commits of each booked demand."""
     found: dict[int, list[str]] = {}
     for commit in commits(rig.state):
         name = commit.one("Request-Id")

@@ -1,4 +1,4 @@
-"""What ``strace`` writes down is read as what was called, whatever bytes the call carried."""
+"""The parser of strace's output finds the files of a call, whatever bytes the call carried."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The system calls that strace wrote down: who made them, on which class of file."""
+"""The system calls in strace's output: who made them, on which class of file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _AT = {
     "newfstatat", "openat", "readlinkat", "renameat", "renameat2", "statx", "symlinkat",
     "unlinkat", "utimensat",
 }  # fmt: skip
-"""The calls that name a file in a folder that is open."""
+"""The calls that name a file relative to an open folder."""
 _TWO_NAMES = {"link", "linkat", "rename", "renameat", "renameat2", "symlink"}
 _FORKS = ("clone", "clone3", "fork", "vfork")
 _RANDOM = (
@@ -45,18 +45,18 @@ class Call:
 
     @property
     def failed(self) -> bool:
-        """Whether it returned an error, an injected one too."""
+        """Whether the call returned an error, also an injected one."""
         return self.result.startswith(("-1", "?"))
 
     @property
     def text(self) -> bytes:
-        """The bytes that it wrote."""
+        """The bytes that the call wrote."""
         found = _TEXT.search(self.arguments)
         return _decoded(found[1]) if found else b""
 
 
 def file_class(path: str, root: Path) -> str:
-    """Return what kind of file this is: its path in the folder, without what differs each time."""
+    """Return the class of a file: its path below ``root`` without the parts that vary."""
     name = path.removeprefix(f"{root}/")
     for pattern, stands in _RANDOM:
         name = pattern.sub(stands, name)
@@ -66,8 +66,8 @@ def file_class(path: str, root: Path) -> str:
 def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
     """Return the calls that touch a file below ``root``, in the order in which they ended.
 
-    ``roles`` names threads and processes; any other process is called after the program that it
-    executes. The first process starts in ``folder``.
+    ``roles`` has the names of threads and processes. Any other process is named after the program
+    that it executes. The first process starts in ``folder``.
     """
     known, roles = set(roles), dict(roles)
     folders: dict[int, str] = {}
@@ -107,7 +107,7 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
 def _whole_lines(
     text: str, roles: dict[int, str], folders: dict[int, str]
 ) -> Iterator[tuple[int, str]]:
-    """Yield process and call, with calls in one piece that others interrupted."""
+    """Yield each process and call; the two parts of an interrupted call are joined."""
     begun: dict[int, str] = {}
     for raw in text.splitlines():
         match = _LINE.match(raw)
@@ -140,9 +140,9 @@ def _program(arguments: str, before: str) -> str:
 
 
 def _paths(kind: str, arguments: str, folder: str) -> list[str]:
-    """Return the paths of the files that a call names, by name or by number.
+    """Return the paths of the files that a call refers to, by a name or by an open file's number.
 
-    What is in quotes may be any bytes that are read or written, so only the kind of a call says
+    A text in quotes may also be data that is read or written. Only the kind of the call shows
     whether it is a name.
     """
     if kind in _AT:

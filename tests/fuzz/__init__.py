@@ -1,9 +1,9 @@
-"""Fuzzing: whatever comes from outside is taken, or refused in the words that are meant for it.
+"""Fuzzing: every input from outside is accepted, or refused by an exception that is meant for it.
 
-``make fuzz`` gives each target ``FUZZ_S`` seconds. A target of bytes is driven by atheris, which
-looks for inputs that reach other lines of ours; one of values by Hypothesis. A finding is every
-other exception, a call that computes for over a second, and one that needs too much memory. Its
-input and its traceback are in ``build/fuzz/<target>/``.
+``make fuzz`` gives each target ``FUZZ_S`` seconds. Atheris drives the targets of bytes: it searches
+for inputs that reach new lines of our code. Hypothesis drives the targets of values. An input is a
+finding if it causes any other exception, takes over a second of processor time, or needs too much
+memory. Its bytes and the traceback are in ``build/fuzz/<target>/``.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from hypothesis import strategies as st
 
 @dataclass(frozen=True)
 class Target:
-    """A check of anything. It raises only ``expected``, else the input is a finding.
+    """A check of any input; an exception that is not ``expected`` makes the input a finding.
 
-    ``seeds`` are inputs of a target of bytes. One of values has ``values`` instead.
+    A target of bytes has ``seeds``, which are sample inputs. A target of values has ``values``
+    instead.
     """
 
     check: Callable[[Any], object]
@@ -30,5 +31,5 @@ class Target:
 
     @property
     def name(self) -> str:
-        """The name of its check."""
+        """The name of the target, which comes from that of its check."""
         return self.check.__name__.strip("_").replace("_", "-")

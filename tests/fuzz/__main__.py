@@ -39,11 +39,11 @@ _ODD = (
     *(".inf", "-.nan", "1e999", "Infinity", "null", "~", "[]", "{}", "-1", "9" * 30, "!!int", "&a"),
     *("*a", "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "..", r"\\ud800", r"\x00"),
 )
-"""Words that have been taken for something else; libFuzzer puts them anywhere."""
+"""Words that parsers have mistaken for something else; libFuzzer inserts them anywhere."""
 
 
 class TooSlow(BaseException):
-    """Raised in a call that computes for longer than a call may."""
+    """Raised in a check that takes more than ``LONGEST_S`` of processor time."""
 
 
 class Run:
@@ -68,7 +68,7 @@ class Run:
         except BaseException:
             os.write(out, traceback.format_exc().encode())
         finally:
-            os._exit(status)  # what the parent has registered for its own end is not for this one
+            os._exit(status)  # without the exit handlers that the parent has registered
 
     def _look(self) -> None:
         tempfile.tempdir = str(self.folder)  # which the next run removes
@@ -84,7 +84,7 @@ class Run:
             self._by_hypothesis()
 
     def check(self, value: Any) -> None:
-        """Check one input, and keep it if it is a finding."""
+        """Check one input; if it is a finding, keep it unless a shorter one like it is kept."""
         self.calls.value += 1
         error = self._error(value)
         if isinstance(error, TooSlow):  # the first call of a function may have to prepare much
@@ -151,7 +151,7 @@ class Run:
             some()
 
     def findings(self, exitcode: int | None) -> list[str]:
-        """Return the findings after the end of its process."""
+        """Return the names of all findings, after the process has ended with ``exitcode``."""
         found = sorted(path.name for path in self.folder.iterdir() if path.suffix == ".input")
         return found if exitcode == 0 else [*found, f"the process ended with {exitcode}; see out"]
 
@@ -165,7 +165,7 @@ def _is_ours(file: str) -> bool:
 
 
 def changed(seeds: tuple[bytes, ...]) -> st.SearchStrategy[bytes]:
-    """Return the seeds with some bytes replaced, removed or doubled."""
+    """Return a strategy: the seeds with some bytes replaced, removed or doubled."""
 
     def change(seed: bytes, random: Random) -> bytes:
         data = bytearray(seed)
@@ -180,7 +180,7 @@ def changed(seeds: tuple[bytes, ...]) -> st.SearchStrategy[bytes]:
 
 
 def run(one: Run) -> list[str]:
-    """Run a target and return its findings."""
+    """Run a target in a process of its own; return the paths of its findings."""
     shutil.rmtree(one.folder, ignore_errors=True)
     one.folder.mkdir(parents=True)
     process = get_context("fork").Process(target=one, daemon=True)
@@ -196,10 +196,10 @@ def run(one: Run) -> list[str]:
 
 
 def main(names: list[str]) -> int:
-    """Run the named targets, two at once; return the exit code."""
+    """Run the named targets, one for each processor at once; return 1 after a finding, else 0."""
     ours = ["demandops", "demandops_ros"]
     instrumented = atheris.instrument_imports(include=ours) if atheris else nullcontext()
-    with instrumented, redirect_stderr(StringIO()):  # it names each module
+    with instrumented, redirect_stderr(StringIO()):  # atheris prints each module's name
         from tests.fuzz import parsers, written
     targets = {one.name: one for one in (*parsers.TARGETS, *written.TARGETS)}
     seconds = float(os.environ.get("FUZZ_S", "10"))

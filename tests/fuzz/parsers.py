@@ -1,4 +1,4 @@
-"""Every parser at the edge: what people, vehicles, clusters and servers send."""
+"""Every parser of input from outside: from people, vehicles, clusters and servers."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _text(data: bytes) -> str:
 
 
 def _bytes(paths: Iterable[Path], most: int = 20) -> tuple[bytes, ...]:
-    """Return the different contents of some files."""
+    """Return the contents of some files without repeats, at most ``most``."""
     return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:most]
 
 
@@ -83,7 +83,7 @@ def _told(error: InvalidInput) -> None:
 
 @cache
 def _folder() -> Path:
-    """Return a new folder, which this process works in."""
+    """Return a new folder, and make it the working directory of this process."""
     folder = Path(tempfile.mkdtemp(prefix="demandops-fuzz-"))
     os.chdir(folder)
     return folder
@@ -116,13 +116,13 @@ def goal_as_data(data: Any) -> None:
 
 
 def _goals() -> st.SearchStrategy[Any]:
-    """Return the valid goals with some parts replaced."""
+    """Return a strategy: any data, and valid goals in which parts are replaced."""
     models = [rich.reference_goal(), rich.own_goal()]
     return st.one_of(ANYTHING, *(_near(model, st.one_of(ANYTHING, TEXT)) for model in models))
 
 
 def _near(value: Any, other: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    """Return plain data near ``value``: parts are left out, or replaced by ``other``."""
+    """Return a strategy for data near ``value``: parts are left out or replaced by ``other``."""
     same: st.SearchStrategy[Any] = st.just(value)
     if isinstance(value, dict):
         same = st.fixed_dictionaries({}, optional={k: _near(v, other) for k, v in value.items()})
@@ -134,7 +134,7 @@ def _near(value: Any, other: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
-    """Return messages of a type with any content."""
+    """Return a strategy for messages of a type with any content."""
     known = {"string": TEXT.filter(str.isprintable), "boolean": st.booleans()}
     known |= {"double": st.floats(), "uint8": st.integers(0, 255)}
     known |= {"uint32": st.integers(0, 2**32 - 1), "int32": st.integers(-(2**31), 2**31 - 1)}
@@ -151,7 +151,7 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
 
 
 def file_of_the_reference(data: bytes) -> None:
-    """What a file of the reference holds is mapped, and its goals are goals."""
+    """What is read from a file of the reference can be mapped, and gives goals."""
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)
     joins, _ = imported_goals.held(files)
@@ -291,7 +291,7 @@ def contexts_file(data: bytes) -> None:
 
 
 def detector_rules(data: bytes) -> None:
-    """Rules that are read also compile, take what is seen, and want goals."""
+    """Rules that can be read also compile, accept observations, and want goals."""
     try:
         file = rule_file.read(_text(data), "rules.yaml")
     except InvalidInput as error:
@@ -315,13 +315,13 @@ def detector_rules(data: bytes) -> None:
 def _seen(
     file: RuleFile, source: str, entity: str, now: float, number: int
 ) -> Iterable[Observation]:
-    """Yield what a message of any type says whose fields are all the same."""
+    """Yield the observation from a message whose fields all have the same value."""
     with suppress(Unreadable):
         yield MessageReader(file, source).observation(_Message(number * 3.0), entity, now)
 
 
 class _Message(float):
-    """A number that has every field, and itself in it."""
+    """A number that is a message too: each of its fields is the number itself."""
 
     def __getattr__(self, name: str) -> _Message:
         return self
@@ -493,7 +493,7 @@ def forge_answer(data: bytes) -> None:
     try:
         answer = json.loads(data)
     except (ValueError, RecursionError):
-        return  # told by the caller
+        return  # the caller reports it
     for kind in (GitHub, Gitea):
         try:
             found = kind("https://x", "t", "o", "n")._read(answer)
@@ -518,7 +518,7 @@ def webhook(data: bytes) -> None:
             connection.shutdown(socket.SHUT_WR)
             answer = connection.makefile("rb").read()
         except OSError:
-            answer = b""  # cut off
+            answer = b""  # the server cut the connection
     assert answer[:10] in (b"", b"HTTP/1.1 2", b"HTTP/1.1 4"), answer[:80]
     assert len(pushed) == before or b"secret" in data or b"ignature" in data.title(), data
 
@@ -529,7 +529,7 @@ _PUSH = b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nX-Gitlab-Token:
 def webhook_address(data: bytes) -> None:
     text = _text(data)
     if any(char.isalpha() for char in text):
-        return  # no names are asked for
+        return  # no name is looked up
     PushWebhook(text, b"", lambda: None).close()
 
 
@@ -568,7 +568,10 @@ _OBJECTS: dict[Any, list[Any]] = {
 
 
 def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
-    """Return what an API may report: parts are missing or null, texts and numbers are others."""
+    """Return a strategy for what an API may report in place of ``value``.
+
+    Parts are missing or null, and texts and numbers differ.
+    """
     if isinstance(value, dict):
         parts = {key: _reported(inner, is_top=False) for key, inner in value.items()}
         if not is_top:

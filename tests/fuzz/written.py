@@ -1,4 +1,4 @@
-"""Every place where text becomes something else: the real reader reads the same value back."""
+"""Each place where a value is written as text: the real reader reads it back unchanged."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def claim_in_its_file(claim: Any) -> None:
 
 
 def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
-    """Return a rich configuration and a goal in which some texts are others."""
+    """Return a rich configuration and a goal in which some texts are replaced by given ones."""
     seed, texts = given
     random, files, goal = Random(seed), rich.rich(), rich.own_goal()
     name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
@@ -110,7 +110,7 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
         if random.random() < 0.05:
             holder[key] = random.choice(texts)
     files[name] = yaml.safe_dump(data, allow_unicode=True)
-    for old, new in renamed.items():  # an id, everywhere
+    for old, new in renamed.items():  # an id is renamed everywhere
         goal = json.loads(json.dumps(goal).replace(json.dumps(old), json.dumps(new)))
         for path in files:
             if path.startswith("inventory/"):
@@ -193,7 +193,7 @@ def name_of_object(ids: tuple[str, str]) -> None:
 
 
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
-    """What a person gives a command is in the file as it was given, or refused."""
+    """The override file has what a person gives to the command, unless that is refused."""
     reason, owner, nodes, patch = words
     way = Way("", None, " ".join(reason.split()) or "x", False, False, False, "text")
     given = {"owner": owner or "x", "values": patch}

@@ -1,4 +1,4 @@
-"""What is rendered is what a reviewer has seen: byte for byte, for every step of every case."""
+"""Every step of every case renders exactly the files that a reviewer has approved."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``make golden``: write the expected changes anew. Review the diff before you commit it."""
+"""``make golden``: write the expected files of all cases. Review the diff before you commit it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.kit.golden import CASES, GOLDEN, to_store
 
 
 def main() -> None:
-    """Write every case."""
+    """Write the expected files of every case."""
     for case in CASES:
         expected = GOLDEN / case / "expected"
         shutil.rmtree(expected, ignore_errors=True)

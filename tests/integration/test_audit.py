@@ -1,4 +1,4 @@
-"""An auditor's questions, by the program and by plain git: what ran, for whom, and by whom."""
+"""The program and plain git answer an auditor: what ran when, for whom, and who booked it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PATH = f"clusters/c-its/perception/edge/{DETECTION}.yaml"
 
 @pytest.fixture(scope="session")
 def _played(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The experiment's first six steps: all four join, vehicle00 and vehicle01 leave."""
+    """A state repo after six steps of the experiment: four vehicles joined, two of them left."""
     folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("played") / "state.git"))
     assert run_command(["request", *map(str, EXPERIMENT[:6]), "--state-repo", str(folder)]) == 0
     git(folder, "repack", "-adq")
@@ -44,7 +44,7 @@ def played(_played: Path, state: Any) -> Any:
 
 @pytest.fixture
 def ask(demandops: Run, state: Any) -> Run:
-    """Return a function that asks for JSON."""
+    """Return a function that runs a command with JSON output and returns the data."""
 
     def call(*args: str) -> Any:
         ran = demandops(*args, "--state-repo", state.path, "--output", "json")
@@ -55,7 +55,7 @@ def ask(demandops: Run, state: Any) -> Run:
 
 
 def test_what_the_page_says_of_git_alone(played: Any) -> None:
-    """``docs/audit.md``: by author, trailer, message and path, and who booked a claim."""
+    """The git commands of ``docs/audit.md``: by author, trailer, message, path and claim."""
 
     def log(*args: str) -> list[str]:
         return git(played, "log", *args).splitlines()
@@ -67,7 +67,7 @@ def test_what_the_page_says_of_git_alone(played: Any) -> None:
     ]
     requesters = log("--format=%(trailers:key=Requester,valueonly,separator=%x2C )", "main")
     assert requesters[:2] == ["vehicle01, station00", "vehicle00, station00"]
-    assert len(requesters) == 6  # init has none
+    assert len(requesters) == 6  # the commit of init has none
     for pattern, count in (
         ("^Operation: shutdown$", 2),
         ("^Requester: vehicle02$", 1),
@@ -226,10 +226,10 @@ class TestWhy:
 
     def test_a_near_miss(self, demandops: Run, played: Any) -> None:
         for name, hint in (
-            ("od-edge-vehicle09", DETECTION),  # which ran once
+            ("od-edge-vehicle09", DETECTION),  # it ran once
             ("vehicle02/edgy", "vehicle02/edge"),
             (f"{FUSION[:-1]}x", FUSION),
-            ("fuson", "fusion"),  # a part of a release's name, which is enough
+            ("fuson", "fusion"),  # part of a release's name is enough
         ):
             told = f"error: nothing called '{name}' runs or ever ran; did you mean '{hint}'?\n"
             assert demandops("why", name, "--state-repo", played.path) == (1, "", told)
@@ -289,7 +289,7 @@ class TestLogFilters:
         ]
 
     def test_a_node_that_only_a_claim_names(self, ask: Run, played: Any, request_json: Run) -> None:
-        """A further requester of what runs changes the ledger and no release."""
+        """A further requester of a running service changes only the ledger."""
         request_json(perception(id="first"))
         before = played.tip
         request_json(perception(id="second"))
@@ -318,7 +318,7 @@ class TestLogFilters:
 
 
 def test_bookkeeping_at_a_time(ask: Run, played: Any) -> None:
-    """The state repo was laid down in January, all else happened just now."""
+    """The first commit is from January; all other commits were made during the test."""
     first = git(played, "rev-list", "--max-parents=0", "main")
     assert ask("bookkeeping", "--at", "2026-01-31")["commit"] == first
     assert ask("bookkeeping", "--at", "1d")["commit"] == first
@@ -461,12 +461,12 @@ class TestRollback:
 
 
 class TestVerifyByDifferences:
-    """A row of commits, proven from one to the next."""
+    """`verify` proves a range of commits by the differences between them."""
 
     FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 2\n"
 
     def verdicts(self, demandops: Run, state: Any) -> dict[str, Any]:
-        """Both ways must say the same."""
+        """Return the rows of `verify` by commit; check that `--whole` gives the same."""
         where = ("verify", "main~4..main", "--state-repo", state.path, "--output", "json")
         ran = demandops(*where)
         assert demandops(*where, "--whole") == ran
@@ -475,7 +475,7 @@ class TestVerifyByDifferences:
         return rows
 
     def surrounded(self, state: Any, request_json: Run, changed: Callable[[], str]) -> str:
-        """Make a commit in the middle of others, and return it."""
+        """Book demands before and after `changed` makes a commit; return that commit."""
         request_json(goal([], [connection("before-1")]), goal([], [connection("before-2")]))
         made = changed()
         request_json(goal([], [connection("after")]))
@@ -496,7 +496,7 @@ class TestVerifyByDifferences:
     def test_a_file_that_should_have_been_touched(
         self, demandops: Run, played: Any, request_json: Run
     ) -> None:
-        """A claim goes, and what it asked for stays."""
+        """A forged commit removes a claim, but leaves the files that the claim needed."""
         path = next(p for p, t in played.files("ledger/connections/").items() if "vehicle02/" in t)
         text = self.FORGED.replace("none", read(played.files()[path], path).demand)
         made = self.surrounded(

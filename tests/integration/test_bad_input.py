@@ -1,6 +1,6 @@
-"""Bad input through ``demandops request``, above all attacks in YAML.
+"""Bad input through ``demandops request``, mainly attacks in YAML.
 
-Whatever is refused leaves no commit and nothing in the outbox, and the next demand works.
+What is refused leaves no commit and nothing in the journal, and the next demand works.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _nothing_is_left_behind(data_home: Path) -> Iterator[None]:
 
 
 def refused(ran: Any) -> list[tuple[str, str]]:
-    """Return the faults of a refused request."""
+    """Check that the only request was refused; return field and message of each fault."""
     (row,) = ran.json()
     assert (ran.code, row["outcome"], row["commit"]) == (1, "refused", None)
     return [(error["field"], error["message"]) for error in row["faults"]]
@@ -113,7 +113,7 @@ def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
 def test_a_mistake_anywhere_in_a_goal_changes_nothing(
     request_json: Send, state: Any, data_home: Path, valid: Any, model: Any
 ) -> None:
-    """A sample; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
+    """This tries a sample; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
     form, before = Form(model.model_json_schema()), state.tip
     wrong = [m for m in mutations(valid()) if form.forbids(m.document)]
     for mutation in wrong[:: len(wrong) // 4]:
@@ -130,7 +130,7 @@ def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
     assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
 
 
-# the file, and how the message starts: the words of libyaml and pydantic are left out
+# A file's content, and the start of the message, without the words of libyaml and pydantic.
 ATTACKS: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "error: no request in {file}; write one\n"),
     "only a comment": ("# nothing\n", "error: no request in {file}; write one\n"),
@@ -228,7 +228,7 @@ for file in sys.argv[2:]:
 
 
 class TestYamlAttacks:
-    """A clear message with the file and the place, exit code 1, nothing booked, no traceback."""
+    """The message names file and place, the exit code is 1, and nothing is booked."""
 
     @pytest.mark.parametrize("name", ATTACKS)
     def test_a_file_is_refused_with_its_name_and_the_place(
@@ -307,7 +307,7 @@ class TestYamlAttacks:
     def test_brackets_without_end_crash_nothing(
         self, state: Any, tmp_path: Path, data_home: Path
     ) -> None:
-        """In a process of its own, for a parser may overrun the stack and end the process."""
+        """The commands run in another process, because a parser might overflow the stack."""
         files = [tmp_path / "lists.yaml", tmp_path / "mappings.yaml"]
         for file, opening, closing in zip(files, ("[", "{a: "), "]}", strict=True):
             file.write_text("apps: " + opening * 40_000 + closing * 40_000)

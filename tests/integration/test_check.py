@@ -1,4 +1,4 @@
-"""`demandops check`: what a person is about to merge, held against where they started from."""
+"""`demandops check` compares what a person is about to merge with the commit they started from."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
 
 
 def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Check) -> None:
-    """A report that stands is no fault; one that a person changes is."""
+    """An existing report is no fault, but a person's change of it is."""
     report = checkout / ".demandops" / "reports" / "problems.yaml"
     report.parent.mkdir(parents=True)
     report.write_text("problems: []\n")

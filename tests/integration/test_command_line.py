@@ -1,6 +1,6 @@
-"""The command line of design §7: text, JSON and exit codes of every command.
+"""The command line (§7 of the design): text, JSON and exit codes of every command.
 
-Exit codes: 0 done, 1 the user's to fix, 2 wrong usage, 3 a fault of the program.
+Exit codes: 0 done, 1 a fault that the user can fix, 2 wrong usage, 3 a fault of the program.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Run = Callable[..., Any]
 
 
 def cells_of(table: str) -> list[list[str]]:
-    """Return the cells of a table without empty ones."""
+    """Return the cells of each line of a table; the table has no empty cells."""
     return [re.split(r"\s{2,}", line) for line in table.splitlines()]
 
 
@@ -60,7 +60,7 @@ def text(*goals: Goal) -> str:
 
 @pytest.fixture
 def joined(request_json: Run, state: Any) -> Any:
-    """Return a state repo with the plain demand booked."""
+    """Return a state repo in which ``perception()`` is booked."""
     assert request_json(perception()).code == 0
     return state
 
@@ -674,7 +674,7 @@ class TestVerify:
 
 
 class TestStateRepo:
-    """Which state repo: named by option or environment, and refused with a remedy."""
+    """An option or the environment names the state repo; a wrong name is refused with a remedy."""
 
     def test_it_may_be_named_by_the_environment(
         self, demandops: Run, state: Any, monkeypatch: pytest.MonkeyPatch

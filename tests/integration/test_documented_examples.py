@@ -1,4 +1,4 @@
-"""What the documentation shows is run, so that it stays true."""
+"""Run what the documentation shows, so that it stays true."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NOW = datetime(2026, 5, 4, 12, 0, tzinfo=timezone.utc)
 
 
 def blocks(name: str) -> list[str]:
-    """The indented blocks of a document."""
+    """Return the indented code blocks of a document, without the indent."""
     text = (DOCS / name).read_text()
     return [
         textwrap.dedent(found) for found in re.findall(r"(?:^ {4}.*\n|^\n(?= {4}))+", text, re.M)
@@ -223,7 +223,7 @@ def test_the_policy_of_the_documentation_refuses_as_it_says(
     on = state(**{"policy/access-domains.yaml": policy})
     goal = demand() | {"requesters": [requester]}
     (application,) = goal["applications"]
-    # its inputs are at the node: no connection is needed, and so none is refused too
+    # its inputs are at its node, so it needs no connection that could be refused too
     inputs = {"ego_data": [{"topic": "/vehicles/vehicle01/ego_data", "source": node}]}
     goal["applications"] = [application | {"node": node, "inputs": inputs}]
     with pytest.raises(Refused) as refused:
@@ -251,7 +251,7 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
     on = state(**{"policy/access-domains.yaml": policy})
     path = "bootstrap/c-its.yaml"
     _, manifests = rendered_files(on)[path].split("\n---\n", 1)
-    check_files({path: manifests})  # against the schema of Kubernetes
+    check_files({path: manifests})  # checks it against Kubernetes' schema
     kinds = [item["kind"] for item in yaml.safe_load_all(manifests)]
     assert kinds.count("NetworkPolicy") == 1
     assert "NetworkPolicy" not in rendered_files(state())[path]

@@ -1,4 +1,4 @@
-"""``demandops get``: what is demanded and what runs, as lists; filters, formats, ``--watch``."""
+"""``demandops get`` lists what is demanded and what runs, with filters, formats and ``--watch``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 
 @pytest.fixture
 def fleet(demandops: Run, state: GitRepo) -> GitRepo:
-    """Two vehicles in the experiment, and a demand with a lease."""
+    """A state repo with the experiment's first two demands and a demand with a lease."""
     link = {"id": "patrol/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
     link |= {"topics": [{"source": "/patrol"}]}
     leased = put("patrol", "vehicle00", applications=[], connections=[link], lease="10m")
@@ -39,7 +39,7 @@ def fleet(demandops: Run, state: GitRepo) -> GitRepo:
 
 @pytest.fixture
 def names(demandops: Run, fleet: GitRepo) -> Any:
-    """Return a function that lists the names of a kind."""
+    """Return a function that lists the names of all items of a kind."""
 
     def call(*args: str) -> list[str]:
         ran = demandops("get", *args, "--state-repo", fleet.path, "-o", "name")
@@ -390,7 +390,7 @@ class TestStatus:
     def test_a_cluster_with_an_old_bootstrap_file_is_named(
         self, demandops: Run, fleet: GitRepo, tmp_path: Path
     ) -> None:
-        """Old by the annotation of its Kustomization, which is not there before this version."""
+        """Without the annotation of its Kustomization, a bootstrap file counts as old."""
         bootstrap = fleet.files()["bootstrap/c-its.yaml"]
         applied = next(
             one for one in yaml.safe_load_all(bootstrap) if one["kind"] == "Kustomization"

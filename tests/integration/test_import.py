@@ -1,4 +1,4 @@
-"""`demandops import`: what the reference runs becomes demands like any other."""
+"""`demandops import` turns what the reference runs into ordinary demands."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.kit.reference import Reference
 from tests.kit.repo import GitRepo, books, claims, init, read, tip
 
 REQUEST = "station00/collective-perception-intersection"
-"""The id of the experiment's demands."""
+"""The request id in all of the experiment's goals."""
 STATION = "mqtt-connection-station00-edge"
 
 
 class Migration:
-    """A fleet after the first steps of the experiment, and an empty state repo."""
+    """The reference after the first steps of the experiment, and a state repo without demands."""
 
     def __init__(self, folder: Path, demandops: Run, steps: int) -> None:
         folder.mkdir(exist_ok=True)
@@ -31,13 +31,13 @@ class Migration:
         self.files = {path.stem: path for path in self.reference.write(folder / "reference")}
 
     def run(self, *args: str | Path, files: str = "", stdin: str = "") -> Ran:
-        """Run `import` with the files whose names hold a word."""
+        """Run `import` with the reference's files whose names contain the text ``files``."""
         chosen = [path for name, path in self.files.items() if files in name]
         how = ["--state-repo", self.repo, "--map", self.map]
         return self._demandops("import", *chosen, *how, *args, stdin=stdin)
 
     def propose(self, old: str = "", new: str = "") -> None:
-        """Have a map proposed, with the experiment's id, and change it."""
+        """Let `import` propose a map; put the experiment's id and `new` into the map."""
         assert self.run().code == 0
         text = self.map.read_text().replace("request: imported", f"request: {REQUEST}")
         assert old in text
@@ -53,7 +53,7 @@ def migration(tmp_path: Path, demandops: Run) -> Migration:
 
 
 def ledger(repo: Path) -> dict[str, str]:
-    """The claims without the times of booking."""
+    """Return the claim files by path, without the times of booking."""
     files = GitRepo(repo).files("ledger/")
     return {path: re.sub("booked: .*", "", files[path]) for path in claims(repo)}
 
@@ -67,7 +67,7 @@ def test_an_imported_ledger_is_that_of_the_demands_themselves(
     direct = init(tmp_path / "direct.git")
     assert demandops("request", *EXPERIMENT[:6], "--state-repo", direct).code == 0
     assert ledger(migration.repo) == ledger(direct)
-    # their clients go on: the same join counts once, and the shutdowns leave nothing
+    # the fleet's clients go on: a repeated join counts once, and shutdowns release everything
     assert migration.request(EXPERIMENT[3]).out.split()[-3] == "unchanged"
     assert migration.request(*EXPERIMENT[6:]).code == 0
     assert ledger(migration.repo) == {}
@@ -84,7 +84,7 @@ def test_counts_alone_end_with_as_many_shutdowns(migration: Migration) -> None:
 
 
 def test_the_same_requesters_twice_are_two_demands(tmp_path: Path, demandops: Run) -> None:
-    """The reference counts them twice; one goal's id would count them once."""
+    """The reference counts the requesters twice; with one id DemandOps would count them once."""
     migration = Migration(tmp_path, demandops, 0)
     for topics in (["/t"], ["/t", "/u"]):
         migration.reference.send({"connections": [connection(topics=topics, who=["v"])]})

@@ -23,7 +23,7 @@ BODY = b'{"ref": "refs/heads/main"}'
 
 
 class Heard:
-    """Counts the pushes that were heard of."""
+    """Counts the pushes that the webhook reports."""
 
     def __init__(self) -> None:
         self.times = 0
@@ -46,7 +46,7 @@ def signed(heard: Heard) -> Iterator[PushWebhook]:
 
 @pytest.fixture
 def impatient(heard: Heard, monkeypatch: pytest.MonkeyPatch) -> Iterator[PushWebhook]:
-    monkeypatch.setattr(push_webhook, "_TIMEOUT_S", 1.0)  # before it accepts any connection
+    monkeypatch.setattr(push_webhook, "_TIMEOUT_S", 1.0)  # set before any connection
     hook = PushWebhook("127.0.0.1:0", SECRET, heard)
     yield hook
     hook.close()
@@ -187,7 +187,7 @@ def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
 ) -> None:
     slow = [_connected(impatient) for _ in range(40)]
     for number, raw in enumerate(slow):
-        with suppress(ConnectionError):  # there are too many
+        with suppress(ConnectionError):  # the hook may have closed it already
             raw.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\n\r\n"[: number + 1])
     for raw in slow:
         assert _is_cut_off(raw)
@@ -237,7 +237,7 @@ def _connected(hook: PushWebhook) -> socket.socket:
     return socket.create_connection((str(parts.hostname), int(parts.port or 0)), timeout=10)
 
 
-# ---- what is given at the start ----
+# # ---- the options at the start ----
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`demandops new`: what it lays down is valid, and the example demand runs."""
+"""`demandops new` writes valid files, and its example demand can be booked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ APPLICATION = ["new", "application", "tracking", *OPTIONS]
 
 @pytest.fixture
 def laid(checkout: Path, demandops: Run) -> Path:
-    """Return a state repo with a new application, committed."""
+    """Return a state repo in which a new application is committed."""
     assert demandops(*APPLICATION, "-C", checkout).code == 0
     git(checkout, "add", "--all")
     git(checkout, "commit", "--quiet", "--message=Add tracking")
@@ -72,7 +72,7 @@ def test_its_example_demand_runs(laid: Path, demandops: Run, tmp_path: Path) -> 
 
 
 def test_a_fleet_from_nothing(demandops: Run, tmp_path: Path) -> None:
-    """As docs/appdef.md says: five nodes and an application, without a line by hand."""
+    """As docs/appdef.md says, commands alone make five nodes and an application."""
     repo = tmp_path / "fleet"
     assert demandops("init", repo, "--example", "none").code == 0
     ran = demandops(*APPLICATION, "-C", repo)

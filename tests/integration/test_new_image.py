@@ -1,4 +1,4 @@
-"""`demandops new image`: valid pipelines, and a script that proposes what `check` accepts."""
+"""`demandops new image` writes valid pipelines and a script whose proposal `check` accepts."""
 
 from __future__ import annotations
 

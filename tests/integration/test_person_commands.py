@@ -1,4 +1,4 @@
-"""What a person does by commands: overrides, suspensions, approvals, in their own name."""
+"""Commands by which a person makes overrides, suspensions and approvals in their own name."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def joined(request_json: Callable[..., Ran], state: GitRepo) -> GitRepo:
 
 @pytest.fixture(params=["folder", "url"])
 def where(request: pytest.FixtureRequest, joined: GitRepo) -> tuple[str, str]:
-    """The state repo as a folder, and behind a URL."""
+    """The options that name the state repo: once as a folder, once as a URL."""
     address = str(joined.path) if request.param == "folder" else joined.path.as_uri()
     return "--state-repo", address
 
 
 def carried_out(state: GitRepo) -> None:
-    """Let a generator carry out what people committed."""
+    """Run a generator until it has followed what people committed."""
     made = state.tip
     with running(state.path, fetch_interval=0.05):
         wait_until(lambda: state.tip != made, "the generator follows")

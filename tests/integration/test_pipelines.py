@@ -1,4 +1,4 @@
-"""The pipelines that `init` lays down: valid by their schemas, of least rights, run as they are."""
+"""The pipelines that `init` writes: valid by their schemas, with few rights; their scripts run."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_who_may_write_runs_nothing_of_the_pull_request(github: dict[str, Any]) 
     checkout = check["steps"][0]["with"]
     assert (checkout["persist-credentials"], checkout["fetch-depth"]) == (False, 0)
     scripts = [step["run"] for job in (check, comment) for step in job["steps"] if "run" in step]
-    # what a pull request names (a branch, a title) reaches no shell as text
+    # no script contains names from a pull request, like a branch or a title, as text
     assert not [script for script in scripts if "${{" in script]
     for script in scripts:
         subprocess.run([BASH, "-n"], input=script, text=True, check=True)
@@ -75,7 +75,7 @@ def environment(tmp_path: Path, **more: str) -> dict[str, str]:
 
 
 def helm(tmp_path: Path) -> dict[str, str]:
-    """Return the variables for a program that says as helm does of a sound chart: nothing."""
+    """Return the environment for a fake helm that accepts every chart without output."""
     program = tmp_path / "helm"
     program.write_text(f"#!{BASH}\n")
     program.chmod(0o755)
@@ -83,7 +83,7 @@ def helm(tmp_path: Path) -> dict[str, str]:
 
 
 def put_demandops(at: Path) -> None:
-    """Put this program where the pipeline installs it."""
+    """Write a `demandops` that runs this program to the path where the pipeline installs it."""
     at.parent.mkdir(parents=True)
     at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m demandops.cli.main "$@"\n')
     at.chmod(at.stat().st_mode | stat.S_IXUSR)
@@ -91,7 +91,10 @@ def put_demandops(at: Path) -> None:
 
 @pytest.fixture(params=["github", "gitlab"])
 def installing(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, dict[str, str]]:
-    """Return the script that installs the program, and an environment whose pip only speaks."""
+    """Return the script that installs the program, and an environment with a fake pip and python.
+
+    The fake programs only print their arguments.
+    """
     pipeline: dict[str, Any] = request.getfixturevalue(request.param)
     if request.param == "github":
         (script,) = [one["run"] for one in pipeline["jobs"]["check"]["steps"] if "pip" in str(one)]
@@ -217,7 +220,7 @@ def test_gitlab_brings_helm_as_its_digest_says(
 
 
 class Notes:
-    """As much of GitLab as the note needs: who I am, and the notes of one merge request."""
+    """A part of GitLab's API: the caller's own id, and the notes of one merge request."""
 
     def __init__(self) -> None:
         self.url = ""

@@ -1,4 +1,4 @@
-"""Approval from the command line: proposed demands, what waits, a dry run."""
+"""Approval from the command line: demands are proposed, listed, awaited, or tried in a dry run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.kit.repo import GitRepo, Person, branches, git
 
 @pytest.fixture
 def strict(state: GitRepo, person: Person) -> GitRepo:
-    """A state repo whose access domain demands approval."""
+    """A state repo whose access domain requires approval of demands."""
     person.policy(approval="required")
     return state
 
@@ -80,7 +80,7 @@ def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
 
 @contextmanager
 def decided(state: GitRepo, *command: str) -> Iterator[None]:
-    """A person who runs a command of git with the first branch that comes."""
+    """During the block a person runs a git command on the first proposal's branch."""
 
     def decide() -> None:
         wait_until(lambda: branches(state.path), "a demand waits")

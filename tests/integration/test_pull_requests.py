@@ -1,4 +1,4 @@
-"""`demandops check` on pull requests: real branches of a state repo in which a demand runs."""
+"""`demandops check` on pull requests: branches of a state repo in which a demand is booked."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ NEWER_PERCEPTION = [
     (f"robotkube-{name}\n    tag: 2025-04", f"robotkube-{name}\n    tag: 2025-09")
     for name in ("object-detection", "object-fusion", "k8s-configmap-watcher")
 ]
-"""Edits of `registry/images.yaml`: newer images of all services."""
+"""Edits of `registry/images.yaml` that give all services newer images."""
 
 
 @pytest.fixture(scope="session")
 def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bare state repo in which vehicle00's demand runs."""
+    """A bare state repo in which vehicle00's demand is booked."""
     folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("booked") / "state.git"))
     book(folder, "1-vehicle00-joins")
     return folder
@@ -47,7 +47,7 @@ def book(bare: Path, step: str) -> None:
 
 @pytest.fixture
 def branch(bare: Path, tmp_path: Path) -> Path:
-    """A clone with a branch of somebody's own checked out."""
+    """A clone in which a new branch `edit` is checked out."""
     folder = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(bare), str(folder))
     git(folder, "checkout", "--quiet", "-b", "edit")
@@ -82,7 +82,7 @@ def claims(folder: Path, needle: str = "") -> list[Path]:
     return [path for path in found if needle in path.read_text()]
 
 
-# ---- hand edits ----
+# # ---- manual edits ----
 
 
 def test_edited_values_image_and_replicas_become_an_override_to_paste(
@@ -410,7 +410,7 @@ def test_without_a_remote_main_is_compared_with(
     edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     commit(branch)
     assert len(found()["releases"]) == 3
-    assert found("--base", "HEAD")["releases"] == found()["releases"]  # not followed up yet
+    assert found("--base", "HEAD")["releases"] == found()["releases"]  # no generator has followed
 
 
 SHALLOW = (
@@ -500,7 +500,7 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
 
 
 def without_code(text: str) -> str:
-    """Return what of Markdown is no code, by the rule of CommonMark for spans and fences."""
+    """Return a Markdown text without its code spans and fences, by CommonMark's rule."""
     kept, rest = "", text
     while "`" in rest:
         before, _, rest = rest.partition("`")

@@ -1,7 +1,7 @@
-"""Long sequences of requests by chance, through the command line into a real state repo.
+"""Long random sequences of requests go through the command line into a real state repo.
 
-The model in ``tests/model`` takes the same requests; at the end of each call, and at commits in
-between, both must say the same.
+The model in ``tests/model`` takes the same requests. After each call, and at commits in between,
+the bookkeeping of both must be equal.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class CommandLine:
         return git(self.repo, "rev-list", "--reverse", "main").split()
 
     def view(self, revision: str) -> dict[str, Any]:
-        """Return the bookkeeping at a commit, in the model's words."""
+        """Return the bookkeeping at a commit in the form of the model."""
         code, data = self("bookkeeping", "--at", revision)
         assert code == 0
         assert data.pop("commit") == git(self.repo, "rev-parse", revision)
@@ -56,11 +56,11 @@ def command(demandops: Run, state: GitRepo) -> CommandLine:
 
 
 def written(goals: list[Goal], folder: Path, name: str) -> list[str]:
-    """Write goals into two files of many documents each and return their paths."""
+    """Write goals into two YAML files with many documents each; return the files' paths."""
     half = len(goals) // 2
     files = {f"{name}-a.yaml": goals[:half], f"{name}-b.yaml": goals[half:]}
     for file, documents in files.items():
-        plain = json.loads(json.dumps(documents))  # two goals may share a list: no YAML anchors
+        plain = json.loads(json.dumps(documents))  # copies shared lists: no YAML anchors
         (folder / file).write_text(yaml.safe_dump_all(plain, sort_keys=False))
     return [str(folder / file) for file in files]
 
@@ -68,7 +68,7 @@ def written(goals: list[Goal], folder: Path, name: str) -> list[str]:
 def assert_told_as_expected(
     rows: list[dict[str, Any]], expected: list[Result], goals: list[Goal], new: list[str]
 ) -> None:
-    """Check the rows of one call: each request's outcome, and the commit that came of it."""
+    """Check the outcome and the commit of each request in the rows of one call."""
     assert [row["outcome"] for row in rows] == [result.outcome for result in expected]
     assert [row["index"] for row in rows] == list(range(len(goals)))
     assert [row["request"] for row in rows] == [goal["id"] for goal in goals]

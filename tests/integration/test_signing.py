@@ -1,4 +1,4 @@
-"""Commits signed by an SSH key, as the real git checks them, and what `verify` says of them."""
+"""Commits signed by an SSH key: the real git checks them, and `verify` reports on them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def book(demandops: Run, state: Any) -> Run:
 
 @pytest.fixture
 def agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An agent of our own, which holds nothing yet."""
+    """An ssh-agent for the test, which has no keys yet."""
     said = subprocess.run(
         ["ssh-agent", "-a", str(tmp_path / "agent")], check=True, capture_output=True, text=True
     ).stdout
@@ -125,7 +125,7 @@ def test_every_command_that_writes_signs(
     for command in commands:
         if command == ("decommission", "vehicle00"):
             assert book("a").code == 0
-        elif command == ("upgrade",):  # something to render
+        elif command == ("upgrade",):  # removes a file, so that it renders something
             state.commit({next(iter(state.manifests())): None})
         ran = demandops(*command, "--state-repo", state.path)
         assert (ran.code, ran.err) == (0, "")
@@ -157,7 +157,7 @@ def test_a_generator_without_a_key_warns_once_where_keys_are_listed(
 
 
 class TestProposals:
-    """Demands that wait for approval: the branch is the generator's, and so signed."""
+    """Demands that wait for approval: the generator signs the commits of their branches."""
 
     @pytest.fixture(autouse=True)
     def _strict(self, state: Any) -> None:
@@ -200,7 +200,7 @@ def test_what_people_changed_is_carried_out_by_a_signed_commit(
 
 
 class TestKeysThatCannotSign:
-    """Told at the start, before anything is booked."""
+    """A key that cannot sign is reported at the start, before anything is booked."""
 
     def told(self, book: Run, state: Any, key: Path | str) -> str:
         before = state.tip
@@ -344,7 +344,7 @@ class TestVerify:
     def test_keys_may_change(
         self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
     ) -> None:
-        """Each commit is held to the list that was there before it."""
+        """Each commit is checked with the list of keys in effect before it."""
         new = keygen(tmp_path / "new")
         since = state.tip
         state.commit({SIGNERS: listed(key)})

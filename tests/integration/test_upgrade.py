@@ -1,7 +1,7 @@
-"""`demandops upgrade`: to another controller, and to a newer program that renders otherwise.
+"""`demandops upgrade` to another controller, and to a newer program that renders other files.
 
-The newer program is this one with its number raised and its label changed, in a folder of its own
-and run in a process of its own.
+The newer program is a copy of this one with a higher render version and another time-out in
+HelmReleases. It runs in a process of its own.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ NEWER = (
 )
 
 
-# Runs each line's command line, with the text that it reads, in one process.
+# Runs the command line and standard input of each line of its input, all in one process.
 SERVE = """
 import io, json, os, sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -59,7 +59,7 @@ for line in commands:
 
 @pytest.fixture(scope="session")
 def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
-    """A program of render version 3, whose HelmReleases wait longer."""
+    """A process that runs commands of a program with render version 3 and another time-out."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
@@ -84,7 +84,7 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subproce
 
 @pytest.fixture
 def newer(newer_program: subprocess.Popen[str], state: GitRepo, data_home: Path) -> Run:
-    """Run a command of the newer program on the state repo."""
+    """Return a function that runs a command of the newer program on the state repo."""
 
     def call(*args: str, stdin: str = "") -> Ran:
         options = ["--state-repo", str(state.path)] if args[0] != "init" else []

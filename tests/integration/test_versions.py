@@ -1,4 +1,4 @@
-"""Versions on demand from the command line: what is told of them, approval, and a channel moved."""
+"""Versions on demand from the command line: the output of commands, approval, a moved channel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Send = Callable[..., Ran]
 
 
 def listed(**channels: str) -> str:
-    """Return a ``registry/versions.yaml`` whose versions pin the detection's image."""
+    """Return a ``registry/versions.yaml`` with these channels, which pins the detection's image."""
     versions = {
         v: {"images": {"object-detection": {"tag": v}}} for v in ("1.0.0", "1.1.0", "2.0.0")
     }
@@ -32,7 +32,7 @@ def listed(**channels: str) -> str:
 
 @pytest.fixture
 def send(demandops: Run, state: GitRepo, person: Person) -> Send:
-    """Send a demand for a version, to a repo whose definition updates."""
+    """Return a function that sends a demand for a version, in a repo with ``versions: update``."""
     text = person.read(APPDEF).replace("inputs:\n", "versions: update\ninputs:\n", 1)
     person.push({APPDEF: text, VERSIONS: listed(testing="1.1.0")})
 

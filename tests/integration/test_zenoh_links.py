@@ -1,8 +1,8 @@
-"""The bridges' configuration in the hands of the real Zenoh: it is read, and the nodes link up.
+"""The real Zenoh reads the bridges' configuration, and the nodes connect.
 
-Zenoh's own library stands in for the bridges: it reads the same configuration, refuses fields that
-it does not know, and keeps the part of the plugin for a plugin that is not there. What the
-bridge's plugin reads is held against our schema only.
+Zenoh's library stands in for the bridges. It reads the same configuration and refuses unknown
+fields, except in the plugin's part, because the plugin is missing. Only our schema checks that
+part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.kit.golden import rendered
 
 DEADLINE_S = 30.0
 STEP = "2-station00-joins"
-"""Of the golden case: the edge can be reached by both others, and the station too."""
+"""The step of the golden case `zenoh`; in it the edge and the station have an endpoint."""
 
 
 def free_port() -> int:
@@ -32,7 +32,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def configurations() -> dict[str, str]:
-    """Return the rendered configuration of each node's bridge, its hosts made this machine."""
+    """Return the rendered configuration of each node's bridge, with addresses of this machine."""
     found = {}
     for path, text in rendered("zenoh")[STEP].items():
         name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
@@ -54,7 +54,7 @@ def configurations() -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def sessions(configurations: dict[str, str]) -> Iterator[dict[str, Any]]:
-    """Run a Zenoh session on each node's configuration, the plugin's part left out."""
+    """Open a Zenoh session with each node's configuration, without the plugin's part."""
     opened = {}
     for node, text in configurations.items():
         whole = json.loads(text)
@@ -106,7 +106,7 @@ def test_what_one_node_puts_arrives_at_another_that_is_linked(sessions: dict[str
     )
 
     def put() -> bool:
-        sessions["vehicle00"].put("points", b"here")  # the subscription takes a moment to spread
+        sessions["vehicle00"].put("points", b"here")  # again and again: a subscription needs time
         return bool(arrived)
 
     wait(put)

@@ -1,4 +1,4 @@
-"""Bags of vehicles' poses, MCAP or sqlite3, written without ROS."""
+"""Write ROS bags of vehicles' poses, as MCAP or sqlite3, without an installed ROS."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def write_bag(
     plugin: StoragePlugin = StoragePlugin.MCAP,
     texts: Iterable[tuple[float, str, str]] = (),
 ) -> None:
-    """Record poses, each of a time in seconds since 1970, a vehicle and a place.
+    """Write a bag of poses; each is a time in seconds since 1970, a vehicle, x and y.
 
     Args:
         path: the folder of the bag; it must not exist.
         poses: in the order of time.
-        plugin: how the bag is stored.
-        texts: what comes before them on other topics: times, topics and texts.
+        plugin: the storage format of the bag.
+        texts: string messages that are recorded before the poses: times, topics and texts.
     """
     new = _TYPES.types
     topics: dict[str, Any] = {}

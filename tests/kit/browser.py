@@ -1,4 +1,4 @@
-"""A headless Chromium of the system, and pages that note what must not happen."""
+"""The system's Chromium without a window, and visits that record a page's requests and errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ new PerformanceObserver((list) => {
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """Run the browser for the length of a block; its profile is new."""
+    """Run Chromium with a new profile for the length of a block; yield the browser."""
     program = shutil.which("chromium")
     assert program, "setup/system page installs chromium"
     with sync_playwright() as playwright:
@@ -42,7 +42,7 @@ def chromium() -> Iterator[Browser]:
 
 
 class Visit:
-    """A page of the site, and everything that it asked for and complained about."""
+    """A visit to the site: its page, the hosts of all requests, and all errors and warnings."""
 
     def __init__(self, browser: Browser, url: str, *, width: int = 1280, **options: Any) -> None:
         self.url = url
@@ -65,8 +65,8 @@ class Visit:
         return self.page
 
     def longest_task_ms(self) -> float:
-        """The longest time that the browser's main thread was busy, since the page was opened."""
-        self.page.wait_for_timeout(150)  # entries come a moment later
+        """Return the longest task of the browser's main thread since the page was opened, in ms."""
+        self.page.wait_for_timeout(150)  # the observer reports tasks a moment later
         return float(self.page.evaluate("Math.max(0, ...window.longTasks)"))
 
     def close(self) -> None:

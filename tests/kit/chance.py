@@ -20,11 +20,11 @@ TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))
 
 chances = st.randoms(use_true_random=False)
 visible = st.characters(exclude_categories=["C", "Z"], include_characters=" ")
-"""A character that may stand in an id."""
+"""A strategy for the characters that an id may contain."""
 
 
 def examples(count: int) -> Callable[[Any], Any]:
-    """Return a decorator that tries ``count`` examples, times ``DEMANDOPS_EXAMPLES``."""
+    """Return a decorator that tries ``count`` × ``DEMANDOPS_EXAMPLES`` examples."""
     return settings(
         max_examples=count * TIMES,
         derandomize=TIMES == 1,
@@ -40,7 +40,7 @@ def examples(count: int) -> Callable[[Any], Any]:
 
 
 def told(requests: list[Goal]) -> list[Goal]:
-    """Return the requests, which are shown if the test fails."""
+    """Return ``requests`` unchanged; Hypothesis prints their summaries if the test fails."""
     for request in requests:
         note(json.dumps(summary(request)))
     return requests

@@ -27,7 +27,7 @@ Run = Callable[..., Ran]
 
 
 def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Return a function that runs ``demandops`` with its arguments."""
+    """Return a function that runs ``demandops`` in this process with the given arguments."""
     from demandops.cli.main import run
 
     def call(*args: str | Path, stdin: str | bytes = "") -> Ran:

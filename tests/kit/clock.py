@@ -13,7 +13,8 @@ _LONGEST_WAIT_S = 0.05
 class Clock(Runtime):
     """A runtime whose clocks a test moves.
 
-    With a ``start`` they move in no other way, and random numbers are always the highest.
+    With a ``start``, only the test moves the clocks, and ``uniform`` always returns ``high``.
+    Without a ``start``, real time passes as well.
     """
 
     def __init__(self, start: datetime | None = None) -> None:
@@ -36,7 +37,7 @@ class Clock(Runtime):
 
     @property
     def offset(self) -> float:
-        """By how many seconds the wall clock was set in all."""
+        """The sum of all seconds by which ``set_by`` has set the wall clock."""
         return self._set
 
     def pass_(self, seconds: float) -> None:
@@ -44,7 +45,7 @@ class Clock(Runtime):
         self._passed += seconds
 
     def set_by(self, seconds: float) -> None:
-        """Set the wall clock alone, as a person does."""
+        """Set the wall clock but not the monotonic clock, as a person does."""
         self._set += seconds
 
 

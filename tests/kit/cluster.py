@@ -1,4 +1,4 @@
-"""What a cluster reports: conditions, deployments, and a history to compare commits in."""
+"""Status objects as a cluster reports them, and a stand-in for the Git history."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 
 class Letters:
-    """A history whose commits are named by letters, in order.
+    """A stand-in for the Git history; its commits are named by letters, in alphabetical order.
 
-    ``changing`` lists the changes that commits make: (commit, path).
+    ``changing`` lists the changes that commits make, each as (commit, path).
     """
 
     def __init__(self, changing: Iterable[tuple[str, str]] = ()) -> None:

@@ -18,7 +18,7 @@ def skeleton(gitops: str = "flux") -> Mapping[str, str]:
 
 
 def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, str]:
-    """Return the skeleton's configuration, with files replaced or, for ``None``, left out."""
+    """Return the skeleton's configuration with the ``changed`` files; ``None`` removes a file."""
     files: dict[str, str | None] = {
         path: text for path, text in skeleton().items() if path.split("/")[0] in CONFIG_ROOTS
     }
@@ -27,14 +27,14 @@ def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, 
 
 
 def edited(path: str, old: str, new: str) -> dict[str, str]:
-    """Return one file of the skeleton with the first ``old`` in it replaced by ``new``."""
+    """Return ``{path: text}`` of a skeleton file in which ``new`` replaces the first ``old``."""
     text = skeleton()[path]
     assert old in text, f"{path} does not contain {old!r}"
     return {path: text.replace(old, new, 1)}
 
 
 def brokers(*nodes: str) -> dict[str, str]:
-    """Return an ``inventory/brokers.yaml`` with a broker on each of ``nodes``."""
+    """Return ``{path: text}`` of ``inventory/brokers.yaml`` with a broker on each of ``nodes``."""
     entries = [{"node": node, "host": f"broker-{node}"} for node in nodes]
     head = {"apiVersion": "demandops/v1", "kind": "Brokers"}
     return {"inventory/brokers.yaml": yaml.safe_dump(head | {"brokers": entries})}

@@ -1,4 +1,4 @@
-"""Demands for connections, in a short form, and nodes that can carry them."""
+"""Short-form demands for connections, and states whose nodes can carry the connections."""
 
 from __future__ import annotations
 
@@ -28,7 +28,13 @@ NO_BROKERS = yaml.safe_dump({"apiVersion": "demandops/v1", "kind": "Brokers", "b
 def state(
     images: str = ZENOH_IMAGE + ROS_IMAGE, *, brokers: bool = True, **nodes: dict[str, Any]
 ) -> State:
-    """Return a state without claims, in which some nodes of the skeleton have more fields."""
+    """Return a state without claims, in which some nodes of the skeleton have more fields.
+
+    Args:
+        images: lines to append to ``registry/images.yaml``.
+        brokers: whether the inventory has the skeleton's brokers or none.
+        nodes: the further fields of each node, by its id.
+    """
     inventory = plain_yaml.load(skeleton()["inventory/nodes.yaml"])
     for node in inventory["nodes"]:
         node.update(deepcopy(nodes.get(node["id"], {})))
@@ -48,10 +54,10 @@ def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any
 
 
 def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a ``Demand`` document for connections in short form.
+    """Return the ``Demand`` document for a short-form demand of connections.
 
-    A connection has ``topics`` as the ledger writes them, its ``type`` by name, and may name its
-    ``requesters``; the first one's requesters make the demand.
+    A short-form connection has its ``topics`` as the ledger writes them and its ``type`` by name.
+    It may list ``requesters``. The whole demand gets the requesters of the first connection.
     """
     connections = []
     for item in demand["connections"]:

@@ -19,12 +19,12 @@ SOURCES = {
 
 
 def demand(**fields: Any) -> dict[str, Any]:
-    """A demand that names the entities of an event."""
+    """Return the demand template of a rule; it names the entities of the event."""
     return {"demand": "{rule}/{entity}", "requesters": ["{entity}"]} | fields
 
 
 def rule(name: str, **fields: Any) -> dict[str, Any]:
-    """A rule with a condition, and a demand unless one is given."""
+    """Return a rule; it gets a default ``demand`` unless it has a ``deploymentRequest``."""
     subjects = ["{rule}"]
     subjects += [] if {"count", "schedule"} & set(fields) else ["{entity}"]
     subjects += ["{other}"] if "together" in fields else []
@@ -33,7 +33,7 @@ def rule(name: str, **fields: Any) -> dict[str, Any]:
 
 
 def text_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> str:
-    """The text of a file with some rules."""
+    """Return the text of a rule file."""
     head = {"apiVersion": "demandops/v1", "kind": "DetectorRules"}
     return strict_yaml.dump({**head, "sources": sources, "rules": [*rules]})
 
@@ -47,7 +47,7 @@ def at(time: float, entity: str, x: float, y: float = 0.0, source: str = "cars")
 
 
 class Run:
-    """An engine and its state."""
+    """An event engine and its current state."""
 
     def __init__(self, *rules: dict[str, Any], now: float = 0.0) -> None:
         self.engine = EventEngine(file_of(*rules))
@@ -58,7 +58,7 @@ class Run:
         return [*events]
 
     def told(self, now: float, *observations: Observation) -> list[tuple[Any, ...]]:
-        """The events of a step in short: rule, entities, start or stop, time."""
+        """Make a step; return each event as (rule, entities, start or stop, time)."""
         return [
             (event.rule, " ".join(event.subjects), "start" if event.starts else "stop", event.at)
             for event in self.step(now, *observations)

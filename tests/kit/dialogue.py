@@ -38,7 +38,7 @@ class Dialogue:
         os.close(self._master)
 
     def read_until(self, wanted: str) -> None:
-        """Read what is printed until it has this text."""
+        """Read output until it contains ``wanted``; fail if it does not in time."""
         end = time.monotonic() + PATIENCE_S
         while wanted not in self.text:
             assert self._read(end - time.monotonic()), f"no {wanted!r} in:\n{self.text}"
@@ -49,10 +49,10 @@ class Dialogue:
         os.write(self._master, self._typed)
 
     def end(self) -> int:
-        """Read the rest; return the exit code.
+        """Read until the command ends; return its exit code.
 
-        What was typed is typed again after some seconds of silence, as people do: Python can miss a
-        signal that comes just before it begins to read.
+        After some seconds of silence, the last typed text is typed again, as people do: Python can
+        miss a signal that arrives just before it begins to read.
         """
         end = time.monotonic() + PATIENCE_S
         while self._read(_SILENCE_S) or self._runs_silently():
@@ -62,14 +62,14 @@ class Dialogue:
         return os.waitstatus_to_exitcode(status)
 
     def _runs_silently(self) -> bool:
-        """Return whether nothing came although it runs; type again then."""
+        """Return whether the command still runs; if it is silent, type the last text again."""
         if select.select([self._master], [], [], 0)[0]:
             return self._read(0)
         os.write(self._master, self._typed)
         return True
 
     def _read(self, wait_s: float) -> bool:
-        """Read what is there; return False at the end, or if nothing came in time."""
+        """Append new output to ``text``; return False if it has ended, or if none came in time."""
         if not select.select([self._master], [], [], max(wait_s, 0))[0]:
             return False
         try:

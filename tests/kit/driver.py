@@ -1,10 +1,11 @@
 """A program that runs generators for tests to kill; each run reports its events as lines of JSON.
 
-It imports the modules once and forks for every run. It reads a run from standard input, as one
-line of JSON. A run has lanes of demands: each lane is a client that waits for an answer before it
-sends its next demand. With an opening demand the lanes start while the worker is busy with it, so
-that their first demands become one batch. ``die_at`` (``<point>`` or ``<point>:<n>``) ends the
-process with SIGKILL when it reaches the point for the n-th time.
+The program imports the modules once and forks for every run. It reads each run from standard input,
+as one line of JSON. A run has lanes of demands. Each lane is a client that waits for an answer
+before it sends its next demand. A run may have an opening demand: the lanes start when the worker
+has admitted it and is busy with it, so that their first demands become one batch. ``die_at``
+(``<point>`` or ``<point>:<n>``) ends the process with SIGKILL when it reaches the point for the
+n-th time.
 """
 
 from __future__ import annotations
@@ -33,7 +34,10 @@ Demand = dict[str, Any]
 
 
 def tell(**event: object) -> None:
-    """Report an event as one line; it is shorter than a pipe's buffer, so it is never cut."""
+    """Report an event as one line on standard output, cut at 4000 characters.
+
+    A write of this size to a pipe is atomic, so lines of different threads do not mix.
+    """
     os.write(1, (json.dumps(event)[:4000] + "\n").encode())
 
 
@@ -43,7 +47,7 @@ def die() -> None:
 
 
 class _At:
-    """Kills the process at the n-th call."""
+    """A callable that kills this process when it is called for the n-th time."""
 
     def __init__(self, times: int, last_act: Callable[[], object]) -> None:
         self._left, self._last_act = times, last_act
@@ -80,7 +84,7 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""The calls that each point follows (true) or precedes (false)."""
+"""For each point: whether it follows (true) or precedes (false) its calls, and these calls."""
 
 
 def arm(where: str, address: str) -> None:
@@ -98,12 +102,12 @@ def arm(where: str, address: str) -> None:
 class Lanes:
     """Clients that each send a demand when the one before it is answered.
 
-    A demand marked ``withdraw`` is withdrawn when the next one is admitted.
+    A demand marked ``withdraw`` is withdrawn as soon as a demand of any lane is admitted.
     """
 
     @staticmethod
     def withdrawn() -> None:
-        """Do nothing; :func:`arm` replaces it to die right after a withdrawal."""
+        """Do nothing; :func:`arm` replaces this method to kill the process after a withdrawal."""
 
     def __init__(self, generator: Generator, lanes: list[list[Demand]]) -> None:
         self._generator = generator
@@ -180,7 +184,7 @@ def run(plan: dict[str, Any]) -> None:
 
 def main() -> None:
     logging.basicConfig(level=logging.INFO, stream=sys.stderr)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for the dead
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for ended runs
     for line in sys.stdin:
         if os.fork():
             continue

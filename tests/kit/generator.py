@@ -29,7 +29,7 @@ def running(address: str | Path, **options: Any) -> Iterator[Generator]:
 
 
 def restart(address: str | Path) -> bool:
-    """Run a generator on what others left in their journals; return whether all is published."""
+    """Start and close a generator; return whether it published all that journals still held."""
     return Generator(str(address)).close(timeout=PATIENCE_S)
 
 
@@ -43,7 +43,7 @@ def book(generator: Generator, *goals: Goal) -> list[Receipt]:
 
 
 class Gate:
-    """A listener that keeps the worker busy at a stage of its demand until ``open`` is set."""
+    """A listener that blocks the worker at a stage of a demand until ``open`` is set."""
 
     def __init__(self, stage: str = "admitted") -> None:
         self._stage = stage

@@ -1,4 +1,4 @@
-"""The rig's smart-HTTP Git server in the test's own process, with faults that tests switch on."""
+"""The Git server of ``tests.e2e.rig`` in the test's own process, with faults to switch on."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ class Faults:
     """How many of the next pushes to refuse with ``status``."""
     status: int = 503
     cut_answers: int = 0
-    """How many of the next pushes to carry out, but cut off before the answer."""
+    """How many of the next pushes to carry out without an answer."""
     away_after_cut: bool = False
-    """Whether such a cut sets ``away``."""
+    """Whether a push without an answer also sets ``away``."""
     hang: threading.Event | None = None
-    """The event that each request waits for first."""
+    """If set, each request first waits for this event."""
     cuts: Callable[[], bool] = lambda: False
     """Called before each request is carried out and before its answer; true cuts the connection."""
 
 
 @dataclass
 class Server:
-    """A running server: its URL, its faults, and counts of what came."""
+    """A running server: its URL, its faults, and counts of pushes, refusals and cuts."""
 
     url: str
     faults: Faults = field(default_factory=Faults)
     taken: int = 0
-    """The pushes that were carried out, even if their answers were cut off."""
+    """How many pushes were carried out, even if their answers were cut off."""
     refused: int = 0
-    """The requests that a fault answered with an error."""
+    """How many requests were answered with an error because of a fault."""
     cut: int = 0
-    """The connections that ``cuts`` cut."""
+    """How many connections ``Faults.cuts`` has cut."""
 
 
 @contextmanager
@@ -90,7 +90,7 @@ class _Handler(githttp.Handler):
         to_client, self.wfile = self.wfile, io.BytesIO()
         self.run_backend(path, query)
         answer, self.wfile = self.wfile.getvalue(), to_client
-        # a push of nothing but a flush ("0000") is git asking whether it may
+        # before a push, git asks whether it may by sending only a flush ("0000")
         if push and len(self._received) > 4:
             with _LOCK:
                 server.taken += 1

@@ -1,4 +1,4 @@
-"""Goals of the reference's action and demands in their own format, as plain data."""
+"""Requests as plain data: goals of the reference's action and demands in DemandOps' own format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Goal = dict[str, Any]
 Item = dict[str, Any]
 
 Topic = tuple[str, str]
-"""Topic name and the node that publishes it."""
+"""A topic's name and the node that publishes the topic."""
 
 APP = "edge/object_detection_fusion"
 CLOUD: Topic = ("/vehicles/vehicle00/drivers/lidar/pointcloud", "vehicle00")
@@ -86,7 +86,7 @@ def goal(
     id: str = "request",
     shutdown: bool = False,
 ) -> Goal:
-    """Return a goal."""
+    """Return a goal of the reference's action."""
     return {
         "id": id,
         "apps": list(apps),
@@ -101,7 +101,11 @@ def perception(**changed: Any) -> Goal:
 
 
 def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None) -> Goal:
-    """Return demand ``number``: its own claims on a shared application and connection."""
+    """Return demand ``number``.
+
+    Its requester ``user<number>`` belongs to this demand alone. Its application and its connection
+    are shared with other demands.
+    """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
     who = [f"user{number}", "station00"]
     ego = (f"/vehicles/{name}/ego_data", name)
@@ -123,7 +127,7 @@ def impossible() -> Goal:
 
 
 def link(number: int, **more: Any) -> Goal:
-    """Return a goal of one connection; every name in it has the number."""
+    """Return a goal of one connection; its ids, requester and topic contain ``number``."""
     item = connection(f"c{number}", who=[f"r{number}"], topics=[f"/t{number}"], broker="")
     return goal([], [item | more], id=f"request{number}")
 

@@ -1,12 +1,14 @@
 """The golden cases: requests played in memory on a state repo, and what they must render.
 
 ``tests/golden/<case>/requests/*.yaml`` are played in order. ``expected/<step>/`` holds the files
-that a step changes, as real files that a reviewer and `kubectl` can read, and in ``DELETED`` the
-paths that it deletes. The first step, ``0-start``, is what `init` renders. A case may lay files
-over the skeleton's in ``state-repo/``.
+that a step writes, as real files that a reviewer and `kubectl` can read. The file ``DELETED`` in it
+lists the paths that the step deletes. The first step, ``0-start``, is what `init` renders. The
+files in a case's ``state-repo/`` replace or extend the skeleton's files.
 
-The experiment is stored whole. Every other case stores how its start differs from the
-experiment's; a case in ``FOLLOWING`` stores at every step how it differs from the experiment.
+The case ``experiment`` stores its whole start. Every other case stores how its start differs from
+the start of ``experiment``. A later step stores how it differs from the step before. A case in
+``FOLLOWING`` plays the requests of ``experiment``; its steps store how their changes differ from
+the changes there.
 """
 
 from __future__ import annotations
@@ -81,7 +83,7 @@ def rendered(case: str) -> Mapping[str, Files]:
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    """Return the files below ``expected/``, by step."""
+    """Return the files below ``expected/`` as step → path → text."""
     expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
     for path in sorted(expected.rglob("*")):
@@ -117,7 +119,7 @@ def to_store(case: str) -> dict[str, dict[str, str]]:
 def _base(
     case: str, step: str, before: Files, steps_of: Callable[[str], Mapping[str, Files]]
 ) -> dict[str, str]:
-    """Return the files that a stored change applies to."""
+    """Return the files to which the stored change of a step is applied."""
     if case == EXPERIMENT or (step != START and case not in FOLLOWING):
         return dict(before)
     steps: dict[str, Files] = {"": {}, **steps_of(EXPERIMENT)}

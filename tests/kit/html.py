@@ -1,4 +1,4 @@
-"""Pages, read as a browser reads them."""
+"""HTML pages as lists of elements, so that tests can check what a person reads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _APART = {"td", "th", "p", "li", "dt", "dd", "h1", "h2", "h3", "summary"}
 
 @dataclass
 class Element:
-    """An element, its attributes, and the text in it and below."""
+    """An element: its attributes, its text with its descendants' text, its ancestors' tags."""
 
     tag: str
     attributes: dict[str, str]
@@ -57,12 +57,12 @@ class Page(HTMLParser):
         return [element for element in self.elements if element.tag == tag]
 
     def texts(self, tag: str) -> list[str]:
-        """Return the text of each such element, with single spaces."""
+        """Return the text of each element with this tag; white space becomes single spaces."""
         return [" ".join(element.text.split()) for element in self.all(tag)]
 
     @property
     def text(self) -> str:
-        """What a person reads in the main part, with single spaces."""
+        """The text of the ``main`` element; white space becomes single spaces."""
         (main,) = self.texts("main")
         return main
 

@@ -70,7 +70,7 @@ def running(server: ThreadingHTTPServer) -> Iterator[str]:
 
 @contextmanager
 def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
-    """Record calls and answer them, one at a time, for the length of a block."""
+    """Run an HTTP server for the length of a block; it records and answers one call at a time."""
     served = Server() if answer is None else Server(answer)
     lock = threading.Lock()
 
@@ -98,7 +98,7 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
 
 def kubeconfig(folder: Path, url: str) -> Path:
-    """Write a kubeconfig for an API server."""
+    """Write a kubeconfig for the API server at ``url``; return its path."""
     config = {
         "apiVersion": "v1",
         "kind": "Config",

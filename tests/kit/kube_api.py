@@ -18,7 +18,7 @@ _BEAT_S = 0.5
 
 
 class KubeApi:
-    """The objects of one cluster, by plural, namespace and name."""
+    """The objects of one cluster, by the plural name of their kind, namespace and name."""
 
     def __init__(self) -> None:
         self.url = ""
@@ -44,7 +44,10 @@ class KubeApi:
             return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
 
     def events(self, plural: str, namespace: str, since: int) -> Iterator[Item]:
-        """Yield each change since a version."""
+        """Yield the changes of a kind of objects in a namespace until the server is closed.
+
+        ``since`` is the version after which the changes begin.
+        """
         while not self.closed:
             with self._changed:
                 if len(self._log) == since:
@@ -55,21 +58,21 @@ class KubeApi:
                     yield {"type": "MODIFIED", "object": item}
 
     def flux(self, namespace: str, domain: str, commit: str) -> None:
-        """Say that Flux has applied a commit to an access domain."""
+        """Report that Flux has applied a commit to an access domain."""
         revision = f"main@sha1:{commit}"
         ready = {"type": "Ready", "status": "True"}
         status = {"lastAppliedRevision": revision, "conditions": [ready]}
         self.put("kustomizations", namespace, domain, status)
 
     def service(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
-        """Say that a Helm release is ready, or why it is not."""
+        """Report a Helm release as ready, or as failed if there is a ``fault``."""
         ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
         ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"
         status = {"observedGeneration": 1, "conditions": [ready]}
         self.put("helmreleases", namespace, name, status)
 
     def deployment(self, namespace: str, name: str, available: int = 1) -> None:
-        """Say how many of a Deployment's one replica are available."""
+        """Report how many replicas of a Deployment are available; one is desired."""
         status = {"observedGeneration": 1, "updatedReplicas": 1, "availableReplicas": available}
         self.put("deployments", namespace, name, status, spec={"replicas": 1})
 

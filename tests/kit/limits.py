@@ -11,7 +11,7 @@ from contextlib import contextmanager
 def files_end_at(size: int) -> Iterator[None]:
     """Keep this process from writing files beyond a size, for the length of a block."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))  # Python ignores its signal
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))  # Python ignores SIGXFSZ
     try:
         yield
     finally:

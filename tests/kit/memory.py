@@ -34,7 +34,7 @@ def _unchanged() -> State:
 
 
 class MemoryRepo:
-    """A state repo in memory; each decision changes what the next one finds."""
+    """A state repo in memory; each committed decision is the basis of the next one."""
 
     def __init__(
         self,
@@ -83,7 +83,10 @@ class MemoryRepo:
         return decision
 
     def scale_down(self, now: datetime) -> list[str]:
-        """Take replicas away whose time is over, as the generator does; return the releases."""
+        """Remove the replicas whose time to be kept is over, as the generator does.
+
+        Return the names of the changed releases.
+        """
         names = []
         for instance in self.state.ledger.kept.due(now):
             self.state, change = scale_down(self.state, instance, now, self.files.get)
@@ -103,7 +106,7 @@ class MemoryRepo:
             return refusal
 
     def take_all(self, goals: Iterable[Goal]) -> list[str]:
-        """Take goals a minute apart, and return the outcomes."""
+        """Send goals a minute apart; return the outcome of each in one word."""
         return [
             outcome(self.take(goal, self.now + timedelta(minutes=minute)))
             for minute, goal in enumerate(goals)
@@ -125,7 +128,7 @@ class MemoryRepo:
         return [f"{fault.field}: {fault.message}" for fault in refusal.faults]
 
     def bookkeeping(self) -> dict[str, Any]:
-        """Return the bookkeeping as plain data, with an empty commit."""
+        """Return the bookkeeping as plain data; the commit's id in it is empty."""
         return as_data(bookkeeping(self.state), "")
 
     def books(self) -> dict[str, Any]:
@@ -134,11 +137,11 @@ class MemoryRepo:
         return {"services": data["services"], "connections": data["connections"]}
 
     def view(self) -> dict[str, Any]:
-        """Return the bookkeeping in the words of ``tests/model``."""
+        """Return the bookkeeping in the form of ``tests.model.books``."""
         return in_model_words(self.bookkeeping(), object_lists(self.below("clusters").values()))
 
     def below(self, *roots: str) -> dict[str, str]:
-        """Return the files of some top folders, without READMEs."""
+        """Return the files below these top-level folders, without READMEs."""
         return {
             path: text
             for path, text in self.files.items()
@@ -175,7 +178,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_booked(path: str) -> bool:
-    """Return whether demands write the file: not what people write, nor ended overrides."""
+    """Return whether a path is that of a claim, shutdowns, kept replicas or a waiting demand."""
     roots = (
         recent_shutdowns.SHUTDOWNS_ROOT,
         kept_replicas.REPLICAS_ROOT,
@@ -185,7 +188,7 @@ def is_booked(path: str) -> bool:
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
-    """Return the ledger that the files alone give."""
+    """Return the ledger that the ledger files among ``files`` describe."""
     booked = {path: text for path, text in files.items() if is_booked(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)

@@ -1,4 +1,4 @@
-"""Every mistake of form that a document can have at one place, and what its JSON schema says."""
+"""Documents with one mistake of form each, and what a JSON schema says about documents."""
 
 from __future__ import annotations
 
@@ -32,9 +32,11 @@ _SAME = {str: "text", bool: "a truth", int: "a number", list: "a list", dict: "a
 
 
 class Mutation(NamedTuple):
-    """A document that is changed at one place.
+    """A copy of a document with one mistake.
 
-    ``value`` is what was there before. ``new_place`` is where a misspelt field is now.
+    ``place`` is where the mistake is, ``kind`` says what it is, and ``value`` is what was at
+    ``place`` before. For a misspelt field, ``new_place`` has the new name; otherwise it equals
+    ``place``.
     """
 
     place: Place
@@ -44,11 +46,11 @@ class Mutation(NamedTuple):
     new_place: Place
 
     def is_at(self, field: str) -> bool:
-        """Return whether a fault's field is the place, contains it or is inside it."""
+        """Return whether a fault's field is the mistake's place, contains it or is inside it."""
         return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the names that were at the place, which references elsewhere may use."""
+        """Return the keys of the place and all texts in its old value; references may use them."""
         names = {str(part) for part in self.place}
         values = [self.value]
         while values:
@@ -62,10 +64,11 @@ class Mutation(NamedTuple):
 
 
 def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
-    """Yield the document with the mistakes of each place; ``limits`` replace whole numbers.
+    """Yield a mutation for each mistake at each place of a document.
 
-    A place gets one value of a wrong type and one control character; places take turns at which
-    (with ``DEMANDOPS_EXAMPLES`` each gets all).
+    ``limits`` are tried in place of whole numbers. To save time, a place gets only one value of a
+    wrong type, and a text only one control character; the next place gets another one. With
+    ``DEMANDOPS_EXAMPLES`` above 1, each place gets all of them.
     """
     for turn, place in enumerate(places(document)):
         value = _at(document, place)
@@ -102,13 +105,13 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 
 
 def _one(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
-    """Return one of the mistakes, or all of them where more examples are wanted."""
+    """Return one mistake, a different one each turn; all if ``DEMANDOPS_EXAMPLES`` is above 1."""
     kinds = [*mistakes] if TIMES > 1 else [[*mistakes][turn % len(mistakes)]]
     return {kind: mistakes[kind] for kind in kinds}
 
 
 def places(document: Any, place: Place = ()) -> Iterator[Place]:
-    """Yield the place of every value below the top."""
+    """Yield the place of every value in a document, at any depth."""
     entries: Any = ()
     if isinstance(document, dict):
         entries = document.items()
@@ -150,8 +153,10 @@ def problem(
 ) -> str:
     """Return what is wrong with the faults of a mutation, or an empty string.
 
-    What the schema forbids has a fault at its place, and so has a control character in any text.
-    Every fault elsewhere quotes a name from that place, so it stands at a reference.
+    There must be a fault at the mutation's place if the schema forbids the mutated document, or if
+    a text got a control character. Control characters may be in the ``free`` fields. A fault at
+    another place must concern a reference, so it must quote a name from the mutation's place. No
+    fault at the mutation's place may contain words of Python.
     """
     place = path(mutation.place)
     here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
@@ -186,7 +191,7 @@ class Form:
         return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
 
     def limits(self) -> list[int]:
-        """Return the whole numbers just outside the limits of fields."""
+        """Return the whole numbers just below a field's minimum or just above its maximum."""
         limits = set()
         for part in self._parts():
             for field in part["properties"].values():
@@ -211,7 +216,7 @@ class Form:
         return [part for part in parts if "properties" in part]
 
     def fields_in(self, document: Any) -> set[str]:
-        """Return the fields that a document gives a value."""
+        """Return the fields that a document uses, as ``Node.id``."""
         return set(self._used(document, self._schema))
 
     def _used(self, value: Any, schema: Schema) -> Iterator[str]:

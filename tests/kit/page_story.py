@@ -1,4 +1,4 @@
-"""A fleet in the middle of a day, for tests of the page: something runs, something does not."""
+"""A running fleet for tests of the web page, with healthy services and one that fails."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ replicas: 2
 
 
 def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
-    """A demand for detection on a vehicle's point cloud, which lasts as long as its lease."""
+    """Return a demand with a lease for a connection from a vehicle to the cloud."""
     return {
         "apiVersion": "demandops/v1",
         "kind": "Demand",
@@ -66,14 +66,14 @@ def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
 
 
 def released(id: str, vehicle: str) -> Goal:
-    """The end of such a demand."""
+    """Return the release of a demand that :func:`leased` returned."""
     goal = leased(id, vehicle) | {"operation": "release"}
     return {key: value for key, value in goal.items() if key not in ("lease", "connections")}
 
 
 @dataclass
 class Story:
-    """The fleet: its state repo, generator and cluster, a person, and the page."""
+    """The fleet: its state repo, generator and API server, a person, and the web page."""
 
     bare: Path
     generator: Generator
@@ -87,7 +87,10 @@ class Story:
         return self.server.url.rstrip("/")
 
     def settle(self, *, mended: bool = False) -> None:
-        """Have the cluster apply the newest commit; one release fails, unless it is mended."""
+        """Have the API server report that the cluster has applied the newest commit.
+
+        The release ``FAILING`` is reported as failed unless ``mended`` is true.
+        """
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)

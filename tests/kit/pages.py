@@ -1,14 +1,14 @@
-"""The blocks of a documentation page, and how its commands are run.
+"""The code blocks of a documentation page, and how the commands in them are run.
 
 A comment before a block says what a test does with it::
 
     <!-- run -->                  the commands are run, in the order of the page, in one folder
-    <!-- tested by tests/… -->    a test of its own runs the like, or needs a cluster
+    <!-- tested by tests/… -->    another test covers the commands, or they need a cluster
     <!-- not run: WHY -->
 
 A block with a title (```yaml title="PATH") is a file that the reader writes. In a `console` block,
-the lines after a command are what it prints. `…` stands for anything, on a line of its own for
-any lines.
+the lines after a command are its expected output. There `…` stands for any text in a line; alone on
+a line, it stands for any number of lines.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Block:
 
     @property
     def has_commands(self) -> bool:
-        """Whether the reader is to type it."""
+        """Whether the block contains shell commands for the reader to type."""
         if self.language:
             return self.language in _SHELL
         return any(_COMMAND.match(line) for line in self.text.splitlines())
@@ -76,7 +76,11 @@ def blocks(markdown: str) -> Iterator[Block]:
 
 
 def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
-    """Write the files of a page and run its commands; raise an AssertionError at a difference."""
+    """Write the files of a page and run its commands.
+
+    Raise an AssertionError if a command prints something else than the page shows. A command whose
+    output the page does not show must succeed.
+    """
     state = folder / ".state"
     state.write_text(f"cd {folder}\n")
     for block in blocks(markdown):
@@ -95,7 +99,7 @@ def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
 
 
 def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
-    """Yield the commands of a block, and what each prints (None: it must not fail)."""
+    """Yield each command of a block and the output that the page shows for it, if any."""
     if block.language != "console":
         yield block.text, None
         return
@@ -107,7 +111,7 @@ def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
 def _ran(
     command: str, state: Path, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run commands where the last ones ended, with what they exported."""
+    """Run a command in the folder and with the exported variables of the command before."""
     script = (
         f"set -e\n. {state}\n"
         f'trap \'{{ printf "cd %q\\n" "$PWD"; export -p; }} >{state}\' EXIT\n{command}\n'
@@ -124,7 +128,7 @@ def _ran(
 
 
 def _pattern(expected: str) -> re.Pattern[str]:
-    """Return the pattern of what is printed. How many spaces separate words does not count."""
+    """Return a pattern for the expected output; it accepts any number of spaces between words."""
     lines = []
     for line in expected.splitlines():
         words = [".*?".join(map(re.escape, word.split("…"))) for word in line.split()]

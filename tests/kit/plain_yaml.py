@@ -1,4 +1,4 @@
-"""YAML as plain data, by libyaml where it is there: tests read much of it."""
+"""Read YAML as plain data, with the fast libyaml if it is installed."""
 
 from __future__ import annotations
 
@@ -10,5 +10,5 @@ FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def load(text: str) -> Any:
-    """Return the data of the one document in a text."""
+    """Return the plain data of a text that holds one YAML document."""
     return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader

@@ -24,7 +24,7 @@ _SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
 
 
 def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any]:
-    """Return a demand for a run's lane."""
+    """Return a demand in the form that the lanes of a run take."""
     return {"name": name, "goal": made, "operation": operation or f"op-{name}"}
 
 
@@ -37,10 +37,13 @@ class Told:
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
     waits: dict[str, float] = field(default_factory=dict)
-    """Seconds from sending a demand to its answer."""
+    """Seconds from sending each demand to its answer, by the demand's name."""
     first: float = 0.0
     last: float = 0.0
-    """When the first demand was sent and the last was answered, on this machine's clock."""
+    """``first``: when the first demand was sent; ``last``: when the last event came.
+
+    Both are times of the monotonic clock.
+    """
 
 
 class Run:
@@ -53,7 +56,7 @@ class Run:
         self.pid = 0
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Read events until the process ends; return them all."""
+        """Read and return events until the process ends; call ``on_ready`` when it is ready."""
         sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:

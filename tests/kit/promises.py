@@ -1,4 +1,4 @@
-"""Random demands and joins with leases, and claims in the words of the model of leases."""
+"""Random requests with leases, and claims in the form of the model of leases."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEASES = (None, 10, 60, 90)
 
 
 class Maker:
-    """Makes random requests with few demands, requesters and subjects, so that they often meet."""
+    """Makes random requests; few demands, requesters and subjects make them overlap often."""
 
     def __init__(self, random: Random) -> None:
         self._random = random
@@ -73,7 +73,7 @@ class Maker:
         return {
             "id": id,
             "type": "object-detection-fusion",
-            # mostly the same: else all contradict each other
+            # mostly the same node: else all demands contradict each other
             "node": self._random.choice(["edge", "edge", "edge", "cloud"]),
             "connect": "none",
             "inputs": {"ego_data": topics or [{"topic": "/ego3", "source": "vehicle00"}]},
@@ -118,13 +118,13 @@ MESSAGES = {
 
 
 def name_of(claim: Claim) -> Name:
-    """Return the name of a claim in the model."""
+    """Return the name that the model of leases gives to a claim."""
     demand = MESSAGES.get(claim.demand, claim.demand)
     return demand, (claim.subject.kind.value, claim.subject.id)
 
 
 def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
-    """Return what claims hold, in the model's words."""
+    """Return what each claim holds and for whom, in the form of ``Promises.claims``."""
     found = {}
     for claim in ledger:
         what: dict[str, Any]

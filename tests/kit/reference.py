@@ -1,8 +1,8 @@
-"""A stand-in for the reference: the custom resources and operators' files that goals lead to.
+"""A stand-in for the reference: it turns goals into custom resources and operators' files.
 
-It is our own code, with the reference's names and formats. It was compared with the operators
-themselves, which ran on a stand-in for their cluster's API: after random goals, all files were
-equal. The operators' oddities are here too: see :meth:`Reference._note`.
+It is our own code, with the reference's names and formats. It was compared with the real operators,
+which ran on a stand-in for their cluster's API: after random goals, all files were equal. It
+repeats the operators' oddities too: see :meth:`Reference._note`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Reference:
             self._apply(*_of_connection(connection, shutdown))
 
     def _apply(self, name: str, kind: str, spec: Item) -> None:
-        """Create a resource, or merge a patch into it; its operator notes a change."""
+        """Create a resource, or merge a patch into it; its operator records any change."""
         known = self.resources.get(name)
         merged = _merged(known["spec"], spec) if known else copy.deepcopy(spec)
         if known and merged == known["spec"]:
@@ -69,9 +69,9 @@ class Reference:
     def _note(self, name: str, kind: str, request: Item, *, created: bool) -> None:
         """Write the versioning, then the bookkeeping.
 
-        For a new connection or detection, the bookkeeping and the first request share one list. So
-        the first request in the versioning file shows the bookkeeping at the time that the file was
-        written.
+        The operators have an oddity: for a new connection or detection, the bookkeeping and the
+        first request share one list of requesters. So in the versioning file, the first request
+        shows the requesters that the bookkeeping had when the file was written.
         """
         self._versions[kind].setdefault(name, {})[str(self._version)] = request
         self._saved[kind] = copy.deepcopy(self._versions[kind])
@@ -95,7 +95,7 @@ class Reference:
             del self.resources[name], book[name]
 
     def texts(self) -> dict[str, str]:
-        """Return the text of each file, and of the custom resources, by name."""
+        """Return the texts by name: the operators' files, and the custom resources as one file."""
         files = {}
         for kind, operator in OPERATORS.items():
             files[f"{operator}_bookkeeping.yml"] = yaml.dump(self.books[kind])

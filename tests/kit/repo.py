@@ -1,6 +1,7 @@
-"""Real state repos: a bare one, a person with a clone, and the history.
+"""State repos in Git for tests: a bare repository, a person with a clone, and the history.
 
-git itself reads the history, so that no test trusts the generator's own reading of it.
+Commits and files are read with git and pygit2, not with the generator's own code, so that tests do
+not depend on that code.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ GIT_ENVIRONMENT = NO_GIT_CONFIG | {
 POLICY = "policy/access-domains.yaml"
 
 FORGER = (GENERATOR_NAME, GENERATOR_EMAIL, 1_770_000_000)
-"""A person who commits in the generator's name; only a signature can show that."""
+"""Author data of a person who uses the generator's name; only a signature shows the forgery."""
 
 
 def init(path: Path, *, bare: bool = True) -> Path:
@@ -69,7 +70,7 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
 def write_tree(
     repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.Oid:
-    """Write ``base`` with ``files`` changed, as the program does, and return the tree."""
+    """Write ``base`` with ``files`` changed, as the program does; return the id of the new tree."""
     objects = NewObjects(repo)
     tree = trees.write(objects, base, files)
     with objects.packed(tree):
@@ -91,7 +92,7 @@ class GitRepo:
 
     @property
     def tip(self) -> str:
-        """The newest commit."""
+        """The id of the newest commit on main."""
         return tip(self.path)
 
     def __fspath__(self) -> str:
@@ -103,12 +104,12 @@ class GitRepo:
         return [commit.message for commit in repo.walk(self.tip)]
 
     def files(self, under: str = "", revision: str = "main") -> dict[str, str]:
-        """Return path → text of every file at a commit, below one folder or all."""
+        """Return path → text of the files at a revision whose paths start with ``under``."""
         repo, index = _index(self.path, revision)
         return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
 
     def manifests(self) -> dict[str, str]:
-        """Return what a GitOps controller reads."""
+        """Return path → text of the YAML files that a GitOps controller reads."""
         return {p: text for p, text in self.files("clusters/").items() if p.endswith(".yaml")}
 
     def commit(
@@ -117,7 +118,7 @@ class GitRepo:
         text: str = "By hand\n",
         who: tuple[str, str, int] = ("A person", "person@example.org", 1_770_000_000),
     ) -> str:
-        """Commit as a forge's web page does, with no clone, and return the commit."""
+        """Commit in the bare repository, as a forge's web page does; return the commit's id."""
         parent = self.tip
         repo, index = _index(self.path, parent)
         for path, new in changed.items():
@@ -149,7 +150,7 @@ class Person:
         self._git("reset", "--quiet", "--hard", "origin/main")
 
     def read(self, path: str) -> str:
-        """Return a file of the newest main."""
+        """Return the text of a file on the newest main."""
         return GitRepo(self.bare).files()[path]
 
     def change(
@@ -161,12 +162,12 @@ class Person:
         """Commit ``files`` (``None``: remove) on the newest main; return the commit."""
         who = who or ("Petra Platform", "petra@example.org", int(time.time()))
         for _ in range(100):
-            with suppress(pygit2.GitError):  # a generator was first
+            with suppress(pygit2.GitError):  # a generator published first: try again
                 return GitRepo(self.bare).commit(files, f"{message}\n", who)
         raise AssertionError("main never stood still")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Commit ``files`` in the clone and push; fails if a generator pushed first."""
+        """Commit ``files`` in the clone, push, return the commit; fails if another push came."""
         self.fetch()
         for path, text in files.items():
             target = self.folder / path
@@ -187,11 +188,11 @@ class Person:
         return self.change({path: text.replace(old, new)})
 
     def override(self, **named: str | None) -> str:
-        """Merge ``name=text`` as overrides/<name>.yaml, or remove it; return the commit."""
+        """Commit ``overrides/<name>.yaml`` files; ``None`` removes one. Return the commit."""
         return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
 
     def policy(self, **changed: Any) -> None:
-        """Set these fields of every access domain."""
+        """Set the ``changed`` fields of every access domain."""
         data = plain_yaml.load(self.read(POLICY))
         for domain in data["domains"]:
             domain.update(changed)
@@ -242,7 +243,7 @@ _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
 
 
 def commits(repo: Path, revisions: str = "main") -> list[Commit]:
-    """Return the commits after the first one, oldest first."""
+    """Return the commits of ``revisions`` except the repository's first one, oldest first."""
     text = git(repo, "log", "--reverse", f"--format={_FORMAT}", revisions)
     found = []
     for record in text.split("\x1d"):
@@ -274,7 +275,7 @@ def away(repo: Path) -> Iterator[None]:
 
 
 def tip(repo: Path | str) -> str:
-    """Return the newest commit of main."""
+    """Return the id of the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
 
 
@@ -284,7 +285,7 @@ def read(repo: Path, path: str) -> str:
 
 
 def without_vehicle01(repo: Path) -> dict[str, str | None]:
-    """Return the inventory of nodes without vehicle01, which demand 1 uses."""
+    """Return ``{path: text}`` of the node inventory without vehicle01, which demand 1 needs."""
     path = "inventory/nodes.yaml"
     before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
     return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
@@ -312,7 +313,10 @@ def claims(repo: Path, needle: str = "") -> list[str]:
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the differing files of each commit that `demandops verify` rejects, by its summary."""
+    """Return the commits that `demandops verify` rejects: summary → differing files.
+
+    Only commits after ``since`` are verified, by default all after the first one.
+    """
     with reader.opened(str(repo)) as opened:
         commits = opened.revisions(f"{since or root(repo)}..")
         verdicts = opened.verify(commits)
@@ -320,16 +324,20 @@ def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]
 
 
 def root(repo: Path) -> str:
-    """Return the first commit."""
+    """Return the id of the first commit."""
     *_, first = pygit2.Repository(str(repo)).walk(tip(repo))
     return str(first.id)
 
 
 def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
-    """Check that objects are whole, history is one line, no demand counts twice, commits verify.
+    """Check objects, history and commits of a state repo.
+
+    The objects are whole, the history is linear, no operation is committed twice, and the commits
+    pass `demandops verify`.
 
     Args:
-        verify_last: how many commits to verify, because each takes a tenth of a second; 0: all.
+        verify_last: how many of the newest commits to verify, as each takes a tenth of a second;
+            0: all.
     """
     fsck = subprocess.run(
         ["git", "-C", str(repo), "fsck", "--strict", "--no-dangling", "--no-progress"],
@@ -347,10 +355,10 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
 
 
 FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
-"""A state repo that the first version wrote: render version 1, ledger ``demandops.ledger/v1``.
+"""The bundle of a state repo from the first version: render version 1, ``demandops.ledger/v1``.
 
-Three joins of the experiment (tag ``three-joins``), then two overrides, of which one ended, a join
-by another request, a demand with a lease, and a shutdown.
+It holds three joins of the experiment (tag ``three-joins``), two overrides, of which one ended, a
+join by another request, a demand with a lease, and a shutdown.
 """
 
 

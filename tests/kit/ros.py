@@ -49,7 +49,7 @@ _LAST = 100
 
 @contextmanager
 def reserved() -> Iterator[int]:
-    """Reserve a ROS domain that is not in use, and talk on this machine only."""
+    """Reserve an unused ROS domain and yield it; limit ROS to this machine."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     domains = list(range(1, _LAST + 1))
     random.shuffle(domains)
@@ -97,10 +97,10 @@ class Served:
         return data
 
     def wait_for(self, text: str, seconds: float = DEADLINE_S) -> None:
-        """Wait until the log has a text; if it does not come, say what the process does instead.
+        """Wait until the log contains ``text``; fail with :meth:`last_words` if it is late.
 
-        Time in which the process waits for a processor does not count: with much else to do, this
-        machine has let a start wait for half a minute that needs two seconds.
+        Time in which the process waits for a processor does not count. On a busy machine, a start
+        that needs two seconds once waited for half a minute.
         """
         began = time.monotonic()
         while True:
@@ -113,12 +113,15 @@ class Served:
             time.sleep(0.05)
 
     def last_words(self) -> str:
-        """Return how the process ended; or abort it, and return where it was, and its log."""
+        """Return how the process ended, and its log.
+
+        A process that still runs is aborted; the result then also says what each thread was doing.
+        """
         code, pid = self.process.poll(), self.process.pid
         lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
         if code is None:
             for task in sorted(Path(f"/proc/{pid}/task").iterdir()):
-                with suppress(OSError):  # it may end meanwhile
+                with suppress(OSError):  # the thread may end meanwhile
                     name, waits = ((task / file).read_text().strip() for file in ("comm", "wchan"))
                     ran, waited = self._scheduled(int(task.name))
                     times = f"ran {ran:.1f} s, waited {waited:.1f} s for a processor"
@@ -128,7 +131,7 @@ class Served:
         return "\n".join([*lines, self.log.read_text()])
 
     def _scheduled(self, thread: int) -> tuple[float, float]:
-        """Return for how many seconds a thread ran, and waited for a processor."""
+        """Return how many seconds a thread ran, and how many it waited for a processor."""
         try:
             path = Path(f"/proc/{self.process.pid}/task/{thread}/schedstat")
             ran, waited, _ = map(int, path.read_text().split())
@@ -145,7 +148,7 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain, as people do or, faster, from warm commands."""
+    """Starts `demandops serve` in one ROS domain; ``warm`` commands, if given, start faster."""
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str
@@ -158,7 +161,7 @@ class Servers:
         return self.run(state_repo, "serve", "--state-repo", state_repo, *args)
 
     def run(self, state_repo: str, *words: str) -> Served:
-        """Start another command in the same ROS domain."""
+        """Start any command of ``demandops`` in the ROS domain."""
         log = self._folder / f"node-{len(self._started)}.log"
         environment = {
             **os.environ,
@@ -198,7 +201,7 @@ class Sent:
     accepted: bool | None = None
     feedback: list[str] = field(default_factory=list)
     stages: dict[str, float] = field(default_factory=dict)
-    """When each stage was heard of; an answer without feedback means pushed."""
+    """When each stage was reported; the result sets ``pushed`` if no feedback did."""
     status: str = ""
     message: str = ""
     cancel: bool | None = None
@@ -214,7 +217,7 @@ class Sent:
 
 
 class Client:
-    """An action client with its own executor; a test drives it."""
+    """An action client with its own executor, which spins only while the test waits."""
 
     def __init__(self, domain: int, action: str = DEFAULT_ACTION_NAME) -> None:
         self._context = rclpy.Context()

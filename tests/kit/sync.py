@@ -1,7 +1,7 @@
 """Forced writes to disk: off in tests, unless a test is marked ``synced``.
 
-Without them only a power cut loses data; a killed process does not. The program has no switch for
-this, so the tests replace what it calls.
+Without forced writes, a killed process loses no data; only a power cut does. The program has no
+switch for forced writes, so the tests replace the functions that it calls.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pygit2
-from demandops.staterepo.git import tree as _  # noqa: F401 - switches libgit2's on when imported
+from demandops.staterepo.git import tree as _  # noqa: F401 - its import switches libgit2's fsync on
 
 _CALLS: Mapping[str, object] = {name: getattr(os, name) for name in ("fsync", "fdatasync")}
 

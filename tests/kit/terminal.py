@@ -37,7 +37,10 @@ class Screen:
 def terminal(
     monkeypatch: pytest.MonkeyPatch, columns: int = 80, lines: int = 1000
 ) -> Iterator[Screen]:
-    """Give standard output to a terminal; what was printed is complete at the end."""
+    """Make standard output a terminal for the length of a block; yield its screen.
+
+    After the block, the screen has everything that was printed.
+    """
     master, slave = os.openpty()
     screen = Screen()
     reading = threading.Thread(target=screen.read, args=(master,))

@@ -1,4 +1,4 @@
-"""A runtime that runs all threads in one, in an order and at times that follow from a seed."""
+"""A runtime that plays all threads in one; a seed determines their order and times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.kit.memory import NOW
 
 
 class Turns(Clock):
-    """Threads take turns when they wait; a wait takes no time, but moves the clock forward."""
+    """Threads take turns when they wait; a wait takes no real time, but moves the clock."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(NOW)
@@ -50,7 +50,7 @@ class Turns(Clock):
         self._turn = self._next()
         while self._turn is not me:
             self._turn.switch()
-            if self._turn.dead:  # the end of a thread leads to the main one
+            if self._turn.dead:  # an ended thread switches to the main one
                 self._turn = self._next()
 
     def stop(self, threads: Collection[greenlet]) -> None:
@@ -62,7 +62,7 @@ class Turns(Clock):
             self._turn.switch()
 
     def end(self, threads: Iterable[greenlet]) -> None:
-        """Unwind threads that were stopped, so that what they hold is released."""
+        """Unwind threads that were stopped, so that their resources are released."""
         self._waiting.clear()
         for thread in threads:
             self._turn = self._main

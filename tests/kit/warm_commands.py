@@ -1,9 +1,9 @@
-"""Commands as processes without the time that imports take: forked from one that has imported all.
+"""Start commands without the time for imports: fork them from a process that has imported all.
 
-A node's start is a second of imports; many tests start one. Each command still has a process,
-threads, signals, a log and an exit code of its own. Python must have one thread when it forks, so
-the tests' own process cannot be the one that forks. ROS is imported after the fork: its tracing
-starts threads, and a process that is forked from them can crash.
+The imports of a node take a second, and many tests start a node. Each command still has its own
+process, threads, signals, log and exit code. Python must have only one thread when it forks. The
+tests' own process has several, so a further process forks. ROS is imported after the fork, because
+its tracing starts threads and a process that is forked from them can crash.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import IO, Any
 
 
 class WarmCommand:
-    """One command that was forked, as `subprocess.Popen` would show it."""
+    """A command that was forked; its interface is that of `subprocess.Popen`."""
 
     def __init__(self, told: IO[str]) -> None:
-        """Read what becomes of the command from ``told``: its process id, then its exit code."""
+        """Read the command's process id from ``told``; its exit code comes there later."""
         self._told = told
         self.pid = int(told.readline())
         self.returncode: int | None = None
@@ -61,10 +61,10 @@ class WarmCommand:
 
 
 class WarmCommands:
-    """Starts commands from a process that has imported what they need."""
+    """Starts commands as forks of a process that has imported what they need."""
 
     def __init__(self, folder: Path) -> None:
-        """Start that process; keep its pipes in ``folder``."""
+        """Start the process that forks; put its pipes into ``folder``."""
         self._folder, self._started = folder, 0
         command = [sys.executable, "-m", "tests.kit.warm_commands"]
         self._process = subprocess.Popen(
@@ -85,20 +85,24 @@ class WarmCommands:
         return WarmCommand(pipe.open())
 
     def close(self) -> None:
-        """End the process that forks; commands go on."""
+        """End the process that forks; running commands go on."""
         self._process.communicate()
 
 
 def _import_all() -> None:
     import demandops
-    import numpy  # noqa: F401 - of ROS' messages
+    import numpy  # noqa: F401 - ROS messages need it
 
     for module in pkgutil.walk_packages(demandops.__path__, "demandops."):
         importlib.import_module(module.name)
 
 
 def _watch(wanted: dict[str, Any]) -> int:
-    """Fork for a command; in the command's process return, in its parent tell how it ends."""
+    """Fork for a command.
+
+    In the command's process, return 0. In the parent, write the command's process id and exit code
+    into its pipe, and return the process id.
+    """
     with Path(wanted["pipe"]).open("w", buffering=1) as pipe:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         pid = os.fork()

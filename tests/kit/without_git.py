@@ -1,8 +1,8 @@
 """A pytest plugin for the tests of the core: they cannot import Git.
 
-Load it with ``-p tests.kit.without_git``. The scenarios use the timers of `service`, which need no
-Git. The plugin skips the imports of the package itself, so that these modules can be imported
-alone.
+Load it with ``-p tests.kit.without_git``. The scenarios use the timers of ``demandops.service``,
+which need no Git. The plugin replaces that package by an empty one with the same modules, because
+the package itself imports Git.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""An independent model of the bookkeeping, to hold the program against."""
+"""Independent models of the bookkeeping; the tests compare the program with them."""

@@ -1,8 +1,8 @@
-"""The bookkeeping once more, from the sentences of docs/demand.md and decision 23 alone.
+"""A second bookkeeping, written only from docs/demand.md and decision 23.
 
-Plain dicts and sets over goals as they come in YAML. It imports nothing of the program and shares
-no idea with it, so that a mistake would have to be made twice. Where the design leaves something
-open, a comment says what is taken here.
+It uses plain dicts and sets over goals as they come in YAML. It imports nothing of the program and
+shares no idea with it. So a mistake stays unnoticed only if it is made in both. Where the design
+leaves something open, a comment says what this model does.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Demand = tuple[str, tuple[str, ...]]
 """The request id and the sorted, de-duplicated requesters of a join: they tell claims apart."""
 
 Subject = tuple[str, str]
-"""``application`` or ``connection``, and the id."""
+"""The kind (``application`` or ``connection``) and the id."""
 
 Topic = tuple[str, ...]
 """A connection's source topic, or an application's role, topic and source."""
@@ -37,7 +37,7 @@ _BODY = "object_detection_fusion_app"
 
 @dataclass(frozen=True)
 class World:
-    """What the state repo's inventory lists, as far as booking asks for it."""
+    """The part of the state repo's inventory that the bookkeeping needs."""
 
     nodes: frozenset[str]
     brokers: frozenset[str]
@@ -47,8 +47,9 @@ class World:
 class Result:
     """What became of one request.
 
-    ``not_held`` names (id, topic, requester) of what a shutdown listed in vain, the topic ``None``
-    if it listed none; ``touched`` the claims that are other than before.
+    ``not_held`` has each (id, topic, requester) that a shutdown lists although it is not held. The
+    topic is ``None`` if the shutdown lists no topics. ``touched`` has the claims that the request
+    adds, changes or removes.
     """
 
     outcome: Outcome
@@ -58,7 +59,7 @@ class Result:
 
     @property
     def effective(self) -> bool:
-        """Whether a commit must come of it."""
+        """Whether the request must lead to a commit."""
         return self.outcome in ("booked", "released")
 
 
@@ -67,23 +68,23 @@ class _Refused(Exception):
 
 
 def absolute(topic: str) -> str:
-    """Return a topic as the root namespace resolves it."""
+    """Return the absolute name of a topic, as ROS resolves it in the root namespace."""
     return topic if topic.startswith("/") else f"/{topic}"
 
 
 def requesters(item: Item) -> list[str]:
-    """Return for whom an application or a connection is asked."""
+    """Return the requesters of an application or a connection."""
     body = item.get(_BODY, {}) if "header" in item else item
     return list(body.get("requester_ids", []))
 
 
 def demand_of(goal: Goal, item: Item) -> Demand:
-    """Return what tells a claim from others on the same subject."""
+    """Return what tells an item's claim from the other claims on the same subject."""
     return goal.get("id", ""), tuple(sorted(set(requesters(item))))
 
 
 class Books:
-    """Who holds what. :meth:`take` a request, then look at :meth:`services`."""
+    """The model: :meth:`take` handles a request, :meth:`view` returns who holds what."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -94,7 +95,8 @@ class Books:
     def take(self, goal: Goal, after: int = 1) -> Result:
         """Book or release a request as a whole, or refuse it as a whole.
 
-        It comes so many seconds after the last one, at least one: the oldest claim gives first.
+        The request comes ``after`` seconds after the one before. This is at least one second,
+        because a shutdown takes from the oldest claim first.
         """
         self.now += after
         problem = next(self._inadmissible(goal), None)
@@ -118,7 +120,7 @@ class Books:
         was, now = _flat(before), _flat(self.claims)
         return frozenset(key for key in {*was, *now} if was.get(key) != now.get(key))
 
-    # What cannot be asked at all
+    # Requests that are refused whatever is booked
 
     def _inadmissible(self, goal: Goal) -> Iterator[str]:
         joining = not goal.get("shutdown", False)
@@ -171,7 +173,11 @@ class Books:
             yield "no broker"
 
     def _broker(self, item: Item) -> str:
-        """Return the broker of an item that asks for one: the only one, else the first there."""
+        """Return the broker of an item, or an empty text if the item names none.
+
+        If the inventory has only one broker, it is that one. Otherwise it is the first broker among
+        the named node, the target and the source.
+        """
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
         found = [*brokers][:1] if len(brokers) == 1 else [n for n in (asked, *ends) if n in brokers]
@@ -186,7 +192,7 @@ class Books:
             for other in claims.values():
                 if other["fixed"] != fixed:
                     raise _Refused("another node, type or end")
-                # "explicitly different": only if both say which
+                # "explicitly different": only if both name a broker
                 if broker and other["broker"] and other["broker"] != broker:
                     raise _Refused("another broker")
                 if any(other["routes"].get(one, two) != two for one, two in routes.items()):
@@ -202,17 +208,20 @@ class Books:
             }
             for topic in _topics(item):
                 claim["holds"].setdefault(topic, set()).update(demand[1])
-            # left open: that a join which changes its claim books it anew
+            # left open by the design: here, a join that changes its claim renews its booking time
             claims[demand] = claim if claim == was else claim | {"booked": self.now}
 
     # Leaving: one hold of each requester that is named, on each topic that is listed
 
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
-        """Take holds; whose is asked of the books as ``found``: what is listed twice is taken once.
+        """Take the holds that a shutdown lists.
 
-        Left open: for several requesters and no topic, each gives up one claim, maybe not the same.
+        Which claim gives up a hold follows from ``found``, the claims before the shutdown. So a
+        hold that is listed twice is taken once. One question is left open by the design: if a
+        shutdown has several requesters and no topics, each requester gives up one claim here, and
+        these claims may differ.
         """
-        # a shutdown is the same if it lists the same, in any order and any number of times
+        # a shutdown repeats another one if it lists the same, in any order and any number of times
         said = frozenset(_said(item) for item in _items(goal))
         this = _people(goal), goal.get("id", ""), said
         if this in self._shutdowns and self.now - self._shutdowns[this] <= REPEATS_WITHIN_S:
@@ -247,7 +256,7 @@ class Books:
     def _take(self, subject: Subject, demand: Demand, one: str, topic: Topic | None) -> None:
         claims = self.claims.get(subject, {})
         if demand not in claims:
-            return  # dropped by what the same request listed before
+            return  # an earlier item of this request dropped the claim
         holds = claims[demand]["holds"]
         for each in list(holds) if topic is None else [topic]:
             holds.get(each, set()).discard(one)
@@ -262,10 +271,10 @@ class Books:
     # The view
 
     def services(self) -> dict[tuple[str, str, str], dict[str, Any]]:
-        """Return who requests which service, by service, node and what it is for.
+        """Return who requests each service; a key is the service, its node and what it is for.
 
-        A detection is for one cloud (``source topic``), a fusion for one application. The
-        fusion's object lists are told by the clouds that they come from.
+        A detection is for one cloud (``source topic``), a fusion is for one application. The object
+        lists of a fusion are named by the clouds from which they are made.
         """
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
         for id_, claim in self._on("application"):
@@ -284,7 +293,7 @@ class Books:
         return {key: _sorted(entry) for key, entry in found.items()}
 
     def connection_view(self) -> dict[str, dict[str, Any]]:
-        """Return who requests which connection, as the contract prints it."""
+        """Return who requests each connection, in the form of the bookkeeping's JSON."""
         found: dict[str, dict[str, Any]] = {}
         for id_, claim in self._on("connection"):
             ends = {end: claim["fixed"][end] for end in ("source", "target")}
@@ -302,7 +311,7 @@ class Books:
         return ((id_, claim) for ((of, id_), _), claim in _flat(self.claims).items() if of == kind)
 
     def view(self) -> dict[str, Any]:
-        """Return both, to be compared with :func:`in_model_words`."""
+        """Return services and connections, in the form of :func:`in_model_words`."""
         return {"services": self.services(), "connections": self.connection_view()}
 
     def holds(self) -> dict[tuple[Subject, Demand], dict[Topic, set[str]]]:
@@ -332,7 +341,10 @@ def _subject(item: Item) -> Subject:
 
 
 def _fixed(item: Item) -> dict[str, Any]:
-    """Return what all claims on a subject agree on; a shutdown may leave out its nodes."""
+    """Return the fields in which all claims on a subject agree: the node or the ends, and the type.
+
+    A shutdown may leave out nodes; these are empty.
+    """
     if "header" in item:
         return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}
     ends = {end: item.get(f"{end}_node_id", "") for end in ("source", "target")}
@@ -340,12 +352,15 @@ def _fixed(item: Item) -> dict[str, Any]:
 
 
 def _is_meant(claim: Claim, item: Item) -> bool:
-    # the broker is not among what a shutdown is told apart by
+    # the broker of a shutdown does not matter
     return all(value in ("", claim["fixed"][name]) for name, value in _fixed(item).items())
 
 
 def _topics(item: Item) -> set[Topic]:
-    """Return what is held; a connection's source topic says which, because it has one target."""
+    """Return the topics of an item.
+
+    A connection's source topic is enough to name a topic, because it has only one target.
+    """
     if "header" not in item:
         return {(source,) for source in _pairs(item)}
     return {(role, topic, of) for role, topics in _inputs(item).items() for of, topic in topics}
@@ -378,7 +393,7 @@ def _two_targets(connection: Item) -> bool:
 
 def _absolute_pairs(connection: Item) -> list[tuple[str, str]]:
     sources, targets = connection.get("source_topics", []), connection.get("target_topics", [])
-    pairs = zip(sources, targets, strict=False)  # where they do not pair the request is refused
+    pairs = zip(sources, targets, strict=False)  # a request whose topics do not pair is refused
     return [(absolute(source), absolute(target)) for source, target in pairs]
 
 
@@ -411,12 +426,11 @@ def _sorted(entry: dict[str, Any]) -> dict[str, Any]:
 def in_model_words(
     data: Mapping[str, Any], object_lists: Mapping[tuple[str, str], str]
 ) -> dict[str, Any]:
-    """Return the bookkeeping JSON of the contract as :meth:`Books.view` tells it.
+    """Return the program's bookkeeping in the form of :meth:`Books.view`.
 
     Args:
         data: ``services`` and ``connections`` as ``demandops bookkeeping --output json`` prints.
-        object_lists: (node, object list topic) → the cloud that a detection there makes it from,
-            as the rendered releases say.
+        object_lists: the result of :func:`object_lists` for the rendered releases.
     """
     services = {}
     for entry in data["services"].values():
@@ -448,7 +462,10 @@ def in_model_words(
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Return (node, object list) → the cloud it is made from, as rendered releases say."""
+    """Return (node, object list topic) → the cloud from which a detection there makes the list.
+
+    ``manifests`` are the rendered releases.
+    """
     found: dict[tuple[str, str], str] = {}
     for text in manifests:
         published = re.search(r"objectListTopic: (\S+)", text)

@@ -1,7 +1,7 @@
-"""Demand requests by chance, in the words of the reference's action.
+"""Random requests in the form of the reference's action.
 
-The same maker serves Hypothesis (whose ``randoms()`` is a ``Random`` that it can shrink) and plain
-seeds. Few subjects, few requesters and few topics, so that requests meet.
+The same maker serves Hypothesis, which can shrink its ``randoms()``, and plain seeds. There are few
+subjects, requesters and topics, so that requests often concern the same ones.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SKELETON = World(
     nodes=frozenset({*PARTIES, "edge", "cloud"}),
     brokers=frozenset({"edge", "cloud"}),
 )
-"""The inventory that ``demandops init`` lays down."""
+"""The nodes and brokers in the inventory that ``demandops init`` writes."""
 
 REQUESTS = ("station00/collective-perception-intersection", "again", "")
 
@@ -43,7 +43,7 @@ APPLICATIONS = {
     "edge/object.detection_fusion": "edge",
     "cloud/fusion": "cloud",
 }
-"""Each application's own node: the first two share their detections, and nearly their name."""
+"""The node of each application. The first two share detections and have nearly the same name."""
 
 CLOUDS = (
     STATION_CLOUD,
@@ -52,7 +52,7 @@ CLOUDS = (
     ("/shared/points", "vehicle01"),
     ("/shared/points", "vehicle02"),
 )
-"""Usual clouds, a second one of a vehicle, and one topic name that two vehicles publish."""
+"""The usual clouds, a second cloud of vehicle00, and a topic name that two vehicles publish."""
 
 CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
     "vehicle00/edge": (
@@ -83,19 +83,20 @@ CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
 
 
 def ego(vehicle: str) -> Topic:
-    """Return a vehicle's usual ego data."""
+    """Return the topic of a vehicle's usual ego data."""
     return f"/vehicles/{vehicle}/ego_data", vehicle
 
 
 def shutdown_of(joined: Goal) -> Goal:
-    """Return the goal that takes back what another asked for: the same lists."""
+    """Return the shutdown that lists the same as a join."""
     return {**deepcopy(joined), "shutdown": True}
 
 
 class Maker:
-    """Makes requests by chance.
+    """Makes random requests.
 
-    What a calm maker asks for never contradicts itself, so that all of it can stand at once.
+    The requests of a ``calm`` maker never contradict each other, so that all can be booked
+    together.
     """
 
     def __init__(self, random: Random, *, calm: bool = False) -> None:
@@ -109,21 +110,21 @@ class Maker:
         return [self.any() for _ in range(length)]
 
     def any(self) -> Goal:
-        """Return a request: joining, joining again, or leaving in one of many ways."""
+        """Return a join, a repeated join, a shutdown or a repeated shutdown."""
         if not self.joined or self._random.randrange(2) == 0:
             return self.join()
         if self._odds(6):
             return self.again(self._pick(self.joined))
         if self._odds(30):
             return goal(id=self._pick(REQUESTS), shutdown=True)
-        if self.left and self._odds(4):  # the last one, or one from long ago
+        if self.left and self._odds(4):  # the last shutdown, or an older one
             made = self.left[-1] if self._odds(2) else self._pick(self.left)
             return self.again(made) if self._odds(3) else made
         self.left.append(self.leave())
         return self.left[-1]
 
     def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
-        """Return a request for one to four subjects, mostly in the name of the same requesters."""
+        """Return a join of one to four subjects, mostly with the same requesters for all."""
         random = self._random
         people = list(who) if who is not None else self._people()
         apps = [self._application(people) for _ in range(random.randrange(3))]
@@ -138,7 +139,7 @@ class Maker:
         return made
 
     def again(self, joined: Goal) -> Goal:
-        """Return the same demand in other words: orders changed, names listed twice."""
+        """Return the same goal with reordered lists and an entry of each list twice."""
         made = deepcopy(joined)
         for item in made["apps"]:
             body = item["object_detection_fusion_app"]
@@ -154,7 +155,7 @@ class Maker:
         return made
 
     def leave(self) -> Goal:
-        """Return a shutdown of something that was asked for, whole or in part, well or badly."""
+        """Return a shutdown of an earlier join: whole, in part, or with mistakes."""
         place = self._random.randrange(len(self.joined))
         made = shutdown_of(self.joined[place])
         if not self._odds(3):  # else it may be sent again
@@ -208,12 +209,12 @@ class Maker:
         return [first, STATION if first != STATION else self._pick(VEHICLES)]
 
     def _disturb(self, made: Goal) -> None:
-        """Make something contradict others, or make no sense, now and then."""
+        """Now and then, make a part of the goal contradict other goals or make no sense."""
         for app in made["apps"]:
             self._disturb_application(app)
         for item in made["connections"]:
             self._disturb_connection(item)
-        if self._odds(16):  # a subject is asked for in the name of the same: one claim is older
+        if self._odds(16):  # all applications or all connections get other requesters
             self._name(self._pick(["apps", "connections"]), made, self._people())
         if self._odds(20):
             made["apps"] += deepcopy(made["apps"])
@@ -260,7 +261,7 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Ask in the name of fewer requesters, of others, or of those of several claims."""
+        """Give the items fewer requesters, other requesters, or their own and others."""
         people = self._people()
         for kind in ("apps", "connections"):
             named = [one for item in made[kind] for one in requesters(item)]
@@ -321,5 +322,5 @@ class Maker:
 
 
 def summary(made: Goal) -> dict[str, Any]:
-    """Return a goal as short as a reader of a failed test wants it."""
+    """Return a goal without empty lists and false values, for the output of a failed test."""
     return {key: value for key, value in made.items() if value not in ([], False)}

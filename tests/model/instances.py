@@ -1,7 +1,8 @@
-"""Instances by version, nodes in two access domains, and replicas that come down later.
+"""A model of instances by version, nodes in two access domains, and replicas that are kept.
 
-Once more from what docs/versions.md, docs/policy.md and docs/appdef.md promise; nothing of the
-program is imported. Here each demand for an instance has one application, which runs one service.
+It is written from what docs/versions.md, docs/policy.md and docs/appdef.md promise, and imports
+nothing of the program. In this model, each demand for an instance has one application, which runs
+one service.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from tests.model.leases import Goal
 from tests.model.places import Outcome, Places
 
 TALLY = "tally"
-"""The type of application that has instances: a replica for each topic, at most ``MOST``."""
+"""The type of applications that have instances; each topic needs a replica, up to ``MOST``."""
 DEFAULT, NEXT = "1.0.0", "1.1.0"
 HALL, FIRST, FURTHER = "hall", "hall@perception", "hall@city"
-"""A node in two access domains, and its names in the first and in the further one."""
+"""A node in two access domains, its name in the first one, and its name in the further one."""
 MAY = {
     "vehicle00": frozenset({HALL}),
     "vehicle01": frozenset({HALL, FURTHER}),
     "traffic": frozenset({FURTHER}),
 }
-"""In which of the two requesters may demand something."""
+"""The access domains in which each requester may demand something, by the node's names there."""
 MOST = 3
 KEPT_FOR = timedelta(seconds=120)
 
@@ -34,16 +35,20 @@ Instance = tuple[str, str]
 
 @dataclass
 class Instances(Places):
-    """Places, and instances.
+    """The model of places, with instances.
 
-    ``kept`` has until when an instance keeps so many replicas that nobody needs any longer.
+    ``testing`` is the version in the channel of this name. ``kept`` maps numbers of replicas that
+    an instance no longer needs to the time until which it keeps so many.
     """
 
     testing: str = NEXT
     kept: dict[Instance, dict[int, datetime]] = field(default_factory=dict)
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:
-        """Book, replace, release, renew or let wait as a whole, or refuse as a whole."""
+        """Apply a goal as a whole or refuse it as a whole; return the outcome.
+
+        ``received`` is the time at which the generator received the goal.
+        """
         before = self.running()
         app: dict[str, Any] = next(iter(goal.get("applications", [])), {})
         if app.get("type") == TALLY:
@@ -86,7 +91,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Note which replicas are needed no longer since ``before``."""
+        """Note the replicas that were needed ``before`` and are not needed now; they are kept."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -95,7 +100,10 @@ class Instances(Places):
                 self.kept[one] = kept
 
     def come_down(self, one: Instance, record: Mapping[int, datetime], now: datetime) -> None:
-        """Compare what an instance keeps with a record, which may lack what has ended."""
+        """Check the record of replicas that an instance keeps, and adopt it.
+
+        The record may lack replicas whose time is over by ``now``.
+        """
         least = needed(self.running().get(one, ()))
         kept, told = _ends(self.kept.get(one, {}), least), _ends(record, least)
         for number in kept.keys() - told.keys():
@@ -111,7 +119,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return until when there are at least so many replicas, for each number above ``least``."""
+    """Return until when at least so many replicas are kept, for each number above ``least``."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)
@@ -119,5 +127,5 @@ def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
 
 
 def needed(topics: Collection[Any]) -> int:
-    """Return how many replicas topics need."""
+    """Return how many replicas an instance with these topics needs."""
     return min(MOST, len(topics))

@@ -1,7 +1,7 @@
-"""Demands that name themselves, and leases, once more: from what is promised alone.
+"""A model of demands in DemandOps' own format and of leases, written only from what is promised.
 
-Plain dicts over goals as they come in YAML; nothing of the program is imported. What a sentence
-leaves open is said in a comment. Time is whole seconds.
+It uses plain dicts over goals as they come in YAML, and imports nothing of the program. Where a
+sentence leaves something open, a comment says what this model does. Times are whole seconds.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Outcome = Literal["booked", "released", "unchanged", "refused"]
 Subject = tuple[str, str]
-"""``applications`` or ``connections``, and the id."""
+"""The kind (``applications`` or ``connections``) and the id."""
 
 BY_MESSAGE = "by message: "
-"""Stands before the request id and requesters of a demand that the reference's goal makes."""
+"""The start of the name of a demand that comes from a goal of the reference."""
 
 
 REPEATS_WITHIN_S = 15 * 60
 
 
 def by_message(request: str, who: Iterable[str]) -> str:
-    """Return the demand that a goal of the reference makes."""
+    """Return the name of the demand that comes from a goal of the reference."""
     return f"{BY_MESSAGE}{request} {sorted(who)}"
 
 
 @dataclass
 class Held:
-    """What one demand holds on one subject, and until when that was promised.
+    """What one demand holds on one subject, and until when.
 
-    ``promised`` is the last renewal and the lease on top of it, nothing for one without an end;
-    ``slack`` is how much later it may go. Of the reference's: who holds each topic, the ``request``
-    that asked, and when it was ``booked``.
+    ``seconds`` is the lease, and ``promised`` is the last renewal plus the lease; both are None for
+    a demand without an end. A demand that comes from a goal of the reference also has ``holders``
+    (who holds each topic), ``request`` (the id of the goal) and ``booked`` (the time).
     """
 
     what: dict[str, Any]
@@ -46,21 +46,29 @@ class Held:
     booked: int = 0
 
     def same(self, other: Held | None) -> bool:
-        """Return whether both are the same but for the time."""
+        """Return whether this equals ``other`` except for the times."""
         if other is None:
             return False
         mine = (self.what, self.requesters, self.seconds, self.holders)
         return mine == (other.what, other.requesters, other.seconds, other.holders)
 
     def holds(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return ``holds``: who holds each topic of a connection, all unless some gave it up."""
+        """Return who holds each topic of a connection, below the key ``holds``.
+
+        All requesters hold a topic unless ``holders`` names some of them. For an application, the
+        result is empty.
+        """
         topics = self.what.get("topics")
         return {"holds": dict.fromkeys(topics, self.requesters) | self.holders} if topics else {}
 
 
 @dataclass
 class Promises:
-    """Who holds what until when, by demand and subject."""
+    """The model: what each demand holds on each subject, and until when.
+
+    ``slack`` is how many seconds after ``promised`` a release may come. ``default`` is the lease of
+    a demand that names none.
+    """
 
     slack: int
     default: int | None = None
@@ -70,16 +78,16 @@ class Promises:
     )
 
     def take(self, goal: Goal, now: int) -> Outcome:
-        """Book, replace, release or renew as a whole, or refuse as a whole.
+        """Apply a goal as a whole or refuse it as a whole; return the outcome.
 
-        ``unchanged`` covers a renewal that only moves what is promised: whether the record follows
-        is left to the slack, so a commit may be made of it or not.
+        The outcome is ``unchanged`` if a renewal only prolongs leases. It depends on the slack
+        whether the recorded end changes too, so the generator may make a commit or not.
         """
         if goal.get("kind") == "Demand":
             return self._own(goal, now)
         return self._message(goal, now)
 
-    # our own
+    # demands in our own format
 
     def _own(self, goal: Goal, now: int) -> Outcome:
         demand, who = goal["demand"], frozenset(goal["requesters"])
@@ -135,7 +143,7 @@ class Promises:
                 return True
         return False
 
-    # the reference's: connections alone, each in the same names, which make the demand
+    # goals of the reference: one connection each; id and requesters name the demand
 
     def _message(self, goal: Goal, now: int) -> Outcome:
         item = goal["connections"][0]
@@ -176,7 +184,7 @@ class Promises:
             if name.startswith(BY_MESSAGE) and subject in held
         ]
         names = [name for *_, name in sorted(around)]
-        # one person's holds are no other's, so it may be taken while the next is looked for
+        # requesters do not share holds, so one can be taken while others are searched
         taken = [self._take(names, one, subject, topics) for one in who]
         if not any(taken):
             return "refused"
@@ -220,11 +228,11 @@ class Promises:
     # time
 
     def may_go(self, now: int) -> set[tuple[str, Subject]]:
-        """What may be released at ``now``: the last renewal and the lease are over."""
+        """Return what may be released at ``now``: the lease since the last renewal is over."""
         return self._over(now)
 
     def must_go(self, now: int) -> set[tuple[str, Subject]]:
-        """What must be released at a look at ``now``: the slack has passed as well."""
+        """Return what a check of the leases at ``now`` must release: the slack is over as well."""
         return self._over(now - self.slack)
 
     def _over(self, now: int) -> set[tuple[str, Subject]]:
@@ -243,9 +251,9 @@ class Promises:
     # the view
 
     def claims(self) -> dict[tuple[str, Subject], tuple[dict[str, Any], frozenset[str]]]:
-        """Return what stands by demand and subject: what it is, and in whose name.
+        """Return what each demand holds on each subject, and the requesters.
 
-        Of the topics of a connection it says who holds each.
+        For a connection, ``holds`` has who holds each topic.
         """
         return {
             (demand, subject): (deepcopy(held.what) | held.holds(), held.requesters)
@@ -255,7 +263,10 @@ class Promises:
 
 
 def _subjects(goal: Goal) -> dict[Subject, dict[str, Any]]:
-    """Return what a put lists; its maker lists no subject twice and leaves nothing to derive."""
+    """Return what a put demands of each subject.
+
+    The tests' puts list no subject twice and leave nothing to derive.
+    """
     found: dict[Subject, dict[str, Any]] = {}
     for app in goal.get("applications", []):
         inputs = {

@@ -1,8 +1,8 @@
-"""The bookkeeping of the reference's operators, over goals as they come in YAML.
+"""A model of the bookkeeping of the reference's operators, over goals as they come in YAML.
 
-`tests/fixtures/reference-run.yaml` records what they do. This is written from it, and imports
-nothing of the program. They count requesters for each topic of a fusion, but only for the whole of
-a detection or a connection.
+It is written from `tests/fixtures/reference-run.yaml`, which records what the operators do, and
+imports nothing of the program. The operators count the requesters of each topic of a fusion. They
+count the requesters of a detection or a connection only as a whole.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ _WHOLE = [""]
 
 @dataclass
 class Resource:
-    """A custom resource: what the last request wrote into it, and what its operator counts.
+    """A custom resource: its last request, and the requesters that its operator counts.
 
-    The operator fails while it ``is_stuck``, and from then on it counts nothing for a fusion.
+    While it ``is_stuck``, the operator fails. A fusion that was stuck ``is_uncounted``: the
+    operator counts nothing for it.
     """
 
     spec: object
@@ -30,7 +31,10 @@ class Resource:
 
 
 class Operators:
-    """Who asked for what, as often as counted. :meth:`take` a goal, then look at :meth:`books`."""
+    """Who requests what, as the operators count it.
+
+    :meth:`take` counts a goal, and :meth:`books` returns the counts.
+    """
 
     def __init__(self) -> None:
         self._resources: dict[str, Resource] = {}
@@ -45,7 +49,10 @@ class Operators:
         }
 
     def take(self, goal: Goal) -> set[str]:
-        """Count a goal and return why it is not counted as asked: rows of docs/reference.md."""
+        """Count a goal; return the reasons why parts of it are not counted as requested.
+
+        A reason is the name of a row in docs/reference.md.
+        """
         leaves = goal.get("shutdown", False)
         found = set[str]()
         for app in goal.get("apps", []):

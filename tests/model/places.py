@@ -1,8 +1,9 @@
-"""Demands that leave the node to the generator, nodes that are full or drained, and waiting.
+"""A model of demands without a node, of nodes that are full or drained, and of waiting.
 
-Once more from what docs/placement.md promises, and nothing of the program is imported. Here each
-such demand has one application of its own, and each of the nodes has room for one. Which of the
-free nodes it gets is left open: ``told`` says which one it got, and that must be a free one.
+It is written from what docs/placement.md promises, and imports nothing of the program. In this
+model, each such demand has one application of its own, and each of the ``nodes`` has room for one
+application. The generator may choose any free node: ``told`` has its choice, and the model checks
+that the node is free.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from tests.model import leases
 from tests.model.leases import Goal, Promises, Subject
 
 Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "waits"]
-"""``waits``: it waited already, as it does now."""
+"""``waiting``: the demand waits from now on; ``waits``: it already waited in the same way."""
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """A demand that waits: its turn, whose it is and what it asks for."""
+    """A waiting demand: its priority, since when it waits, its requesters and its goal."""
 
     priority: int
     since: str
@@ -32,13 +33,16 @@ class Waiting:
         return self
 
     def turn(self, demand: str) -> tuple[int, str, str]:
-        """Return its place among those that wait."""
+        """Return the sort key for the order in which waiting demands get room."""
         return -self.priority, self.since, demand
 
 
 @dataclass
 class Places(Promises):
-    """Promises, and what waits for one of the ``nodes``, of which some are ``drained``."""
+    """The model of leases, with demands that wait for room on ``nodes``.
+
+    ``drained`` nodes get no applications.
+    """
 
     nodes: frozenset[str] = frozenset()
     drained: frozenset[str] = frozenset()
@@ -46,7 +50,10 @@ class Places(Promises):
     told: Mapping[Subject, str] = field(default_factory=dict)
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:  # type: ignore[override]
-        """Book, replace, release, renew or let wait as a whole, or refuse as a whole."""
+        """Apply a goal as a whole or refuse it as a whole; return the outcome.
+
+        ``received`` is the time at which the generator received the goal.
+        """
         demand, who = goal.get("demand", ""), frozenset(goal.get("requesters", ()))
         waits = self.waiting.get(demand)
         if waits and goal.get("operation", "put") != "put":
@@ -65,7 +72,7 @@ class Places(Promises):
             return "refused"
         if self.free():
             first = min(self.waiting, key=self._turn, default=demand)
-            # only while it is tried in vain may one that waits find room
+            # with a real placement (`told`), no other demand may wait in front of this one
             assert first == demand or not self.told, f"{first} waits, but {demand} gets room"
             return self._place(demand, goal, now)
         if self.nodes <= self.drained:
@@ -75,7 +82,11 @@ class Places(Promises):
         return "waits" if self.waiting[demand] == waits else "waiting"
 
     def _put_again(self, goal: Goal, now: int, held: tuple[Subject, leases.Held]) -> Outcome:
-        """What is on a node that is not drained stays there; else it needs another one."""
+        """Apply a put to a demand that already has a node; return the outcome.
+
+        The application stays on its node unless the node is drained. Then it needs another free
+        node.
+        """
         subject, what = held
         node = what.what["node"]
         if not what.requesters & {*goal["requesters"]}:
@@ -107,14 +118,17 @@ class Places(Promises):
         return self.nodes - self.drained - taken
 
     def has_room(self, demand: str, now: int) -> None:
-        """Book a demand that waited, at ``now`` at the earliest."""
+        """Book the waiting demand that is first in turn; fail if ``demand`` is another one.
+
+        ``now`` is the earliest time at which it can be booked.
+        """
         assert demand in self.waiting, f"{demand} is booked, and did not wait"
         first = min(self.waiting, key=self._turn)
         assert demand == first, f"{demand} is booked before {first}"
         assert self._place(demand, self.waiting[demand].goal, now) == "booked"
 
     def moved(self, demand: str, subject: Subject) -> None:
-        """Move an application off a drained node."""
+        """Move an application from a drained node to the node in ``told``."""
         held = self.held[demand][subject]
         assert held.what["node"] in self.drained, f"{subject} moved off a node that is not drained"
         self.held[demand][subject] = replace(held, what=held.what | {"node": self._told(subject)})
@@ -124,7 +138,7 @@ class Places(Promises):
         self.drained = self.drained | {node} if drained else self.drained - {node}
 
     def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return who waits, since when and how urgently."""
+        """Return the priority, the time and the requesters of each waiting demand."""
         return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
 
 

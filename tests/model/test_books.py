@@ -1,4 +1,4 @@
-"""The model itself, against the table of the paper's experiment (design §9)."""
+"""The model gives the table of the paper's experiment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ STEPS = (
     ("7-vehicle02-leaves", "S 3", "", "3"),
     ("8-vehicle03-leaves", "", "", ""),
 )
-"""File; who requests what the station feeds, what vehicle 0 feeds; which others are connected."""
+"""The requesters after each file.
+
+First come the requesters of what the station's data feeds, then those of what vehicle 0's data
+feeds, then the other vehicles that have a connection.
+"""
 
 
 def people(text: str) -> list[str]:

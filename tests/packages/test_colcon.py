@@ -1,7 +1,7 @@
 """The ROS packages build in a colcon workspace, as they do in a ROS 2 installation.
 
-Here the workspace lies over the wheels of PyPI, which colcon takes for an underlay. There are no
-wheels of ros2run and ros2launch: what these look up is looked up, and nothing is launched.
+colcon takes the ROS 2 wheels of PyPI for the underlay of the workspace. There are no wheels of
+ros2run and ros2launch. So the tests launch nothing, but find the files that both would look up.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def test_the_packages_build_with_colcon_and_import_from_its_install_space(tmp_pa
         str(tmp_path / "install" / package / SITE / package / "__init__.py")
         for package in ("application_manager_interfaces", "demandops_interfaces")
     ]
-    # Here nothing is left out: a C++ node may use the interfaces too.
+    # A colcon build includes the C++ headers, so a C++ node may use the interfaces too.
     header = Path("include", "demandops_interfaces", "demandops_interfaces", "srv")
     assert (
         tmp_path / "install" / "demandops_interfaces" / header / "get_bookkeeping.hpp"

@@ -1,6 +1,6 @@
-"""The built wheel carries templates, appdefs and skeleton: it renders where no checkout is.
+"""The wheel contains templates, appdefs and skeleton, so it renders demands without a checkout.
 
-It is built of what deploy/Containerfile copies.
+The tests build the wheel of only those files that deploy/Containerfile copies.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
 
 
 def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
-    """What `ros2 run` and `ros2 launch` look up; there are no wheels of these to run here."""
+    """The test looks up what `ros2 run` and `ros2 launch` look up; neither is a wheel on PyPI."""
     packages = pytest.importorskip("ament_index_python.packages")
     # without --ignore-installed pip would remove the package under test from its environment
     options = ["-q", "--no-deps", "--no-index", "--ignore-installed", "--prefix", str(tmp_path)]

@@ -1,4 +1,4 @@
-"""A fleet in the middle of a day, its page, and a browser."""
+"""Fixtures: a fleet whose demands and services have a history, its page, and a browser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ Visits = Callable[..., Visit]
 
 @pytest.fixture
 def visit(browser: Browser, fleet: Story) -> Iterator[Visits]:
-    """Visit the page; in the end it asked no other host, and nothing was wrong."""
+    """Return a function that opens a visit of the page.
+
+    At the end the fixture checks that the page called no other host and reported no error.
+    """
     made: list[Visit] = []
 
     def start(**options: Any) -> Visit:

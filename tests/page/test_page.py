@@ -44,7 +44,7 @@ SERIOUS = ("serious", "critical")
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_view_can_be_read_by_anybody(visit: Visits, scheme: str) -> None:
-    """No serious finding of axe-core, nothing wider than the window, no fault in the console."""
+    """axe-core finds nothing serious in any view; the fixture `visit` checks the console too."""
     BUILD.mkdir(parents=True, exist_ok=True)
     seen = visit(color_scheme=scheme)
     axe = Axe()
@@ -81,7 +81,7 @@ def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
 
 
 def test_a_commit_is_on_the_page_within_a_second(visit: Visits, fleet: Story) -> None:
-    """The best of three, so that a busy machine does not decide."""
+    """The fastest of three commits counts, so that a busy machine does not fail the test."""
     page = visit().open("/demands")
     expect(page.locator("#live")).to_have_text("live")
     waits = []
@@ -170,7 +170,7 @@ def test_health_is_live(visit: Visits, fleet: Story) -> None:
 
 
 class _Away(BaseHTTPRequestHandler):
-    """What a reverse proxy answers while its server is away."""
+    """Answers 502 to each request, as a reverse proxy does while its server is down."""
 
     def do_GET(self) -> None:
         self.send_error(502)
@@ -194,7 +194,7 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
         thread.start()
         expect(page.locator("#live")).to_have_text("not current: waiting for the server")
         with page.expect_response(lambda answer: answer.status == 502):
-            pass  # which ends a stream of events for good, as far as the browser is concerned
+            pass  # after a 502 the browser itself never reopens its stream of events
         proxy.shutdown()
         thread.join()
     book(fleet.generator, leased("meanwhile", "vehicle03"))

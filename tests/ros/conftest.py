@@ -1,4 +1,4 @@
-"""Nodes as people run them, and clients: real processes, real rclpy, ROS graphs of their own."""
+"""Fixtures: nodes in processes of their own, and clients, with rclpy in separate ROS domains."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ APPDEFS = Path(__file__).parents[1] / "appdefs"
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain for the nodes of single tests, so that nothing else answers."""
+    """A ROS domain for the nodes of single tests, in which no other node answers."""
     with reserved() as domain:
         yield domain
 
@@ -36,7 +36,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
 def servers(
     tmp_path: Path, data_home: Path, ros_domain: int, warm: WarmCommands
 ) -> Iterator[Servers]:
-    """Start commands that work with ROS, and end those that a test leaves running."""
+    """What starts commands that use ROS; the end of the test kills those that still run."""
     made = Servers(tmp_path, ros_domain, warm)
     yield made
     made.kill()
@@ -44,7 +44,7 @@ def servers(
 
 @pytest.fixture
 def serve(servers: Servers, new_repo: Callable[[str], Path]) -> Serve:
-    """Start nodes."""
+    """Return a function that starts a node, by default with a state repo of its own."""
 
     def start(state_repo: str | Path | None = None, *args: str) -> Served:
         return servers.start(str(state_repo or new_repo("state.git")), *args)
@@ -59,14 +59,15 @@ def client(ros_domain: int) -> Iterator[Client]:
     made.close()
 
 
-# ---- one node for all tests that leave it as it is ----
+# # ---- one node for all tests that neither restart it nor change its set-up ----
 
 
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A node that serves many tests, each with ids of its own, started as people start it.
+    """A node that serves many tests, each of which uses ids of its own.
 
-    Its state repo has a third type of application and a rule.
+    Its state repo has the recorder as a further type of application, and a policy rule that
+    names the requesters.
     """
     folder = tmp_path_factory.mktemp("shared")
     bare = init(folder / "state.git")

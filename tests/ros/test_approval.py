@@ -1,4 +1,4 @@
-"""Goals that await approval over real ROS 2: feedback, merged, turned down, cancelled."""
+"""Goals over ROS 2 await approval, report so, and are then merged, rejected or cancelled."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.kit.ros import Client, Sent, Serve
 
 
 def branch_of(client: Client, sent: Sent) -> str:
-    """Wait until a goal's feedback names its branch."""
+    """Wait until a goal's feedback names the branch of its proposal; return the branch."""
 
     def lines() -> list[str]:
         return [line for line in sent.feedback if line.startswith("awaiting approval: ")]

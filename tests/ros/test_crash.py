@@ -1,6 +1,6 @@
-"""kill -9 in a burst of goals: what a client was told to be accepted is booked, or refused aloud.
+"""A node is killed in a burst of goals: each accepted goal is booked, or the log has its refusal.
 
-Three kills by default; ``GOAL_KILLS=100`` kills a hundred times.
+The node is killed three times by default, and a hundred times with ``GOAL_KILLS=100``.
 """
 
 from __future__ import annotations
@@ -23,15 +23,18 @@ BURST = 40
 
 
 def _goal(number: int) -> rig.Goal:
-    """Return a goal; every fourth is refused."""
+    """Return a goal; if its number is a multiple of four, its node is unknown and it is refused."""
     wrong = {} if number % 4 else {"target_node_id": "egde"}
     return {**connection(number % BURST, **wrong), "id": f"request{number}"}
 
 
 def _killed_in_a_burst(served: Served, client: Client, goals: range, answers: int) -> list[Sent]:
-    """Kill a node that has given some answers and owes others, and return the goals."""
+    """Send the goals, kill the node between its answers, and return what was sent.
+
+    The kill comes after at least `answers` answers, while an accepted goal has none.
+    """
     served.wait_for("taking demands")
-    for _ in range(30):  # it may still know only the node that was killed
+    for _ in range(30):  # the client may still know only the node that was killed
         first = client.send(_goal(0))
         with suppress(AssertionError):
             client.wait(lambda: first.answered, 2)  # noqa: B023

@@ -38,7 +38,6 @@ RECORDER: dict[str, Any] = {
 
 
 def link(id: str) -> dict[str, Any]:
-    """Return a connection."""
     topics = [{"source": "/a", "qos": 1, "reverse": True}, {"source": "/b", "target": "/c"}]
     return {"id": id, "source": "vehicle00", "target": "edge", "topics": topics}
 
@@ -50,13 +49,13 @@ def operations(served: Served, since: str) -> list[str]:
 
 @pytest.fixture
 def before(shared: Served) -> str:
-    """The newest commit before a test."""
+    """The newest commit of the shared node's state repo before the test."""
     return tip(shared.state_repo)
 
 
 @pytest.fixture
 def raw(shared: Served) -> Iterator[SingleThreadedExecutor]:
-    """An executor in the domain of the shared node, with a node that is not the client's."""
+    """An executor in the domain of the shared node, with a ROS node of its own."""
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=shared.domain)
     executor = SingleThreadedExecutor(context=context)
@@ -83,7 +82,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
         assert books["commit"] == held.commit
     assert shared.bookkeeping()["services"] == {}
     assert operations(shared, before) == ["put", "release"]
-    # an action client may miss feedback at the start, and forgets it once it has the result
+    # an action client may miss the first feedback, and drops what comes after the result
     assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
@@ -186,7 +185,7 @@ def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
 
 @pytest.fixture
 def short_leases(shared: Served) -> Iterator[None]:
-    """The domain's leases end after two seconds."""
+    """Make leases in the access domain end after two seconds, for the length of a test."""
     repo = GitRepo(Path(shared.state_repo))
     text = repo.files(POLICY)[POLICY]
     policy = yaml.safe_load(text)

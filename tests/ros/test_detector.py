@@ -1,4 +1,4 @@
-"""The event detector as people run it: vehicles publish where they are, the node books demands."""
+"""The event detector as a process: vehicles publish their poses, and the node books demands."""
 
 from __future__ import annotations
 
@@ -28,13 +28,17 @@ from tests.kit.ros import Served, Servers
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
 _MOST_AHEAD_S = 2.0
-"""Less than the silence, 5 s, after which a vehicle has left: a slow machine must not look so."""
+"""How far the simulated time may run ahead of the detector's.
+
+The detector takes a vehicle that is silent for 5 s for gone. With less than that, a slow machine
+makes no vehicle look silent.
+"""
 STATION = (-5352.679, -3363.067)
 S, V0, V1, V2, V3 = paper.S, paper.V0, paper.V1, paper.V2, paper.V3
 
 
 class Fleet:
-    """Vehicles that publish where they are, ten times a second, while a test waits."""
+    """Vehicles that publish their poses ten times a second while a test waits in `until`."""
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
@@ -48,12 +52,12 @@ class Fleet:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
         self._clock = self.node.create_publisher(Clock, "/clock", 10)
         self._seconds, self.pace = 1000.0, 1.0
-        """The simulated time, and how fast it passes."""
+        """The simulated time in seconds, and its speed relative to the real time."""
         self._limit = inf
-        """The simulated time waits here until the detector has told a later time."""
+        """The simulated time stops here until the detector reports a later time."""
         self._since = 0.0
         self.is_timeless = False
-        """Publish no clock."""
+        """Whether the vehicles publish no simulated time."""
         self.node.create_timer(0.1, self._publish)
 
     def _hear(self, message: Any) -> None:
@@ -64,14 +68,14 @@ class Fleet:
             self._limit = told + _MOST_AHEAD_S
 
     def drive(self, vehicle: str, away: float) -> None:
-        """Move a vehicle to a distance from the station."""
+        """Place a vehicle at a distance from the station, in meters."""
         if vehicle not in self._publishers:
             topic = f"/vehicles/{vehicle}/pose"
             self._publishers[vehicle] = self.node.create_publisher(PoseStamped, topic, 10)
         self._away[vehicle] = away
 
     def forget(self) -> None:
-        """Await another detector."""
+        """Discard what the last detector reported, so that `until` waits for the next one."""
         self.statuses.clear()
         self._limit, self._since = inf, self._seconds
 
@@ -93,12 +97,12 @@ class Fleet:
         self._clock.publish(message)
 
     def entities(self) -> str:
-        """Return how many entities the detector has seen."""
+        """Return how many entities the detector reports, as text; empty before a report."""
         status = self.statuses.get("demandops_detector: data")
         return {pair.key: pair.value for pair in status.values}["entities"] if status else ""
 
     def until(self, true: Callable[[], object], what: str) -> None:
-        """Publish until something holds."""
+        """Publish poses until `true` returns a true value; `what` names it in the error."""
         next_look = [0.0]
 
         def spun() -> object:
@@ -108,7 +112,7 @@ class Fleet:
                 return False
             found = true()
             took = time.monotonic() - began
-            next_look[0] = time.monotonic() + max(0.2, took)  # it must not stop the vehicles
+            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles go on between
             return found
 
         wait_until(spun, what, 60)
@@ -121,7 +125,10 @@ class Fleet:
 
 @pytest.fixture
 def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
-    """Start commands as people do: a detector that starts faster still hears older bookkeeping."""
+    """Starts each command in a new process, as a person does.
+
+    A detector from a warm process starts so fast that it still receives older bookkeeping.
+    """
     started = Servers(tmp_path, ros_domain)
     yield started
     started.kill()
@@ -142,7 +149,7 @@ def commits(served: Served) -> list[str]:
 def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_paper(
     servers: Servers, fleet: Fleet, new_repo: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    """And a restart of the detector changes none of them. Time is simulated."""
+    """The detector restarts on the way, which changes no demand. Time is simulated."""
     served = servers.start(str(new_repo("state.git")))
 
     def detect() -> Served:
@@ -161,16 +168,16 @@ def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_pa
     for step, vehicle in enumerate((V0, V1, V3, V2), start=1):
         fleet.drive(vehicle, 83)
         expect(step)
-    fleet.drive(V2, 89)  # it stops at 90 m
+    fleet.drive(V2, 89)  # its demand ends only beyond 90 m
     fleet.drive(V0, 91)
     expect(5)
     assert detecting.stop() == 0
-    fleet.mute(V1)  # gone before the detector is back
+    fleet.mute(V1)  # the vehicle leaves while the detector is down
     fleet.forget()
     fleet.is_timeless = True
     detecting = detect()
     fleet.until(lambda: fleet.node.count_subscribers("/demandops/bookkeeping"), "it is heard")
-    fleet.is_timeless = False  # the time comes later than the bookkeeping
+    fleet.is_timeless = False  # the detector gets the time only after the bookkeeping
     fleet.until(lambda: fleet.entities() == "3", "the others are seen")
     fleet.pace = 10
     expect(6)
@@ -187,7 +194,7 @@ def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_pa
 
 
 def rules_of(**fields: Any) -> str:
-    """Rules by which each vehicle near the station demands an application."""
+    """Return rules by which each vehicle near the station demands an application."""
     goal = put("near/{entity}", "{entity}", topic=("/vehicles/{entity}/ego_data", "{entity}"))
     demand = {name: value for name, value in goal.items() if name != "kind"}
     demand["applications"][0]["id"] = "edge/near-{entity}"

@@ -1,6 +1,6 @@
-"""The ROS 2 interfaces: their wire format, and one round trip.
+"""The ROS 2 interfaces: their wire format, and a goal with its feedback and result.
 
-Run as a script, this file is the round trip, so that a test can give it an environment.
+A test runs this file as a script, `round_trip`, in an environment of its own.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import pytest
 
 OURS = "application_manager_interfaces"
 
-# What the clients of the reference announce: with another hash they would not connect.
+# The hash that clients of the reference announce; a server with another one would not be found.
 TYPE_HASH = "RIHS01_1190e6ea1469f559e7fc3c50e3255e75c519f1e3ed29a5f860b0ad8f41786bd9"
 
 # The wire format
 
 
 def described(path: str) -> dict[str, str]:
-    """The type hashes in a generated type description, by type."""
+    """Return the type hashes in a generated type description, by the type's name."""
     file = Path(sys.prefix) / "share" / path
     hashes = json.loads(file.read_text(encoding="utf-8"))["type_hashes"]
     return {entry["type_name"]: entry["hash_string"] for entry in hashes}
@@ -144,7 +144,7 @@ def test_a_goal_goes_round_with_nothing_set_by_hand(tmp_path: Path, ros_domain: 
 
 
 def round_trip() -> None:
-    """One goal from a client to a server in this process; prints what came back."""
+    """Send one goal to a server in this process; print its status, feedback and result as JSON."""
     import rclpy
     from application_manager_interfaces.action import DeploymentRequest
     from application_manager_interfaces.msg import Application, Connection

@@ -31,7 +31,7 @@ from tests.kit.ros import Client, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
-    """Hold every push to a repository until its file ``go`` is there, and return its URL."""
+    """Delay every push to a repository until its folder has a file ``go``; return the URL."""
     hook(bare, "pre-receive", "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
 
@@ -98,7 +98,10 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.parametrize("end", ["", "thread.close(); node.destroy_node()"])
 def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> None:
-    """Closed or forgotten: Python aborts if a thread is in ROS when it ends."""
+    """Python would abort at its end if the executor's thread were still in ROS.
+
+    The program ends once with the thread closed, and once without.
+    """
     program = (
         "import rclpy, time; from demandops_ros.ros_process import ExecutorThread\n"
         "rclpy.init(); node = rclpy.create_node('busy')\n"
@@ -137,7 +140,7 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy(
     told = 0
 
     def pass_time(seconds: int) -> None:
-        """Let the time run, fast, until the node tells a time that is so much later."""
+        """Publish a fast clock until the node reports a time that is this many seconds later."""
         nonlocal told
         after, began = told, time.monotonic()
 
@@ -188,7 +191,7 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
     client.ready()
     committed = client.send(connection(1))
     client.wait(lambda: any(text.startswith("committed") for text in committed.feedback))
-    waiting = client.send(connection(2))  # the worker is busy pushing the first
+    waiting = client.send(connection(2))  # the worker still pushes the first goal
     client.wait(lambda: waiting.accepted is not None)
     assert client.cancel(waiting)
     assert not client.cancel(committed)

@@ -30,7 +30,7 @@ FILE_NAME = "ConfigMap perception/of-params params.yml"
 
 
 class Cluster:
-    """An API server with one ConfigMap, which answers a watch when the ConfigMap changes."""
+    """An API server with one ConfigMap; it answers a watch as soon as the ConfigMap changes."""
 
     def __init__(self) -> None:
         self.item = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {}}
@@ -69,7 +69,7 @@ StartFusion = Callable[[], "subprocess.Popen[bytes]"]
 
 @pytest.fixture
 def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
-    """Start the stand-in of the fusion; its end is the test's."""
+    """Return a function that starts the stand-in of the fusion; the end of the test kills it."""
     environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain), "PYTHONFAULTHANDLER": "1"}
     names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
     topics = [f"{name}_topic:=/{name}" for name in names]
@@ -115,7 +115,7 @@ def test_a_node_follows_without_a_restart_and_after_one(
     client.wait(lambda: read_by_the_fusion(client) == {"/a", "/b"})
     cluster.hold("/b", "/c")
     client.wait(lambda: read_by_the_fusion(client) == {"/b", "/c"})
-    assert cluster.reads <= 3  # it watches: it does not read again and again
+    assert cluster.reads <= 3  # it watches the ConfigMap, and does not poll it
     log = sync.log
     cluster.hold(text="of_edge_fusion: 5")
     fault = f"{FILE_NAME}: of_edge_fusion.ros__parameters: must be a mapping"

@@ -55,7 +55,7 @@ def ros() -> Iterator[None]:
 def told(folder: Path, text: str, **files: str) -> list[str]:
     file = folder / "params.yml"
     file.write_text(text)
-    # the way that a launch file starts a node: under a name that it gives
+    # a launch file sets the node's name like this
     args = ["--ros-args", "-r", "__node:=demandops", "--params-file", str(file)]
     values = reference_parameters.read(args)
     assert values["deployment_action_name"] == "/fleet/deployment_request"
@@ -82,7 +82,7 @@ def test_the_page_names_the_images_as_the_registry_has_them(ros: None, tmp_path:
     )
     files = {"registry/images.yaml": images}
     assert told(tmp_path, text, **files) == REPLACED[:1]
-    # as object_detection_fusion_app.py and mqtt_connection.py of application_manager name them
+    # the names in object_detection_fusion_app.py and mqtt_connection.py of application_manager
     assert {image.reference() for image in load(configuration(files)).images.values()} == {
         f"k3d-registry.localhost:41671/{name}:latest"
         for name in (

@@ -1,4 +1,4 @@
-"""Rules on recorded bags: the demands are those that a plain script over the same poses gives."""
+"""Rules on recorded bags give the same demands as a simple script on the same poses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ Poses = list[tuple[float, str, float, float]]
 
 
 def driven(seed: int) -> Poses:
-    """Vehicles on lines past the station, ten poses a second; some are silent for a while."""
+    """Return poses of vehicles that pass the station on straight lines, ten a second, by time.
+
+    Some vehicles are silent for a while. The seed decides lines, speeds and silences.
+    """
     chance, poses = random.Random(seed), []
     for vehicle in VEHICLES:
         heading, beside = chance.uniform(0, 6.28), chance.uniform(-90, 90)
@@ -51,7 +54,10 @@ def record(path: Path, poses: Poses, plugin: StoragePlugin) -> None:
 
 
 def plainly(poses: Poses) -> list[tuple[float, str, str]]:
-    """When each vehicle comes and goes, by the rule alone: 84 m, 90 m, 5 s of silence."""
+    """Return when each vehicle enters and leaves: the time, the vehicle, and `start` or `stop`.
+
+    A vehicle enters within 84 m, and leaves beyond 90 m or after 5 s of silence.
+    """
     found, end = [], poses[-1][0]
     for vehicle in VEHICLES:
         is_near, heard = False, 0.0
@@ -113,7 +119,7 @@ STATE_FIELDS = "string model\nfloat64[] continuous_state\n"
 def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
     demandops: Run, tmp_path: Path, plugin: StoragePlugin
 ) -> None:
-    """Their package is not installed; only the fields that the detector reads are as they are."""
+    """The package of EgoData is not installed; the test defines only what the detector needs."""
     types = get_typestore(Stores.ROS2_KILTED)
     types.register(get_types_from_msg(STATE_FIELDS, "perception_msgs/msg/ObjectState"))
     types.register(get_types_from_msg(EGO_FIELDS, EGO))

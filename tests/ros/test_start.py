@@ -1,4 +1,4 @@
-"""What `demandops serve` refuses at its start, with the remedy; a start that hangs is told."""
+"""What `demandops serve` refuses at its start, and how tests report a start that hangs."""
 
 from __future__ import annotations
 

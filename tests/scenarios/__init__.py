@@ -1,1 +1,1 @@
-"""What must come of demands, told as YAML: see ``README.md``."""
+"""Scenarios in YAML: demands, and what each must cause. ``README.md`` describes their form."""

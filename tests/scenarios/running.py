@@ -1,7 +1,7 @@
-"""Scenarios: how they are read, and a state repo in memory to run them on.
+"""Read scenarios, and run them on a state repo in memory.
 
-Time passes only where a scenario says so. Leases are looked at as the generator does, with its own
-clock, after every step.
+Time passes only where a step has ``after`` or ``clock``. In every step, before its demand is
+sent, the generator's own lease clock decides which leases have ended.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
 
 
-# ---- what a scenario says ----
+# # ---- the form of a scenario ----
 
 
 class Told(FrozenModel):
-    """A fault that must be told: its code, its field, and words of its message."""
+    """An expected fault: its code, file and field, and words that its message contains."""
 
     code: str = "invalid"
     file: str = ""
@@ -62,12 +62,12 @@ _CHECKS = (
 
 
 class Step(FrozenModel):
-    """One thing that happens and what must come of it; only what is listed is compared.
+    """One event of a scenario, and its expected effects; an effect that is None is not compared.
 
-    ``after`` lets time pass, ``clock`` sets the wall clock alone, by a duration that may be
-    negative. ``restart`` forgets what a generator has in memory, ``config`` is laid over the
-    scenario's from here on, as by a person's commit. ``expires`` are the demands that
-    the generator releases then, in order; none, where it is left out.
+    ``config`` changes the configuration from this step on, like a person's commit. ``after`` lets
+    time pass. ``clock`` moves only the wall clock, by a duration that may be negative. ``restart``
+    discards what the generator has in memory. ``expires`` lists the demands that the generator
+    releases after these changes, in order; without it, the generator must release none.
     """
 
     why: str = ""
@@ -104,10 +104,11 @@ class Step(FrozenModel):
 
 
 class Scenario(FrozenModel):
-    """A whole scenario. ``config`` is laid over what ``demandops init`` lays down.
+    """A whole scenario.
 
-    Mappings in it are merged, all else replaces what stands. ``appdefs`` are further folders of
-    ``tests/appdefs``. Where the configuration itself is not valid, ``invalid`` lists its faults.
+    ``config`` changes the files that ``demandops init`` writes: its mappings are merged into them,
+    and any other value replaces theirs. ``appdefs`` names folders of ``tests/appdefs`` to add.
+    ``invalid`` lists the expected faults of a configuration that is not valid.
     """
 
     must: str = Field(min_length=1)
@@ -124,7 +125,7 @@ class Scenario(FrozenModel):
 
 
 def read(text: str, file: str) -> Scenario:
-    """Parse a scenario; raise ``InvalidInput`` where it could not fail."""
+    """Parse a scenario; raise ``InvalidInput`` if it is not valid or checks nothing."""
     return parse_file(Scenario, text, file)
 
 
@@ -144,7 +145,7 @@ def _laid_over(below: Any, above: Any) -> Any:
 def configuration(
     appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
-    """Return the files of a state repo that people own."""
+    """Return the configuration files of a state repo, by path, with these appdefs and changes."""
     files = skeleton_config()
     overlays: list[tuple[str, Any]] = []
     for name in (*appdefs, "driver") if appdefs else ():
@@ -169,7 +170,7 @@ def configuration(
 
 
 class World(MemoryRepo):
-    """A state repo in memory, and one generator at it."""
+    """A state repo in memory, with the clock and the memory of one generator."""
 
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
         super().__init__(state=state)
@@ -179,7 +180,7 @@ class World(MemoryRepo):
         self.restart()
 
     def configure(self, state: State, config: Mapping[str, str]) -> None:
-        """Take a configuration in, and write what follows of it."""
+        """Replace the configuration, and write the files that the generator derives from it."""
         before = self.state.ledger
         self.state = replace(state, ledger=self.state.ledger)
         moved = following_overrides(self.state)
@@ -193,12 +194,12 @@ class World(MemoryRepo):
         self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
-        """Forget all that is not in the state repo."""
+        """Discard the generator's memory: its lease clock and its rate limits."""
         self._lease_clock = LeaseExpiry(self.clock)
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal; nothing changes."""
+        """Return the decision on a goal, without a change of the state repo."""
         self._sent += 1
         operation, now = f"hand-in-{self._sent}", now or self.clock.now()
         return decide(
@@ -210,9 +211,10 @@ class World(MemoryRepo):
         )
 
     def look(self) -> list[str]:
-        """Release what has expired, one commit for each demand; return the demands.
+        """Release the demands whose leases have ended; return them in order.
 
-        What was placed on drained nodes moves then too, and replicas go whose time is over.
+        Like the generator, it then removes the replicas that were kept until now, moves placed
+        applications away from drained nodes, and tries the waiting demands.
         """
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
@@ -230,24 +232,24 @@ class World(MemoryRepo):
         return done
 
     def book_waiting(self) -> None:
-        """Try the demands that wait, in turn."""
+        """Try to book each waiting demand, in the order of the queue."""
         for waiting in in_turn(self.state.ledger.waiting):
             taken = self.take(dict(waiting.goal))
             assert isinstance(taken, Decision), taken
 
     def waiting(self) -> list[str]:
-        """Return the demands that wait, in turn."""
+        """Return the ids of the waiting demands, in the order of the queue."""
         return [one.demand for one in in_turn(self.state.ledger.waiting)]
 
     def runs(self) -> dict[str, list[str]]:
-        """Return who requests each service, which is told by what it is for."""
+        """Return the requesters by service, named like `driver for vehicle00 /points on edge`."""
         return {
             f"{entry['service']} for {_purpose(entry)} on {entry['node']}": entry["requesters"]
             for entry in self.books()["services"].values()
         }
 
     def leases(self) -> dict[str, datetime]:
-        """Return the recorded ends by demand, the last of each."""
+        """Return the latest recorded end of a lease of each demand."""
         found: dict[str, datetime] = {}
         for claim in self.state.ledger:
             if claim.lease:
@@ -257,7 +259,7 @@ class World(MemoryRepo):
         return found
 
     def assert_sound(self) -> None:
-        """The files say what the books say, and nothing else is there."""
+        """Check that the files contain exactly the ledger and the releases that follow from it."""
         assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
@@ -276,7 +278,7 @@ def _purpose(entry: Mapping[str, Any]) -> str:
 
 
 def run(scenario: Scenario) -> None:
-    """Take every step and compare what the scenario says of it."""
+    """Run every step, and raise an AssertionError if its effects are not the expected ones."""
     files = configuration(scenario.appdefs, scenario.config)
     world = World(State.of(load(files), Ledger()), files)
     for number, step in enumerate(scenario.steps, 1):
@@ -326,7 +328,7 @@ def _take(step: Step, world: World, place: str) -> None:
 
 
 def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
-    """Yield what of a demand's answer is not as the step says."""
+    """Yield each difference between the decision on a demand and what its step expects."""
     if isinstance(taken, Refused):
         told = "\n".join(f"{found.code}: {found}" for found in taken.faults)
         if step.refused is None:
@@ -353,7 +355,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
 
 
 def same_faults(wanted: Iterable[Told], found: Iterable[Fault]) -> bool:
-    """Return whether each fault found is one that was expected, and the other way round."""
+    """Return whether every fault found is expected, and every expected fault is found."""
     wanted, found = list(wanted), list(found)
     return len(wanted) == len(found) and all(
         any(told.fits(fault) for fault in found) for told in wanted
@@ -365,7 +367,7 @@ def _of_connections(world: World, what: str) -> dict[str, list[str]]:
 
 
 def _since_start(moment: datetime) -> str:
-    """Return a moment as the scenario's own time: ``1h30m``."""
+    """Return a moment as the duration since the scenario's start, as ``1h30m``."""
     rest = int((moment - START).total_seconds())
     parts = []
     for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):

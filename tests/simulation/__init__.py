@@ -1,1 +1,1 @@
-"""Generators in one thread by a seed, with people and faults: ``make simulate``."""
+"""Generators in one thread with people and faults, all from a seed: ``make simulate``."""

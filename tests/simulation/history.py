@@ -1,4 +1,4 @@
-"""One history by a seed: about thirty things that happen, then all is healed and must be right."""
+"""A random history from a seed: about thirty steps, then faults are mended and all is checked."""
 
 from __future__ import annotations
 
@@ -70,7 +70,10 @@ watcher: {nodeName: {{ (release | ros_name) ~ "_Watcher" }}}
 
 @lru_cache(maxsize=1)
 def template() -> Path:
-    """Return a state repo in memory with leases, approval and nodes that may be full; copy it."""
+    """Return the state repo that every history copies; its nodes may become full.
+
+    It is in memory, and has leases and approval.
+    """
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
     files = GitRepo(path).files()
     policy, nodes, appdef = (yaml.safe_load(files[name]) for name in (POLICY, NODES, APPDEF))
@@ -119,7 +122,7 @@ def _versions(testing: str) -> str:
 
 
 class History:
-    """What happens in a world."""
+    """A random history of a world: demands, crashes, network faults and people's commits."""
 
     def __init__(self, world: World) -> None:
         self.world, self.oracle = world, Oracle(world)
@@ -138,7 +141,7 @@ class History:
         )
 
     def run(self, steps: int) -> None:
-        """Let things happen, then heal everything and check the end."""
+        """Let random things happen in ``steps`` steps, then mend all faults and check the end."""
         things = (
             [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
             + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
@@ -155,7 +158,7 @@ class History:
         self.oracle.check_end()
 
     def heal(self) -> None:
-        """Mend everything, decide every proposal, and wait until every lease is over."""
+        """Mend all faults, decide all proposals, and wait until all leases are over."""
         for machine in self.world.machines:
             machine.is_cut_off, machine.delay = False, 0.0
             machine.crashes_in = machine.losses = machine.rejections = 0
@@ -169,7 +172,7 @@ class History:
             while self._branches():
                 self.decide()
             self.turns.sleep(30)
-        # those that wait follow each other on the places
+        # the waiting demands get the places one after the other
         self.turns.sleep(8 * (_LONGEST_LEASE_S + SLACK_S + LONGEST_WAIT_S))
 
     # ---- what happens ----
@@ -178,7 +181,7 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Give a place back, and at once ask for places."""
+        """Send the release of a place, if one is held, together with two demands for places."""
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
@@ -187,7 +190,7 @@ class History:
         self._send(goals)
 
     def _send(self, goals: list[Goal]) -> None:
-        """Send demands to one machine; while it does something else, they become one batch."""
+        """Send demands to one machine; they become one batch if its generator is busy meanwhile."""
         ready = [machine for machine in self.world.machines if machine.generator]
         machine = self.chance.choice(ready) if ready else None
         for goal in goals if machine else ():
@@ -202,7 +205,7 @@ class History:
             return self._tallied()
         if kind == 0:
             return self._visitor()
-        if kind == 1 and self._sent:  # as who waited in vain for an answer
+        if kind == 1 and self._sent:  # sent again, as by a requester who got no answer
             return self.chance.choice(self._sent[-6:])
         if kind == 2:
             return self._maker._message(shutdown=bool(self.chance.randrange(2)))
@@ -211,12 +214,12 @@ class History:
         return self._maker.any()
 
     def _tallied(self) -> Goal:
-        """Return a demand for an instance on a node in two access domains."""
+        """Return a put, release or renewal for an instance on the node in two access domains."""
         topics = self.chance.sample(range(4), self.chance.randrange(1, 5))
         inputs = {"ego_data": [{"topic": f"/e{one}", "source": "vehicle00"} for one in topics]}
         known = [one for one in self._sent if one.get("demand", "").startswith("tally")]
         puts = [one for one in known if one["operation"] == "put"]
-        if puts and self.chance.randrange(3):  # else each would hold something else
+        if puts and self.chance.randrange(3):  # mostly the same demand again
             (app,) = puts[-1]["applications"]
             return puts[-1] | {"applications": [app | {"inputs": inputs}]}
         names = ["traffic", "vehicle01", "vehicle01", "vehicle01", "vehicle00"]
@@ -237,7 +240,7 @@ class History:
         return made | ({"lease": lease} if lease else {})
 
     def _placed(self) -> Goal:
-        """Return a demand whose node the generator chooses, if one has room."""
+        """Return a put, release or renewal of a demand whose node the generator chooses."""
         number = self.chance.randrange(4)
         who = [f"vehicle0{one}" for one in self.chance.choice([[0], [1], [0, 1]])]
         made = {"kind": "Demand", "demand": f"place{number}", "requesters": who}
@@ -299,9 +302,10 @@ class History:
             machine.is_cut_off, machine.delay = False, 0.0
 
     def set_clocks(self) -> None:
-        """Set the clocks; once set back, not forward again before every machine has seen it.
+        """Set the wall clocks forward or back; after a step back, only further back.
 
-        Who saw neither may end a lease early that another recorded in between.
+        Otherwise a machine might notice neither step. It might then end a lease early that another
+        machine recorded between the two steps.
         """
         self.oracle.check()
         sign = self.chance.choice([-1, 1]) if self.turns.offset == self._latest else -1
@@ -341,7 +345,7 @@ class History:
         self._commit({NODES: yaml.safe_dump(data)})
 
     def _drain(self) -> None:
-        """Take a node out of service, mostly one in use, or back in."""
+        """Drain a node, or end its draining; the node is mostly one in use."""
         self.oracle.check()
         data, books = yaml.safe_load(self._files(NODES)[NODES]), self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
@@ -394,7 +398,7 @@ class History:
         return sorted(b for b in self.world.remote.branches.local if b.startswith("demand/"))
 
     def decide(self) -> None:
-        """Merge a proposal, or delete its branch."""
+        """Choose a proposal, merge it or not, and delete its branch."""
         if not (branches := self._branches()):
             return
         remote, branch = self.world.remote, self.chance.choice(branches)
@@ -416,7 +420,7 @@ class History:
 
 
 def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
-    """Play a history; return its last commit, and how many demands, commits and so on it had."""
+    """Play the history of a seed; return the last commit, and counts of what happened."""
     with TemporaryDirectory(dir=MEMORY, prefix="simulation-") as folder:
         world = World(seed, template(), Path(folder), machines=1 + seed % 3)
         history = History(world)
@@ -427,6 +431,6 @@ def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
 
 
 def clean_up() -> None:
-    """Remove the template."""
+    """Remove the state repo that :func:`template` made."""
     shutil.rmtree(template().parent)
     template.cache_clear()

@@ -1,4 +1,4 @@
-"""What must be so of a history: every commit of main is held against the independent model."""
+"""Checks of a history: each commit on main and each answer must be possible in the model."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from tests.simulation.world import Machine, World
 
 SLACK_S = 30
 PLACES = frozenset({"rack0", "rack1"})
-"""The nodes of which each has room for one application that names no node."""
+"""The nodes that have room for one application each, if its demand names no node."""
 KEPT_REPLICAS = "ledger/replicas"
 VISITOR = "visitor"
-"""Begins the names of those whose demands need approval."""
+"""The start of the ids of requesters whose demands need approval."""
 
 
 @dataclass(eq=False)
 class Asked:
-    """A demand that was sent, when, and after how many commits of main."""
+    """A demand that was sent to a machine: when, and after how many commits (``place``)."""
 
     goal: Goal
     machine: Machine
@@ -54,25 +54,28 @@ class Asked:
 
     @property
     def subjects(self) -> set[Subject]:
-        """What it is about, the demand by its name too: such demands keep their order."""
+        """The subjects of the demand, and the demand's name.
+
+        Demands that have one of these in common are booked in the order in which they were sent.
+        """
         found = {("demand", self.goal["demand"])} if "demand" in self.goal else set()
         kinds = ("applications", "connections")
         return found | {(kind, each["id"]) for kind in kinds for each in self.goal.get(kind, ())}
 
 
 class Oracle:
-    """Follows main and the answers, and fails when one is not as the model says."""
+    """Follows main and the answers, and fails when one of them contradicts the model."""
 
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
         self.edits: dict[str, Callable[[Instances], object]] = {}
-        """What people's commits change of what is booked."""
+        """What people's commits change in the model, by the commit's id."""
         self.counts = Counter[str]()
         self._seen = world.tip
         self.books = Instances(SLACK_S, nodes=PLACES)
         self._pushed_at = world.turns.monotonic()
-        """When the last tip of main that was looked at was pushed, or seen."""
+        """When the oracle last found a new tip of main."""
         self._models = [deepcopy(self.books)]
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
@@ -97,13 +100,13 @@ class Oracle:
         return asked
 
     def check(self) -> None:
-        """Fail if anything that happened should not have."""
+        """Follow main; fail if anything contradicts the model since the last check."""
         self._guard(self._follow_main)
         if self.world.failure is not None:
             raise self.world.failure
 
     def claims(self, revision: str = MAIN) -> dict[str, Claim]:
-        """Return the claims of a commit by their files."""
+        """Return the claims of a commit, by the paths of their files."""
         tree = trees.commit_of(self.world.remote, revision).tree
         found = {}
         for path, blob in trees.blobs(tree, ["ledger"]):
@@ -165,7 +168,7 @@ class Oracle:
     def _compare_instances(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> None:
-        """Fail unless each instance runs as it should, with what it keeps."""
+        """Fail unless the rendered instances and the kept replicas are those of the model."""
         entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
         self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
         for one in self.books.kept.keys() | records.keys():
@@ -187,7 +190,10 @@ class Oracle:
     def _time_of_own_work(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> datetime:
-        """Return when a generator did something by itself, as a new record says if there is one."""
+        """Return when a generator acted on its own.
+
+        A new record of kept replicas gives the exact time. Otherwise it is the time of the commit.
+        """
         known = {end for steps in self._records.values() for end in steps.values()}
         told = {end for steps in records.values() for end in steps.values()} - known
         made = _made(commit)
@@ -201,7 +207,7 @@ class Oracle:
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return who waits in a commit, since when and how urgently."""
+        """Return the priority, the time and the requesters of each waiting demand in a commit."""
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
         found = [plain_yaml.load(text) for text in texts]
         return {
@@ -210,7 +216,10 @@ class Oracle:
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
-        """Book what a generator did by itself: it ended leases, let one in, or emptied a node."""
+        """Update the model with what a generator did on its own.
+
+        It ended leases, booked a waiting demand, or moved applications away from a drained node.
+        """
         both = self._claims.keys() & claims.keys()
         moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
         let_in = {demand for demand, _ in claims.keys() - both}
@@ -224,16 +233,16 @@ class Oracle:
         assert moved or gone or let_in, "an operation that nobody asked for"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
-        """Return the demands of a commit and of all that it merges, and whether each was proposed.
+        """Return the operations of a commit and of all commits that it merges.
 
-        The lease of a demand that was proposed starts when it is merged, which is now.
+        Each comes with whether it was proposed. The lease of a proposed demand starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:
             remote, main = self.world.remote, commit.parents[0].id
             walker = remote.walk(commit.parents[1].id)
             walker.hide(main)
-            # libgit2 does not hide all of them if a clock was set back in between
+            # libgit2 may not hide all commits of main if a clock was set back
             commits += [one for one in walker if not remote.descendant_of(main, one.id)]
         return [
             (operation, PROPOSAL in trailers)
@@ -246,7 +255,7 @@ class Oracle:
         for demand, subject in gone:
             held, jump = self.books.held[demand][subject], self.world.last_jump
             assert held.promised is not None and held.seconds is not None, f"{demand}: no lease"
-            # after a jump every lease gets its full term, from those who saw the jump
+            # after a jump, every lease gets its full term from the machines that saw the jump
             full_term = jump + held.seconds if started < jump else jump
             least = held.promised if jump < 0 else min(held.promised, full_term)
             assert time >= least, f"the lease of {demand} ended {least - time} s early"
@@ -266,7 +275,10 @@ class Oracle:
         )
 
     def _guard(self, check: Callable[[], object]) -> None:
-        """Keep a failure for the next check: generators and futures survive most errors."""
+        """Run a check; keep its failure for the next :meth:`check`.
+
+        Generators and futures would catch most errors.
+        """
         try:
             check()
         except Exception as error:
@@ -290,7 +302,7 @@ class Oracle:
                 self._take(self.books, asked, asked.time)
         elif outcome == "waiting" and place is None:
             self._assert_possible(asked, "waits")
-        elif asked.needs_approval and place is None:  # taken back, or main had its claims already
+        elif asked.needs_approval and place is None:  # withdrawn, or main had its claims already
             if outcome != "released":
                 self._assert_possible(asked, "unchanged")
         else:
@@ -300,7 +312,7 @@ class Oracle:
                 self._last[asked.machine] = place
 
     def _assert_possible(self, asked: Asked, outcome: str) -> None:
-        """Fail unless the model says so in some state between the question and the answer."""
+        """Fail unless the model allows the outcome in a state between the demand and its answer."""
         said = self._possible(asked)
         told = f"{asked.goal} was answered {outcome} {asked.ticket.future.exception() or ''}"
         assert outcome in said, f"{told}, but the model says {said}"
@@ -312,7 +324,7 @@ class Oracle:
     # ---- machines ----
 
     def _check_resumed(self, machine: Machine) -> None:
-        """Fail if a machine forgot a demand at a crash; watch for the other answers."""
+        """Fail if a machine lost a demand in a crash; watch for the other demands' answers."""
         self._last.pop(machine, None)
         assert machine.generator is not None
         tickets = machine.generator._demands._tickets
@@ -325,7 +337,7 @@ class Oracle:
                 continue
             asked.is_lost = True
             if asked.ticket.state not in ("arrived", "done"):
-                # at a crash the journal may say already what the requester was not told
+                # at a crash, the journal may already have an outcome that the requester did not get
                 may_fail = machine.has_rejected or asked.needs_approval
                 may_fail |= not self._possible(asked).isdisjoint({"refused", "unchanged", "waits"})
                 assert may_fail or operation in self._place, (
@@ -333,7 +345,10 @@ class Oracle:
                 )
 
     def check_end(self) -> None:
-        """Fail unless all is answered and in effect, long after everything was healed."""
+        """Fail unless all demands are answered, and all that is booked is in effect.
+
+        The check comes long after all faults were mended.
+        """
         self.check()
         tip = self.world.tip
         left = [op for op, one in self.asked.items() if not (one.is_answered or one.is_lost)]
@@ -362,7 +377,7 @@ def _made(commit: pygit2.Commit) -> datetime:
 
 
 def _records_in(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    """Return the replicas that services keep, and until when."""
+    """Return how many replicas each instance keeps, and until when."""
     return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
 
 

@@ -1,6 +1,7 @@
-"""``make simulate``: plays histories for ``SIMULATE_S`` seconds, from ``SEED`` or any.
+"""``make simulate``: plays histories for ``SIMULATE_S`` seconds, from ``SEED`` or a random seed on.
 
-A history that fails is told with the command that plays it again, and the run goes on until ten do.
+For each history that fails, it prints the command that plays the history again. It stops after ten
+failures.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ RESULTS = Path("build/simulate.json")
 
 
 def main() -> int:
-    """Play one history if ``HISTORIES=1``, else as many as there is time for; add them up."""
+    """Play at most ``HISTORIES`` histories while there is time; return 1 if one failed, else 0."""
     os.environ.update(NO_GIT_CONFIG)
     logging.disable(logging.CRITICAL)
     sync.force(False)
@@ -57,7 +58,7 @@ def main() -> int:
 
 
 def told(counts: Counter[str]) -> str:
-    """Return counts as a person reads them."""
+    """Return counts as one line of text."""
     names = (
         "histories",
         "demands",

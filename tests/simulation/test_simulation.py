@@ -1,4 +1,4 @@
-"""The simulation is exact, passes, and finds faults that are planted for the purpose."""
+"""A seed determines the whole history, and the oracle finds each fault that is planted."""
 
 from __future__ import annotations
 
@@ -251,7 +251,10 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     take_the_first_domain: 1,
     forget_what_is_booked_in_a_domain: 20,
 }
-"""Each with a seed that found it at once when this was written; others are tried if it does not."""
+"""Each planted fault, with a seed that found it at once when this was written.
+
+If that seed no longer finds the fault, other seeds are tried.
+"""
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)

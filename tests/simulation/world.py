@@ -1,8 +1,9 @@
 """Machines with generators, a remote, and a network and disks that fail, all in one thread.
 
-Generators are the production code. Replaced are only: clock, chance and threads (``Turns``), the
-call of git (a push or a fetch moves a reference, because all clones share one folder of objects),
-and the calls that force a write (a crash keeps of a journal what a disk may have kept).
+The generators are the production code. Only three things are replaced. ``Turns`` replaces the
+clock, random numbers and threads. A push or fetch only moves a reference, because all clones share
+one folder of objects. A forced write of the journal is recorded, so that a crash leaves only what a
+disk may have kept.
 """
 
 from __future__ import annotations
@@ -51,14 +52,14 @@ class Machine(Runtime):
         self.crashes_in = self.losses = self.rejections = 0
         self.is_cut_off, self.delay = False, 0.0
         self.has_rejected = False
-        """Whether a push of it was refused by the remote."""
+        """Whether the remote has rejected a push of this machine."""
 
     def start_thread(self, name: str, target: Callable[[], object]) -> Any:
         self.threads.append(self.turns.start_thread(name, target))
         return self.threads[-1]
 
     def start(self) -> None:
-        """Start the generator, as soon as the remote is there if it needs it."""
+        """Start the generator in a thread; try again while it cannot fetch from the remote."""
         self.is_up = True
         self.start_thread("start", self._start)
 
@@ -76,20 +77,23 @@ class Machine(Runtime):
         self.world.on_start(self)
 
     def failed(self, name: str, error: Exception) -> None:
-        """Note what no fault of this world explains."""
+        """Make an unexpected error the world's failure."""
         super().failed(name, error)
         if not isinstance(error, DemandOpsError):
             self.world.failure = self.world.failure or error
 
     def may_crash(self) -> None:
-        """Crash if it is time; then the calling thread never goes on."""
+        """Crash at the call that ``crashes_in`` has set; the calling thread never goes on."""
         if self.crashes_in and getcurrent() in self.threads:
             self.crashes_in -= 1
             if not self.crashes_in:
                 self.crash()
 
     def crash(self) -> None:
-        """Lose all but what the disk keeps, which is moved out of the reach of the dead."""
+        """Stop all threads and lose all but what the disk keeps.
+
+        What is kept moves to a new folder, which the stopped threads cannot reach.
+        """
         self.world.dead += self.threads
         self.is_up, self.generator, self.crashes_in = False, None, 0
         old, self.folder = (
@@ -110,7 +114,7 @@ class Machine(Runtime):
 
 
 class Disk:
-    """What a disk kept of a journal: names and contents as of the last forced write."""
+    """What a disk keeps of a journal: names and contents at the last forced writes."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -118,7 +122,10 @@ class Disk:
         self._contents: dict[int, bytes] = {}
 
     def sync(self, path: Path) -> None:
-        """Note what a forced write of a file or a folder made durable; a crash may come around."""
+        """Record what a forced write of a file or a folder makes durable.
+
+        The machine may crash before or after the write.
+        """
         self._machine.may_crash()
         if path.is_dir():
             self._names = {found.name: found.stat().st_ino for found in path.iterdir()}
@@ -127,12 +134,15 @@ class Disk:
         self._machine.may_crash()
 
     def sync_all(self, folder: Path) -> None:
-        """Note that all in a folder is durable."""
+        """Record that the journal and the names in a folder are durable."""
         for path in (*folder.glob(_JOURNAL), folder):
             self.sync(path)
 
     def left_of(self, folder: Path) -> bytes | None:
-        """Return a journal after a crash of the process or of the machine."""
+        """Return what is left of a journal after a crash; None if there is no journal.
+
+        The crash is one of the process, which loses nothing, or one of the whole machine.
+        """
         chance, path = self._machine.turns.chance, folder / _JOURNAL
         now = {_JOURNAL: path.stat().st_ino} if path.exists() else {}
         if chance.randrange(2):  # the process alone: all that was written stays
@@ -150,14 +160,14 @@ class Disk:
 
 
 class Clone(RemoteRepository):
-    """A clone whose git is a few lines here, on a network that fails."""
+    """A clone whose git commands are simulated, on a network that fails."""
 
     def __init__(self, machine: Machine, folder: Path, allow_offline: bool) -> None:
         self._machine = machine
         super().__init__(machine.name, folder, lambda text: None, allow_offline)
 
     def tidy(self) -> None:
-        """Leave the shared objects alone."""
+        """Do nothing: all clones share one folder of objects."""
 
     def _clone(self, notify: Callable[[str], None]) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
@@ -253,30 +263,30 @@ def _failed(command: tuple[str, ...], text: str) -> git.GitCommandError:
 
 
 class World:
-    """Machines that share a remote; everything in it follows from the seed."""
+    """Machines that share a remote; the seed determines all that happens."""
 
     def __init__(self, seed: int, template: Path, folder: Path, machines: int) -> None:
         self.turns, self.folder, self.numbers = Turns(seed), folder, count(1)
         self.remote = pygit2.Repository(str(shutil.copytree(template, folder / "remote.git")))
         self.pushed_by: dict[str, tuple[Machine, float, float]] = {}
-        """Who pushed a tip of main, when it had started, and when it did."""
+        """For each pushed tip of main: the machine, when its generator started, when it pushed."""
         self.dead: list[Any] = []
         self.on_start: Callable[[Machine], object] = lambda machine: None
         self.failure: Exception | None = None
-        """What must not happen, if it did."""
+        """The first thing that happened although it must not."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
         self.last_jump = -1.0
-        """When the clocks were set forward the last time."""
+        """When the clocks were last set forward; -1 if they never were."""
 
     @property
     def tip(self) -> str:
-        """The newest commit of main."""
+        """The id of the newest commit of main."""
         return str(self.remote.references[MAIN].target)
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Let the machines run, with the doors of this world."""
+        """Run the machines for the length of a block, with the simulated git and disks."""
         by_name = {machine.name: machine for machine in self.machines}
 
         def connect(address: str, folder: Path, notify: object, *, allow_offline: bool) -> Clone:
@@ -301,11 +311,11 @@ class World:
             self.turns.end(self.dead)
 
     def set_clocks(self, seconds: float) -> None:
-        """Set the wall clock of all machines, as one time server does."""
+        """Move the wall clocks of all machines by some seconds, as one time server does."""
         self.turns.set_by(seconds)
         if seconds > 0:
             self.last_jump = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
-        """Return the seconds of a wall clock's time, to be compared only."""
+        """Return a wall clock's time in seconds, to be compared with other results only."""
         return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)

@@ -60,7 +60,7 @@ COMMANDS = (
     "why object-detection-fusion",
     "why patrol",
 )
-"""None of them changes the fleet."""
+"""Commands that leave the fleet unchanged."""
 
 CHANGING = (
     "approve visit --yes --state-repo fleet.git",
@@ -77,7 +77,7 @@ CHANGING = (
     "version",
     "watch --state-repo fleet.git",
 )
-"""Each of them runs in a copy of the fleet."""
+"""Commands that change the fleet, so each runs in a copy of it."""
 
 NOT_SHOWN = {
     "demand": "needs a running node",
@@ -86,7 +86,7 @@ NOT_SHOWN = {
     "serve": "prints nothing but its log",
     "web": "prints an address",
 }
-"""The commands of which only the help has a file here, and why."""
+"""The commands whose output has no file in `expected`, with the reason; their help has one."""
 
 _HEX = re.compile(
     r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<=after commit )[0-9a-f]{12}"
@@ -97,7 +97,10 @@ _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
-    """Make a fleet with demands, a lease, overrides and contexts in ``folder``, at ``NOW``."""
+    """Make a fleet with demands, a lease, overrides and contexts in ``folder``.
+
+    Afterwards the process runs in ``folder``, and its clock stands at ``NOW``.
+    """
     made, clock = count(), [NOW - timedelta(hours=3)]
     patch.setattr(REAL, "now", lambda: clock[0])
     patch.setattr(REAL, "fresh_id", lambda: f"00000000-0000-4000-8000-{next(made):012}")
@@ -146,14 +149,14 @@ def _done(command: str) -> None:
 
 
 def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
-    """Return what a command prints, without colors and with equal commit ids."""
+    """Return what a command prints, without colors and with one fixed value for all commit ids."""
     with patch.context() as own, TemporaryDirectory() as folder:
         own.setenv("NO_COLOR", "1")
         if command in CHANGING:
             own.chdir(shutil.copytree(Path.cwd(), Path(folder, "fleet")))
             own.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
             own.setenv("HELM_BIN", "no-helm")
-        if command.startswith("config "):  # its table has no paths of this machine
+        if command.startswith("config "):  # its contexts name URLs, no local paths
             own.setenv("XDG_CONFIG_HOME", str(Path.cwd() / "contexts"))
         if command.startswith("watch"):
             own.setattr(REAL, "sleep", _interrupt)
@@ -171,7 +174,7 @@ def _interrupt(seconds: float) -> None:
 
 
 def helps() -> str:
-    """Return the help of all commands at 80 columns, one below the other."""
+    """Return the help texts of all commands at 80 columns, joined to one text."""
     root = click.Context(cli, info_name="demandops", terminal_width=80, **cli.context_settings)
     return "\n".join(
         text for name in sorted(COMMAND_NAMES) for text in _help(load(name), name, root)
@@ -187,7 +190,7 @@ def _help(command: click.Command, name: str, parent: click.Context) -> Iterator[
 
 
 def same_ids(text: str) -> str:
-    """Return a text with equal commit ids."""
+    """Return a text in which every commit id consists of the letter `c`."""
     return _HEX.sub(lambda found: "c" * len(found[0]), text)
 
 

@@ -1,4 +1,4 @@
-"""Commands on a real pseudoterminal: questions, and what is shown while git is slow."""
+"""Commands on a pseudoterminal: their questions, and what they show while git is slow."""
 
 from __future__ import annotations
 

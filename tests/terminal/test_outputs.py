@@ -1,4 +1,4 @@
-"""Each command at 80 columns, as ``tests/terminal/expected`` has it; no name is ever cut."""
+"""Each command prints at 80 columns what ``tests/terminal/expected`` has, and cuts no name."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SCHEMA = yaml.safe_load((Path(__file__).parents[2] / "docs" / "json.schema.yaml"
 
 @pytest.fixture(scope="module")
 def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPatch]:
-    """The fleet, made once: the commands leave it as it is."""
+    """Make the fleet once for all tests; return the patch that sets its clock and environment."""
     with pytest.MonkeyPatch.context() as made:
         folder = tmp_path_factory.mktemp("fleet")
         made.setenv("DEMANDOPS_DATA_HOME", str(folder / "home"))
@@ -40,7 +40,7 @@ def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPat
 
 @pytest.fixture(autouse=True)
 def _home(data_home: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Give each test the journals of the fleet, not its own."""
+    """Make each test use the journals of the fleet instead of its own."""
     with pytest.MonkeyPatch.context() as made:
         made.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
         yield
@@ -53,7 +53,7 @@ def test_it_prints_what_it_printed(command: str, patch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch) -> None:
-    """Each word on the terminal is one of the same output in a pipe, where nothing is left out."""
+    """In a pipe the command prints everything, so each word on the terminal must be there too."""
     lines = file_of(command).read_text().splitlines()
     wider = [line for line in lines if line.startswith("more columns in a wider terminal: ")]
     piped = {*words(same_ids(demandops(*shlex.split(command)).out)), *words(" ".join(wider))}
@@ -64,7 +64,7 @@ def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("command", CHANGING[:-1])
 def test_no_name_is_cut_where_something_changes(command: str, patch: pytest.MonkeyPatch) -> None:
-    """``watch``, the last one, cuts at the height of the terminal."""
+    """All words also occur at 1000 columns. ``watch`` is left out: it fits the height."""
     whole = {*words(printed(command, patch, columns=1000))}
     assert {*words(file_of(command).read_text())} <= whole
 
@@ -88,7 +88,7 @@ def test_every_command_is_shown_or_says_why_not() -> None:
 
 
 def schema_of(command: str) -> str:
-    """Return the name of a command's schema: its own, with that of a subcommand."""
+    """Return the name of the schema of a command's JSON: its name, and that of its subcommand."""
     words = command.split()
     return "-".join(words[: 2 if words[0] in ("config", "override") else 1])
 

@@ -1,4 +1,4 @@
-"""``make golden``: write what each command prints anew. Review the diff before you commit it."""
+"""``make golden``: write the expected output of each command. Review the diff before a commit."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.terminal.outputs import (
 
 
 def main() -> None:
-    """Write the output of every command."""
+    """Write the expected output and the help of every command."""
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:

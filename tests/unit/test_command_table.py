@@ -1,4 +1,4 @@
-"""The table of commands: what `--help` lists, without the modules of the commands."""
+"""The table of commands, which `--help` lists without importing the commands' modules."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def commands_of(command: click.Command, *names: str) -> Iterator[tuple[str, clic
 
 
 def examples_of(command: click.Command) -> list[list[str]]:
-    """Return the words of each line below Examples; pipes and redirections are the shell's."""
+    """Return the words of each command line in the examples, without pipes and redirections."""
     _, _, block = cleandoc(command.help or "").partition("\nExamples:\n")
     lines = re.sub(r"\\\n", " ", block).splitlines()
     return [shlex.split(re.split(r" [|>] ", line)[0]) for line in lines]
@@ -74,7 +74,7 @@ def test_every_command_has_examples_that_parse(
 
 
 def parse(command: click.Command, words: list[str], parent: click.Context | None = None) -> None:
-    """Parse a command line as the program does, down to the command that would run."""
+    """Parse a command line as the program does, including subcommands, but run nothing."""
     ctx = command.make_context("demandops", words, parent=parent)
     if isinstance(command, click.Group):
         _, found, rest = command.resolve_command(ctx, [*ctx._protected_args, *ctx.args])

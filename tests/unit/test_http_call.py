@@ -1,4 +1,4 @@
-"""HTTP calls to real servers on loopback: what they trust, how long they wait, what they tell."""
+"""HTTP calls to real servers on loopback: TLS trust, time-outs, and the text of errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def call(url: str, timeout: float = 5.0) -> HttpAnswer:
 def speaking(
     *chunks: bytes, pause: float = 0.0, tls: ssl.SSLContext | None = None
 ) -> Iterator[str]:
-    """Answer one connection with these bytes, slowly, and close it."""
+    """Serve one connection: send these chunks with a pause after each, and close it."""
 
     def speak() -> None:
         try:
@@ -46,7 +46,7 @@ def speaking(
                 for chunk in chunks:
                     peer.sendall(chunk)
                     time.sleep(pause)
-        except OSError:  # the caller has had enough
+        except OSError:  # the caller has closed the connection
             pass
 
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -22,7 +22,7 @@ def files_run_by(target: str) -> frozenset[Path]:
     printed = subprocess.run(
         ["make", "--dry-run", "--no-print-directory", target],
         cwd=ROOT,
-        env=environment | {"E2E_KUBECONFIG": "a file"},  # a cluster is there: nothing is built
+        env=environment | {"E2E_KUBECONFIG": "a file"},  # with a cluster it builds nothing
         capture_output=True,
         text=True,
         check=True,

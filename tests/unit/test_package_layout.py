@@ -1,4 +1,4 @@
-"""The layout of the packages: names, sizes of folders, the list in `pyproject.toml`."""
+"""The layout of the packages: module names, sizes of folders, and the list in `pyproject.toml`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SAME_NAME = {
 """The module names that may occur more than once, and why."""
 
 COMMANDS = PACKAGES[0] / "cli"
-"""A module here has the name of its command, whatever other rooms have."""
+"""A module in this folder has the name of its command, even if another folder has that name too."""
 
 
 def dotted(path: Path) -> str:
@@ -73,7 +73,7 @@ def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
 
 
 def test_only_the_runtime_reads_a_clock_or_starts_threads() -> None:
-    """What the contract `door-runtime` does not see, because `datetime` may be imported."""
+    """The import contract `door-runtime` cannot check this, because `datetime` may be imported."""
     uses = re.compile(r"\b(datetime|date)\.(now|utcnow|today)\(|PoolExecutor\b|\burandom\(")
     assert [dotted(path) for path in MODULES if uses.search(path.read_text())] == [
         "demandops.runtime.py"

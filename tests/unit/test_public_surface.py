@@ -131,7 +131,7 @@ def walk(schema: Json, definitions: Json, path: str) -> Iterator[tuple[str, str]
 
 
 def claim_files() -> Json:
-    """Return the top-level fields of the claims in the golden cases."""
+    """Return the top-level fields of the claims in the golden cases, by version and kind."""
     found: dict[str, set[str]] = {}
     steps = (files for case in CASES for files in whole(case).values())
     texts = {text for files in steps for path, text in files.items() if path.startswith("ledger/")}
@@ -193,7 +193,7 @@ def test_people_find_everything_in_the_documentation() -> None:
     assert names - listed == set()
 
 
-if __name__ == "__main__":  # writes the listing anew; review the difference
+if __name__ == "__main__":  # writes the listing; review the diff
     listing = {name: section() for name, section in SECTIONS.items()}
     text = yaml.safe_dump(listing, sort_keys=False, width=100, allow_unicode=True)
     Path(__file__).with_name("public_surface.yaml").write_text(text)

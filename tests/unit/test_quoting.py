@@ -1,4 +1,4 @@
-"""Nothing from outside begins a line, controls a terminal, hides text or fills a screen."""
+"""Text from outside cannot begin a line, control a terminal, hide text or fill a screen."""
 
 from __future__ import annotations
 

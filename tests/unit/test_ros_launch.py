@@ -1,4 +1,4 @@
-"""The files of the ROS package, which no test can launch: there are no wheels of ROS's launch."""
+"""The launch files of the ROS package. No test can run them: PyPI has no wheels of ROS's launch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_launch_file_takes_the_arguments_of_the_reference_s() -> None:
     assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", "serve")
     used = re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(node, "unicode"))
     assert sorted(used) == sorted(arguments)
-    # a file's value comes later, and so it counts
+    # the values of the file come later, so they take precedence
     assert [sorted(each.keys()) for each in node.findall("param")] == [["name", "value"], ["from"]]
 
 

@@ -1,4 +1,4 @@
-"""What ``import demandops_ros`` gives, and what it leaves for later."""
+"""What ``import demandops_ros`` gives, and what it imports only on use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No thread ends unseen."""
+"""The runtime reports a thread that fails, and starts it again."""
 
 from __future__ import annotations
 

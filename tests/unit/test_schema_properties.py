@@ -1,4 +1,4 @@
-"""Every property of the published schemas says what it means, with an example that is valid."""
+"""Every property of the published schemas has a description and a valid example."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Charts in folders of the state repo: the libraries that they depend on, and their default values.
 
-Pure: a chart's files are given as texts by path. Like Flux and Argo CD, this module reads a library
-from the folder that ``repository: file://…`` in ``Chart.yaml`` names.
+Pure: functions get the files as a mapping of paths to texts, and charts as folders. Like Flux and
+Argo CD, this module reads a library from the folder that ``repository: file://…`` in ``Chart.yaml``
+names.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ _EXACT = re.compile(r"\d+\.\d+\.\d+")
 class Dependency:
     """An entry of a chart's ``dependencies``.
 
-    ``folder`` is the library's path in the state repo; None if the library is elsewhere.
-    ``imports`` names the library's ``exports`` that become values of the chart.
+    ``index`` is the entry's place in the list. ``folder`` is the library's folder in the state
+    repo; None if the library is elsewhere. ``imports`` lists the names in the library's ``exports``
+    whose values the chart imports.
     """
 
     index: int
@@ -38,12 +40,12 @@ class Dependency:
 
 
 def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...]:
-    """Return the dependencies of a chart; none if its ``Chart.yaml`` cannot be read."""
+    """Return the dependencies of a chart; empty if its ``Chart.yaml`` cannot be read."""
     return _dependencies(folder, files.get(f"{folder}/Chart.yaml", ""))
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the folder of a chart, and those of the libraries that it depends on, at any depth."""
+    """Return a chart's folder, then the folders of all libraries that it needs, even indirectly."""
     found = [folder]
     for one in found:
         for dependency in dependencies(one, files):
@@ -53,7 +55,10 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
-    """Return a chart's own default values, merged by Helm's rules over the values that it imports.
+    """Return the default values of a chart.
+
+    These are the chart's own values, merged by Helm's rules over the values that it imports from
+    libraries.
 
     Raises:
         InvalidInput: if a ``values.yaml`` cannot be read.
@@ -69,7 +74,11 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values merged by Helm's rules: mappings merge, null removes, others replace."""
+    """Return the values ``above`` merged over the values ``below`` by Helm's rules.
+
+    Mappings are merged key by key. A null in ``above`` removes the key. Any other value in
+    ``above`` replaces the value in ``below``.
+    """
     result = dict(below)
     for key, value in above.items():
         if value is None:
@@ -82,7 +91,10 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield a fault for each library that is not where a chart says, or has another version."""
+    """Yield a fault for each library of a chart that is not in the folder that the chart names.
+
+    Also yield a fault if the chart requires an exact version and the library has another one.
+    """
     for one in dependencies(folder, files):
         if not one.repository.startswith(_LOCAL):
             continue
@@ -126,7 +138,10 @@ def _imports(listed: object) -> tuple[str, ...]:
 
 
 def _local_folder(folder: str, repository: str) -> str | None:
-    """Return the folder of a library; Flux fetches nothing outside ``appdefs/``."""
+    """Return the folder of a library in the state repo.
+
+    Return None if the library is not in ``appdefs/``, because Flux fetches only this folder.
+    """
     if not repository.startswith(_LOCAL):
         return None
     path = posixpath.normpath(posixpath.join(folder, repository.removeprefix(_LOCAL)))

@@ -1,7 +1,7 @@
-"""The ``values.schema.json`` of a chart: its own values, and those of the library that it imports.
+"""The ``values.schema.json`` of a chart, for its own values and the values that it imports.
 
-Helm and the generator follow no reference out of a schema. So this module copies the library's
-schema into the chart's schema.
+Neither Helm nor the generator follows a reference to another schema file. So this module copies the
+library's schema into the chart's schema.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ EXPORT = "service"
 def composed(
     title: str, own: Mapping[str, Any], values: str, library: Mapping[str, Any], shared: str
 ) -> dict[str, Any]:
-    """Return the schema of a chart.
+    """Return the schema of a chart, including the library's values and all descriptions.
 
     Args:
         title: the schema's title.
@@ -41,7 +41,7 @@ def composed(
         "title": title,
         "type": "object",
         "additionalProperties": False,
-        # Lint does not know imported values, so the schema requires only those of the chart.
+        # `helm lint` lacks imported values, so the schema requires only the chart's own values.
         "required": sorted(own),
         "properties": {
             name: _described(copy.deepcopy(one), name, told)
@@ -54,7 +54,10 @@ def composed(
 
 
 def own_properties(schema: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the properties of a chart's schema that differ from the library's schema."""
+    """Return name → property for what a chart's schema adds to or changes in the library's schema.
+
+    Descriptions are ignored and left out.
+    """
     shared = {
         name: _plain(copy.deepcopy(one))
         for name, one in library["definitions"][EXPORT]["properties"].items()

@@ -18,7 +18,7 @@ _HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------
 
 
 def descriptions(text: str) -> dict[str, str]:
-    """Return path of a value (``image.tag``) → its description."""
+    """Return the path of each described value (such as ``image.tag``) → its description."""
     found: dict[str, str] = {}
     path: list[tuple[int, str]] = []
     said: list[str] = []
@@ -40,7 +40,7 @@ def descriptions(text: str) -> dict[str, str]:
 
 
 def table(text: str, root: str = "") -> str:
-    """Return the table of the values in a ``values.yaml``, below the path ``root``, in Markdown."""
+    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``."""
     values: Any = strict_yaml.load(text)
     prefix = f"{root}." if root else ""
     told = {

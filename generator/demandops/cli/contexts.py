@@ -1,4 +1,4 @@
-"""Contexts: the fleets that a person works with, in a file of the user's config folder.
+"""Contexts: the fleets that a person works with. A file in the user's config folder lists them.
 
 A context replaces options that a person would repeat: the state repo, the access to the clusters,
 the signing key. docs/commands.md describes the file.
@@ -59,7 +59,7 @@ def read() -> ContextsFile:
     """Return the contexts in the file; without a file there are none.
 
     Raises:
-        InvalidInput: with all faults.
+        InvalidInput: if the file is not valid; the error lists all faults.
     """
     try:
         text = path().read_text(encoding="utf-8")
@@ -74,7 +74,7 @@ def read() -> ContextsFile:
 
 
 def parsed(data: dict[str, Any]) -> ContextsFile:
-    """Return data as contexts; raise if the data are not valid."""
+    """Return parsed YAML data as contexts; raise InvalidInput if the data are not valid."""
     return parse(ContextsFile, data, str(path()))
 
 
@@ -90,7 +90,7 @@ def write(content: ContextsFile) -> None:
 
 
 def named(name: str) -> Context:
-    """Return a context; raise if there is none of that name."""
+    """Return the context of this name; raise InvalidInput if there is none."""
     known = read().contexts
     if name not in known:
         message = f"there is no context '{name}'{suggestion(name, known)}"

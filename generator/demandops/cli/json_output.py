@@ -1,4 +1,4 @@
-"""The shapes that the JSON of all commands shares; docs/json.md lists them."""
+"""The JSON output that several commands share; docs/json.md describes it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ Command = Callable[..., Any]
 
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
-    """Return the option ``--output``; with json, a command that fails prints its faults as JSON."""
+    """Return a decorator that adds the option ``--output`` with these formats to a command.
+
+    With ``--output json``, a command that fails prints its faults as JSON.
+    """
     description = "The output format."
     if "markdown" in formats:
         description = "The output format; markdown is for a comment on a pull request."
@@ -64,7 +67,10 @@ output_option = output_formats("text", "json")
 
 
 def show(output: str, data: object, text: Iterable[str | Table]) -> None:
-    """Print ``data`` as JSON, or ``text``: lines, which are not wrapped, and tables."""
+    """Print ``data`` as JSON if ``output`` is ``json``, and otherwise ``text``.
+
+    ``text`` consists of lines and tables. Lines are not wrapped.
+    """
     if output == "json":
         print_json(data)
         return
@@ -78,18 +84,18 @@ def _lines_of(each: str | Table) -> list[str]:
 
 
 def print_json(data: object) -> None:
-    """Print ``data`` as JSON, with escapes for what is not visible."""
+    """Print ``data`` as JSON, with escapes for characters that are not visible."""
     click.echo(json_escaped(json.dumps(data, indent=2, ensure_ascii=False)))
 
 
 def faults_of(error: DemandOpsError) -> list[Json]:
-    """Return the faults of any error of the program."""
+    """Return an error's faults as JSON data; an error without a list of faults counts as one."""
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
     return [asdict(each) for each in dict.fromkeys(faults)]
 
 
 def time_data(moment: datetime | None) -> str | None:
-    """Return a time as JSON text, in UTC."""
+    """Return a time as text for JSON, in UTC; None without a time."""
     return format_time(moment) if moment else None
 
 
@@ -104,7 +110,7 @@ def subject_data(subject: Subject) -> Json:
 
 
 def lease_data(lease: Lease | None) -> Json | None:
-    """Return a lease as JSON data; it has no end before its start."""
+    """Return a lease as JSON data; ``until`` is None if the lease has not started."""
     if lease is None:
         return None
     return {
@@ -132,7 +138,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return the description, the namespace and the node of a release as JSON data."""
+    """Return the description and the place of a release (cluster, domain, node) as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -148,7 +154,7 @@ def release_data(release: Release) -> Json:
 
 
 def version_data(release: Release, ledger: Ledger) -> Json:
-    """Return the versions of a release that runs, and those that demands name."""
+    """Return the version of a release and the versions that its demands name, as JSON data."""
     if not isinstance(release, ServiceRelease):
         return {"version": None, "application_version": None, "versions_asked": {}}
     return {
@@ -159,7 +165,7 @@ def version_data(release: Release, ledger: Ledger) -> Json:
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    """Return an override as JSON data, with the given effects; by default all."""
+    """Return an override as JSON data, with these effects; by default with all its effects."""
     names = override.effects() if effects is None else effects
     return {
         "name": override.name,
@@ -173,7 +179,7 @@ def override_data(override: Override, effects: Iterable[str] | None = None) -> J
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return an effect as written in the file. A patch keeps its null values."""
+    """Return the value of an effect as in the override's file; a patch keeps its null values."""
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value

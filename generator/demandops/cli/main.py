@@ -62,7 +62,7 @@ COMMANDS = {
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that log, or fill the screen; they do not show what git does meanwhile."""
+"""The commands that log or fill the screen. They show no progress of slow git operations."""
 
 
 class ExitCode(IntEnum):
@@ -76,7 +76,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command; raise ClickException if it needs a missing package."""
+    """Import and return a command; raise ClickException if a package that it needs is missing."""
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = f"{name}_" if iskeyword(name) else name.replace("-", "_")
@@ -94,7 +94,7 @@ def load(name: str) -> click.Command:
 
 
 class _LazyGroup(click.Group):
-    """A group that lists its commands from the table and imports the one that runs."""
+    """A group that lists its commands from ``COMMANDS`` and imports only the command to run."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -1,4 +1,4 @@
-"""Names of the state repo, which shells complete."""
+"""The names from the state repo that shells complete."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
 def names_of(*kinds: str) -> Complete:
-    """Return the function that completes names of these kinds; after a fault it offers none."""
+    """Return a completer for names of these kinds; it offers no names if an error occurs."""
 
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:

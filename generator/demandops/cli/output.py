@@ -30,7 +30,10 @@ Progress = Callable[[int, int], None]
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a console; if the stream is not a terminal, it is wide and has no colors."""
+    """Return a console for stdout or stderr.
+
+    If the stream is not a terminal, the console is very wide and prints no colors.
+    """
     from rich.console import Console  # noqa: PLC0415
 
     class QuotingConsole(Console):
@@ -45,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""The mark of a release or an entry, by its change."""
+"""How a release or an entry of the bookkeeping changes → its mark in text."""
 
 
 def terminal_width() -> int | None:
@@ -54,7 +57,10 @@ def terminal_width() -> int | None:
 
 
 def painted(text: str, style: str) -> str:
-    """Return text in a style: ``bold``, ``dim`` or a color; plain unless stdout shows colors."""
+    """Return text in a style, which is ``bold``, ``dim`` or a color.
+
+    Return the text unchanged if stdout does not show colors.
+    """
     colors = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     if not colors or not style or os.environ.get("TERM") == "dumb":
         return text
@@ -64,14 +70,14 @@ def painted(text: str, style: str) -> str:
 
 
 def print_lines(found: list[str]) -> None:
-    """Print lines; if the terminal has too few rows, through the pager ``$PAGER``."""
+    """Print lines; use the pager ``$PAGER`` if the terminal has too few rows for them."""
     text = "".join(f"{line}\n" for line in found)
     high = len(found) >= shutil.get_terminal_size().lines
     pager = os.environ.get("PAGER")
     if not high or pager in ("", "cat") or not (sys.stdin.isatty() and sys.stdout.isatty()):
         click.echo(text, nl=False)
         return
-    os.environ.setdefault("LESS", "FRX")  # as git does: colors, and the text stays afterwards
+    os.environ.setdefault("LESS", "FRX")  # as in git: show colors, and leave the text on screen
     click.echo_via_pager(text)
 
 
@@ -122,7 +128,10 @@ def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:
-    """Return the version that a service runs, and below it the versions that demands name."""
+    """Return lines for a release: its version, then each version that demands name.
+
+    ``data`` has the form that :func:`demandops.cli.json_output.version_data` returns.
+    """
     asked = data["versions_asked"].items()
     return [
         data["application_version"] or data["version"] or "",
@@ -131,7 +140,10 @@ def version_lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def show_slow(text: str) -> None:
-    """Show on a terminal what takes long, in place of the last text; an empty text clears it."""
+    """Show on a terminal which slow operation is in progress.
+
+    The text replaces the last shown text; an empty text clears it.
+    """
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[2K{lines(text)}")
         sys.stderr.flush()
@@ -139,7 +151,7 @@ def show_slow(text: str) -> None:
 
 @contextmanager
 def busy(title: str) -> Iterator[Callable[[str], None]]:
-    """Show the title and the elapsed seconds on a terminal, if the block takes a second.
+    """Show the title and the elapsed seconds on a terminal if the block takes a second or longer.
 
     Yield a function that replaces the title.
     """
@@ -172,7 +184,10 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that shows a progress bar, on a terminal and if the work takes long."""
+    """Yield a function that updates a progress bar with the number of parts done and in total.
+
+    The bar appears only on a terminal, and only if the work takes long.
+    """
     start = REAL.monotonic()
     bar: Bar | None = None
     task: Any = None

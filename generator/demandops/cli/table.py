@@ -1,7 +1,7 @@
 """Tables of all commands: plain columns that fit the terminal without cutting a word.
 
-On a terminal, text wraps between words, and columns that do not fit are left out, those that matter
-least first. Elsewhere each row is one line with every column, for programs like awk and grep.
+On a terminal, text wraps between words. If not all columns fit, the least important ones are left
+out. Elsewhere each row is one line with every column, for programs like awk and grep.
 """
 
 from __future__ import annotations
@@ -15,7 +15,10 @@ from demandops.quoting import one_line
 
 _GAP = "  "
 _COMFORT = 12
-"""The width that every column of text may have before one column is left out."""
+"""The width in characters that a column of wrapped text gets at least, if its text is that long.
+
+Columns are left out rather than made narrower.
+"""
 
 Cell = str | Sequence[str]
 """The text of a cell, or its lines."""
@@ -23,10 +26,10 @@ Cell = str | Sequence[str]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: its title, and when it is left out.
+    """A column: its title, and whether a narrow table leaves it out.
 
-    A column with a lower ``rank`` gets room first; one with rank 0 always stays. ``wraps`` says
-    that its cells are text, which may wrap between words.
+    Columns get room in the order of ``rank``, from low to high. A column of rank 0 is never left
+    out. ``wraps`` is true if the cells contain text that may wrap between words.
     """
 
     title: str
@@ -36,14 +39,14 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of cells; a cell with several lines is a list."""
+    """A table: its columns, and its rows with one cell for each column."""
 
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
     title: str = ""
     empty: str = "(nothing)"
     styles: dict[str, str] = field(default_factory=dict)
-    """Colors of cells, by their text; used on a terminal with colors."""
+    """The text of a cell → its color on a terminal that shows colors."""
     whole: bool = False
     """Whether to keep every column and wrap nothing, however wide the table gets."""
 
@@ -51,7 +54,7 @@ class Table:
         """Return the table as lines.
 
         Args:
-            width: that of the terminal; None: one line for each row, however long.
+            width: the width of the terminal; None makes one line for each row, however long.
             style: returns a text in a style (``bold``, ``dim`` or a color); None for plain text.
         """
         width = None if self.whole else width
@@ -78,7 +81,11 @@ class Table:
         return [*title, *found]
 
     def _fitting(self, rows: list[list[list[str]]], width: int) -> list[int]:
-        """Return the columns that fit, those that matter most first; empty ones are left out."""
+        """Return the indexes of the columns to show, in ascending order.
+
+        Columns of rank 0 are always shown. The others get the remaining room by rank; empty columns
+        get none.
+        """
         used = [at for at in range(len(self.columns)) if any(any(row[at]) for row in rows)]
         shown = [at for at, column in enumerate(self.columns) if column.rank == 0]
         room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
@@ -94,7 +101,7 @@ class Table:
         return max([cell_len(self.columns[at].title), *lengths])
 
     def _least(self, rows: list[list[list[str]]], at: int) -> int:
-        """Return the width that a column needs so that no word in the column is cut."""
+        """Return the smallest width of the column with index ``at`` in which no word is cut."""
         natural = self._natural(rows, at)
         if not self.columns[at].wraps:
             return natural
@@ -117,7 +124,7 @@ class Table:
 
 
 def _cell(cell: Cell, width: int | None) -> list[str]:
-    """Return the lines of a cell, with escapes for what is not visible."""
+    """Return the lines of a cell; without a width, one line with the lines joined by commas."""
     lines = [one_line(line) for line in ([cell] if isinstance(cell, str) else cell)]
     return lines if width is not None else [", ".join(filter(None, lines))]
 
@@ -144,7 +151,7 @@ def _wrapped(lines: Iterable[str], width: int) -> list[str]:
 def _laid_out(
     cells: Sequence[Sequence[str]], widths: Sequence[int], paint: Callable[[str], str] = str
 ) -> Iterator[str]:
-    """Yield the lines of one row."""
+    """Yield the printed lines of one row, given the lines and the width of each cell."""
     for number in range(max(len(cell) for cell in cells)):
         parts = [cell[number] if number < len(cell) else "" for cell in cells]
         padded = (

@@ -1,9 +1,10 @@
 """Which state repo a command works on, and with which access: options, environment, contexts.
 
-The order: the option, ``--context``, the environment variable, the checkout around the current
-folder, the current context. A relative folder in the variable counts only where it exists. A
-command that writes uses the remote of the checkout. Signing key and clusters come from the same
-context, never from another one.
+The first of these that is given decides: the option, ``--context``, the environment variable, the
+checkout around the current folder, the current context. If the variable names a relative folder
+that does not exist, a command in a checkout ignores the variable, and any other command fails. A
+command that writes uses the remote of the checkout. The default signing key and clusters come from
+the same context as the state repo.
 """
 
 from __future__ import annotations
@@ -35,9 +36,10 @@ _NO_STATE_REPO = (
 
 
 def _chosen(around: Path | None) -> Context | None:
-    """Return the context of --context, of the checkout ``around``, or the current one.
+    """Return the context that applies, and remember it for :func:`_from_context`.
 
-    The command keeps it for :func:`_from_context`.
+    This is the context that ``--context`` names. Without that option, it is the context of the
+    checkout ``around`` or, outside a checkout, the current context. Return None if there is none.
     """
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
@@ -58,13 +60,13 @@ def _chosen(around: Path | None) -> Context | None:
 
 
 def _around() -> Path | None:
-    """Return the checkout that the command is run in, unless a context is named."""
+    """Return the checkout around the current folder; None outside one, or with ``--context``."""
     named = _NAME in click.get_current_context().meta
     return None if named else checkout_around(Path.cwd())
 
 
 def readable_repo() -> str | None:
-    """Return the default state repo of a command that only reads, or None."""
+    """Return the default state repo of a command that only reads; None if there is no default."""
     around = _around()
     context = _chosen(around)
     return str(around) if around else context.state_repo if context else None
@@ -96,7 +98,10 @@ def hint_to_pull() -> list[str]:
 
 
 def _from_context(field: str) -> Callable[[], str | None]:
-    """Return an option's default: a field of the context that gave the state repo."""
+    """Return a function that returns the default of an option.
+
+    The default is the named field of the context that applies to the state repo, if there is one.
+    """
 
     def default() -> str | None:
         context = click.get_current_context().meta.get(_CONTEXT)
@@ -106,7 +111,11 @@ def _from_context(field: str) -> Callable[[], str | None]:
 
 
 def _required(default: Callable[[], str | None]) -> Callable[..., str]:
-    """Return a callback that returns the given address or the default, or raises."""
+    """Return a callback for ``--state-repo`` that returns the address of the state repo.
+
+    This is the given address or, without one, the result of ``default``. The callback raises
+    UsageError if there is neither.
+    """
 
     def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
@@ -159,7 +168,7 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
         envvar=_VARIABLE,
         metavar="URL_OR_DIR",
         default=default,
-        is_eager=True,  # what else is left out depends on it
+        is_eager=True,  # the defaults of other options depend on it
         callback=_required(default),
         help=f"The state repo: a bare repository's folder, or a URL that git can clone. Default: "
         f"{where}, else that of the context [env: {_VARIABLE}].",
@@ -176,7 +185,7 @@ writable_repo_option = _state_repo(_writable, "the remote of the checkout that y
 dry_run_option = click.option(
     "--dry-run",
     is_flag=True,
-    is_eager=True,  # what a command that writes nothing reads may be a checkout without a remote
+    is_eager=True,  # the default state repo depends on it
     help="Show the consequences and change nothing.",
 )
 

@@ -26,8 +26,8 @@ class ClusterAccess(FrozenModel):
     """The access to a cluster: its API, a webhook of its controller, or both.
 
     ``receiver`` is the URL of a Flux Receiver, ``webhook`` the URL of Argo CD's webhook.
-    ``secret_file`` holds the secret that signs calls to either. ``wake`` says whether the
-    controller is woken after a push.
+    ``secret_file`` holds the secret that signs calls to the receiver or the webhook. ``wake`` says
+    whether the controller is woken after a push.
     """
 
     kubeconfig: Path | None = Field(default=None, strict=False)
@@ -47,7 +47,7 @@ class ClusterAccess(FrozenModel):
         return self
 
     def secret(self) -> bytes | None:
-        """Return the secret of the webhook.
+        """Return the secret that signs webhook calls, or None if no ``secret_file`` is given.
 
         Each call reads the file again, so that the secret can be replaced.
 

@@ -1,4 +1,4 @@
-"""A watch on one ConfigMap, which passes on the data at once and after each change."""
+"""Watches one ConfigMap, and passes its data on: at the start, and after each change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OnData = Callable[[Mapping[str, str]], object]
 
 
 class ConfigMapWatch:
-    """Reads and follows a ConfigMap; the only right it needs is to list and watch this object."""
+    """Reads and watches a ConfigMap; needs only the right to list and watch this one object."""
 
     def __init__(
         self,
@@ -39,7 +39,8 @@ class ConfigMapWatch:
             name: the ConfigMap's name. The ConfigMap need not exist yet. If it is deleted, the last
                 data stay valid.
             on_data: called with the data, from the thread of the watch.
-            kubeconfig: how to reach the cluster; without one, this process must be a pod there.
+            kubeconfig: the file with the access to the cluster; if None, this process must be a
+                pod in the cluster.
             runtime: provides the threads.
 
         Raises:
@@ -54,7 +55,7 @@ class ConfigMapWatch:
         runtime.keep_running("config-map", self._run)
 
     def close(self) -> None:
-        """Stop the watch; ``on_data`` may still be in a call, but is not called again."""
+        """Stop the watch. A call of ``on_data`` may still be running, but no other one follows."""
         self._closed.set()
 
     def _run(self) -> None:

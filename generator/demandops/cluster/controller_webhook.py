@@ -1,7 +1,8 @@
 """Signed calls to a controller's webhook after a push.
 
-Flux: a Receiver of type ``generic-hmac``, or ``generic`` without a secret. Argo CD: a push event in
-GitHub's format, which Argo CD compares with the source of each Application.
+A call to Flux goes to a Receiver of type ``generic-hmac``, or ``generic`` if there is no secret. A
+call to Argo CD is a push event in GitHub's format. Argo CD compares the repository of the event
+with the source of each Application.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _NO_COMMIT = "0" * 40
 
 
 def call_flux(url: str, secret: bytes | None) -> None:
-    """Call a Receiver of Flux, which ignores the body.
+    """Call a Receiver of Flux. The Receiver ignores the body of the call.
 
     Raises:
         NoAnswer: if the controller does not answer, rejects the call or redirects it.

@@ -22,11 +22,12 @@ from demandops.runtime import REAL, Runtime
 log = logging.getLogger("demandops")
 
 _LEASE_S = 15
-"""How long a Lease counts if nobody renews it."""
+"""How many seconds a Lease is valid if nobody renews it."""
 _RENEW_S = 10
-"""How long a leader tries to renew its Lease; then its process ends."""
+"""How many seconds a leader tries to renew its Lease. If it fails, its process ends."""
 _CALL_S = 2
-"""How long a call may take. A renewal has two calls: ``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
+"""How many seconds a call of the API may take. A renewal has two calls, and must end in time:
+``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
 _PAUSE_S = 2.0
 _RELEASED_S = 1
 _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-9])?)")
@@ -49,8 +50,8 @@ class Leadership:
         process becomes the leader soon.
 
         Args:
-            lease: the Lease's namespace and name, with a slash between. It must exist.
-            may_lead: whether this process may become the leader now.
+            lease: the Lease's namespace and name, with a slash between. The Lease must exist.
+            may_lead: returns whether this process may become the leader now.
             on_leader: called when this process becomes the leader.
             api: the cluster's API; by default that of the cluster in which this process is a pod.
             runtime: provides the time and the threads.
@@ -89,7 +90,7 @@ class Leadership:
             self.is_leader = False
             try:
                 self._write(self._read(), "")
-            except Exception as error:  # the Lease ends by itself
+            except Exception as error:  # the Lease expires on its own
                 log.warning("the Lease %s is not released: %s", self._lease, _reason(error))
 
     def _run(self) -> None:
@@ -103,10 +104,10 @@ class Leadership:
                 self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
             self._closed.wait(_PAUSE_S)
-            self._require_renewed()  # a renewal that begins too late would be no use
+            self._require_renewed()  # a renewal that begins later could end too late
 
     def _compete(self) -> None:
-        """Renew the Lease, or take it if nobody holds it."""
+        """Renew the Lease as the leader; else take it if it is free and this process may lead."""
         lease = self._read()
         spec = lease.get("spec") or {}
         holder = spec.get("holderIdentity") or ""
@@ -141,7 +142,10 @@ class Leadership:
         return lease
 
     def _write(self, lease: dict[str, Any], holder: str) -> None:
-        """Replace the Lease that was read; the server refuses if the Lease has changed since."""
+        """Write a holder into the Lease that was read; an empty ``holder`` releases the Lease.
+
+        The server refuses the call if the Lease has changed since it was read.
+        """
         old, now = lease.get("spec") or {}, f"{self._runtime.now():%Y-%m-%dT%H:%M:%S.%fZ}"
         spec = old | {
             "holderIdentity": holder,

@@ -52,7 +52,7 @@ class ObjectCache:
         self._client: Any = None
 
     def watch(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Watch further objects."""
+        """Start to watch objects that are not watched yet."""
         for selector in wanted:
             with self._lock:
                 if selector in self._watched or self._closed.is_set():
@@ -96,7 +96,10 @@ class ObjectCache:
                 self._errors[selector] = _reason(selector, error)
 
     def give_up(self, reason: str) -> None:
-        """Stop waiting for objects that are still unread; ``reason`` says why they are unknown."""
+        """Stop waiting for objects that have not been read yet.
+
+        :meth:`why_unknown` then returns ``reason`` for these objects.
+        """
         with self._lock:
             self._unread = reason
 
@@ -164,7 +167,7 @@ class ObjectCache:
             return self._client
 
     def _read(self, selector: ObjectSelector) -> str:
-        """Replace the selected objects by those of the cluster; return the list's version."""
+        """Read the selected objects into the cache; return the resource version of the list."""
         listed = self._api().list_namespaced_custom_object(
             **_request(selector), _request_timeout=(_CONNECT_S, _WATCH_S)
         )
@@ -186,7 +189,7 @@ class ObjectCache:
         with self._lock:
             known = self._objects.get(key)
             if known is not None and _version(item) < _version(known):
-                return  # a refresh read a newer version
+                return  # :meth:`refresh` has read a newer version
             if event["type"] == "DELETED":
                 self._objects.pop(key, None)
             else:
@@ -206,7 +209,10 @@ class ObjectCache:
 
 
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    """Return the arguments that select objects; to select a single object needs fewer rights."""
+    """Return the arguments of an API call that selects objects.
+
+    A call for a single object needs fewer rights than one for a namespace.
+    """
     names = ("group", "version", "plural")
     request = {
         **dict(zip(names, _KINDS[selector.kind], strict=True)),
@@ -216,12 +222,12 @@ def _request(selector: ObjectSelector) -> dict[str, str]:
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether the cluster answered the request, with an error or a refusal."""
+    """Return whether an error is an answer of the cluster, so that the cluster is reachable."""
     return bool(getattr(error, "status", None))
 
 
 def _reason(selector: ObjectSelector, error: Exception) -> str:
-    if _is_answer(error):  # without an answer, the whole cluster is unreachable
+    if _is_answer(error):  # otherwise the whole cluster is unreachable
         plural = _KINDS[selector.kind][2]
         reason = getattr(error, "reason", None) or type(error).__name__
         return f"{plural} in {selector.namespace}: {reason}"

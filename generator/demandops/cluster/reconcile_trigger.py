@@ -26,7 +26,8 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""Seconds between fetches: two within a second can make source-controller corrupt an artifact."""
+"""The least number of seconds between two fetches. Two fetches within a second can make Flux's
+source-controller corrupt an artifact."""
 _REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 _REFRESH = "argocd.argoproj.io/refresh"
 
@@ -36,7 +37,10 @@ ChangesSince = Callable[[str], tuple[str, list[str] | None]]
 
 
 class ReconcileTrigger:
-    """Wakes clusters from its own thread, once for several pushes in a short time."""
+    """Wakes clusters from its own thread.
+
+    If several pushes follow each other within a short time, it wakes the clusters once for all.
+    """
 
     def __init__(
         self,
@@ -62,7 +66,7 @@ class ReconcileTrigger:
     def close(self) -> None:
         """Wake the clusters for the last push, if that is still due, and stop."""
         self._stop.set()
-        self._due.set()  # lets the thread run once more
+        self._due.set()  # makes the thread run once more
         self._thread.join(2 * _TIMEOUT_S)
 
     def _run(self) -> None:
@@ -72,7 +76,7 @@ class ReconcileTrigger:
         while True:
             fresh = self._due.wait(pause)
             self._due.clear()
-            # pushes come in bursts
+            # wait, because pushes come in bursts
             self._stop.wait(max(0.0, woken_at + _SPACING_S - self._runtime.monotonic()))
             woken_at, stopping = self._runtime.monotonic(), self._stop.is_set()
             if fresh:
@@ -86,7 +90,10 @@ class ReconcileTrigger:
                 missed, pause = set(), None
 
     def _wake_all(self, names: Iterable[str], logged: bool) -> set[str]:
-        """Wake clusters; return those that failed, and log them unless they are ``logged``."""
+        """Wake clusters; return the names of those that could not be woken.
+
+        Failures are logged unless ``logged`` is true, which means that they are in the log already.
+        """
         missed = set()
         for name in sorted(names):
             if self._config is None:
@@ -155,7 +162,7 @@ def _concerns(path: str, cluster: str) -> bool:
 
 
 def _refresh_patch(domain: AccessDomain, repository: RepoSettings, now: str) -> dict[str, Any]:
-    """Return the arguments of an API call that makes a domain's object fetch from Git now."""
+    """Return the arguments of an API call that makes the controller fetch a domain's folder now."""
     if repository.gitops == "argocd" and repository.argocd:
         group, version, plural = "argoproj.io", "v1alpha1", "applications"
         namespace, name = repository.argocd.namespace, project_of(domain, repository)

@@ -20,10 +20,10 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class ReleaseStatus:
-    """What a cluster says about a release.
+    """What a cluster reports about a release.
 
-    ``seen`` is the commit that the cluster has applied, ``since`` when the state last changed; both
-    are empty if the cluster does not say.
+    ``seen`` is the commit that the cluster has applied. ``since`` is the time when the state last
+    changed. Both are empty if the cluster does not report them.
     """
 
     health: Health
@@ -52,9 +52,9 @@ def statuses(
 ) -> list[ReleaseStatus]:
     """Return the status of each release at a commit, from the caches of the clusters.
 
-    With ``changed``, a release counts as applied if its cluster has applied an earlier commit in
-    which the release's file is the same. So a new commit does not hide the health of unchanged
-    releases.
+    If the cluster has applied only an earlier commit, ``changed`` is asked for the paths in which
+    the two commits differ. If the release's file is not among them, the release counts as applied.
+    So a new commit does not hide the health of unchanged releases.
     """
     changed = cache(changed)
     known = _Known(history)
@@ -88,7 +88,10 @@ def _is_among(paths: Collection[str], target: Target) -> bool:
 
 
 class _Known:
-    """A history that remembers its answers, because a domain's releases ask the same questions."""
+    """Caches the answers of a history.
+
+    All releases of a domain ask the same questions.
+    """
 
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)

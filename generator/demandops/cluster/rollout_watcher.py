@@ -130,7 +130,7 @@ class RolloutWatcher:
             self._changed.wait(_LONGEST_WAIT_S)
             self._changed.clear()
             self._evaluate()
-            self._runtime.sleep(_PAUSE_S)  # changes come in bursts
+            self._runtime.sleep(_PAUSE_S)  # wait, because changes come in bursts
         self._evaluate(last=True)
 
     def _evaluate(self, last: bool = False) -> None:
@@ -173,9 +173,10 @@ class RolloutWatcher:
         rollout.confirmed = True
 
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
-        """Resolve a rollout after its timeout; say also why its pods do not run.
+        """Resolve a rollout whose timeout is over; add what is known to the reason.
 
-        If the controller is just retrying, say also why its last attempt failed.
+        If a Deployment is not available, the reason also says why its pods do not run. If the
+        controller is retrying, the reason also says why the last attempt failed.
         """
         failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:

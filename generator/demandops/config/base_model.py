@@ -30,7 +30,7 @@ Model = TypeVar("Model", bound=BaseModel)
 Item = TypeVar("Item")
 
 Items = Annotated[tuple[Item, ...], Field(strict=False)]
-"""A list in a file."""
+"""A list in a file; the model has it as a tuple."""
 
 Positive = Annotated[int, Field(ge=1)]
 """A whole number above zero."""
@@ -45,7 +45,7 @@ Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_lengt
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """Return a validator that rejects text in which ``problem_of`` finds a problem."""
+    """Return a validator that rejects a text for which ``problem_of`` returns a message."""
 
     def check(value: str) -> str:
         problem = problem_of(value)
@@ -57,7 +57,10 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects text that ``parse`` cannot read; it changes no text."""
+    """Return a validator that rejects a text for which ``parse`` raises an error.
+
+    The validator leaves a valid text unchanged.
+    """
 
     def check(value: str) -> str:
         parse(value)
@@ -116,7 +119,10 @@ def faults_of(
     file: str = "",
     place: tuple[int | str, ...] = (),
 ) -> list[Fault]:
-    """Return every fault of a failed validation of the value at ``place`` in a file."""
+    """Return every fault of a failed validation.
+
+    ``place`` is the path to the validated value in the file, ``()`` for the whole file.
+    """
     return [
         fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
@@ -165,7 +171,7 @@ def _fields(model: type[BaseModel]) -> list[str]:
 
 
 def parse(model: type[Model], data: object, file: str = "") -> Model:
-    """Return ``data`` as ``model``.
+    """Validate plain data, and return it as an instance of ``model``.
 
     Raises:
         InvalidInput: with every fault; each names ``file``.
@@ -177,7 +183,7 @@ def parse(model: type[Model], data: object, file: str = "") -> Model:
 
 
 def parse_file(model: type[Model], text: str, file: str) -> Model:
-    """Return the text of a YAML file as ``model``.
+    """Parse the text of a YAML file, and return its content as an instance of ``model``.
 
     Raises:
         InvalidInput: with every fault.

@@ -43,16 +43,20 @@ COLLECTIONS = (
     CLIENTS_FILE,
     VERSIONS_FILE,
 )
-"""Files with many entries, which files of a folder may share (:func:`collection_of`)."""
+"""The collections: files with many entries.
+
+The files of a folder with the same name may have further entries (:func:`collection_of`).
+"""
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
 """The top-level entries of a state repo that hold the configuration; people own them."""
 
 
 def collection_of(path: str) -> str | None:
-    """Return the collection to which a file's entries belong: the file itself, or its folder's.
+    """Return the collection to which the entries of a file belong.
 
-    ``inventory/nodes/berlin.yaml`` has entries of ``inventory/nodes.yaml``.
+    ``inventory/nodes.yaml`` and ``inventory/nodes/berlin.yaml`` have entries of the collection
+    ``inventory/nodes.yaml``. Return ``None`` if a file does not belong to a collection.
     """
     folder, _, name = path.rpartition("/")
     if name.startswith(".") or not name.endswith(".yaml"):
@@ -75,7 +79,7 @@ class Config:
     ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
     override; :class:`demandops.ledger.world.World` knows which of them have ended. ``entry_files``
     maps each collection's entries to the files that they are in. ``hosts`` maps each node in a
-    further access domain (``edge@city``) to the node that it is (``edge``).
+    further access domain (``edge@city``) to the node of the inventory (``edge``).
     """
 
     repo_settings: RepoSettings
@@ -102,17 +106,17 @@ class Config:
     )
     """Part of a topic's name → the nodes whose ids become this part."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    """The nodes of each type, sorted by id; an empty name stands for all."""
+    """Type of nodes → these nodes, sorted by id; the empty type has all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """The nodes with a capability, or with a label's key and value, sorted by id."""
+    """A capability, or the key and value of a label → the nodes that have it, sorted by id."""
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    """The type of each property, as most nodes that have it say, and the first of these."""
+    """Property → the type of its value on most nodes, and the first node with this type."""
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The nodes that are drained, sorted."""
     limits_capacity: bool = field(init=False, compare=False, repr=False)
-    """Whether a node declares a capacity."""
+    """Whether any node declares a capacity."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The roles, sorted, for which a service of any appdef runs once for each topic."""
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
@@ -120,7 +124,7 @@ class Config:
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """Appdef → version or channel → the version's contents; an empty name is the default."""
+    """Appdef → version or channel → the version's contents; the empty name is the default."""
 
     def __post_init__(self) -> None:
         """Set the fields that are derived from other fields."""
@@ -190,7 +194,7 @@ class Config:
         return host, *(id_in_domain(host, one.name) for one in further)
 
     def file_of(self, collection: str, name: str) -> str:
-        """Return the file that has an entry, or the collection's usual file."""
+        """Return the file that has an entry; for an unknown entry, the collection's usual file."""
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
@@ -201,7 +205,7 @@ class Config:
         """Return a node and its access domain.
 
         Raises:
-            Refused: if a node in use was removed from the inventory or its access domain.
+            Refused: if the node is not in the inventory, or not in any access domain.
         """
         node, domain = self.nodes.get(id), self.domain_of.get(id)
         if node is None or domain is None:
@@ -215,7 +219,7 @@ class Config:
         return node, domain
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
-        """Return the appdef that ``DeploymentRequest`` names by ``number``."""
+        """Return the appdef that ``DeploymentRequest`` names by ``number``, or ``None``."""
         for appdef in self.appdefs.values():
             if appdef.deployment_request and appdef.deployment_request.type == number:
                 return appdef
@@ -226,7 +230,7 @@ class Config:
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return the file that a message names for the versions of an appdef."""
+        """Return how a message names the file or files with the versions of an appdef."""
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
         return self.place_of(CHARTS_FILE)

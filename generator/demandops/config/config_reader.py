@@ -92,8 +92,8 @@ class ConfigReader:
     ) -> None:
         """Add the faults of an entry that appears twice, at the places ``first`` and ``second``.
 
-        A place is (file, field). Both files get a fault, so the file that a person changed is
-        held back, whichever it is.
+        A place is (file, field). If the places are in two files, both files get a fault. So the
+        changed file is quarantined, no matter which of the two a person changed.
         """
         dot_key = f".{key}" if key else ""
         if first[0] == second[0]:
@@ -105,14 +105,17 @@ class ConfigReader:
             self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
 
     def entry_files(self) -> dict[str, dict[str, str]]:
-        """Return the files of the entries of each collection that :meth:`read_items` read."""
+        """Return collection → entry → file, for the collections that :meth:`read_items` read."""
         return {
             collection: {name: file for name, (file, _) in places.items()}
             for collection, places in self._places.items()
         }
 
     def head(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file that :meth:`read_items` read, without its items, if its rest is valid."""
+        """Return a file that :meth:`read_items` read as ``model``, without its items.
+
+        Return ``None`` if the other fields of the file are not valid.
+        """
         head = self._heads.get(file)
         return head if isinstance(head, model) else None
 
@@ -125,7 +128,10 @@ class ConfigReader:
         self._places[collection][name] = self._places[collection][of]
 
     def is_missing(self, collection: str, name: str) -> bool:
-        """Return whether a collection lacks an item; False if any of its items is invalid."""
+        """Return whether a collection lacks an item.
+
+        Return False if an item of the collection is invalid, because it may be the missing item.
+        """
         return collection not in self._incomplete and name not in self._places[collection]
 
     def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
@@ -151,7 +157,10 @@ class ConfigReader:
             return None
 
     def _items(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
-        """Return the raw value of ``field``; add the faults of the file's other fields."""
+        """Return the raw value of ``field``, and add the faults of the file's other fields.
+
+        Return ``None`` if the value is missing or is not of the type ``kind``.
+        """
         raw = None
         try:
             data = strict_yaml.load(self.files.get(file, ""), file)

@@ -39,9 +39,9 @@ def duration_text(seconds: float) -> str:
 
 
 def span(seconds: float) -> str:
-    """Return about how long something is: its largest unit and perhaps the next, like ``3h20m``.
+    """Return an approximate duration in one or two units, like ``12d`` or ``3h20m``.
 
-    The second unit appears if the first has one digit.
+    The second unit is given only if the number of the first unit has one digit.
     """
     left = int(abs(seconds))
     for place, (size, unit) in enumerate(_UNITS):
@@ -56,6 +56,6 @@ def span(seconds: float) -> str:
 
 
 def relative(moment: datetime, now: datetime) -> str:
-    """Return ``3m20s ago`` or ``in 10m``."""
+    """Return a time relative to ``now``, like ``3m20s ago`` or ``in 10m``."""
     seconds = (moment - now).total_seconds()
     return f"in {span(seconds)}" if seconds >= 1 else f"{span(seconds)} ago"

@@ -59,7 +59,7 @@ class Zenoh(CamelModel):
 
     Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
     the endpoint's port at every address. It always connects to the routers in ``connect``. A node
-    without any of these connects to nodes that have an endpoint.
+    with none of these fields connects to the nodes that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -73,7 +73,7 @@ class Zenoh(CamelModel):
         return self
 
     def listening(self) -> tuple[str, ...]:
-        """Return the endpoints that the bridge listens on; none if no other bridge can connect."""
+        """Return the endpoints that the bridge listens on; empty if no other bridge can connect."""
         if self.listen or not self.endpoint:
             return self.listen
         protocol, _, address = self.endpoint.partition("/")
@@ -150,7 +150,7 @@ ResourceName = Annotated[
 """A name of a resource: ``cpu``, ``memory``, ``gpu``, ``nvidia.com/gpu``."""
 
 Resources = dict[ResourceName, Quantity]
-"""How much of each resource something has or requests."""
+"""Resource → how much of it a node has, or a service requests."""
 
 NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
@@ -192,7 +192,7 @@ class Toleration(CamelModel):
 
 
 Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp", "image"]
-"""A middleware of ROS; ``image`` for the one that each image has."""
+"""A middleware of ROS; with ``image``, each container uses the middleware of its image."""
 
 
 RosDomainId = Annotated[int, Field(ge=0, le=232)]
@@ -216,9 +216,9 @@ class Position(CamelModel):
 
 
 class FurtherDomain(CamelModel):
-    """An access domain that a node is in besides the one whose ``nodes`` has it.
+    """A further access domain of a node, besides the domain whose ``nodes`` field has the node.
 
-    ``zenoh`` and ``wan`` replace the node's own for connections of this domain, because two
+    For connections of this domain, ``zenoh`` and ``wan`` replace those of the node, because two
     programs cannot listen on one port.
     """
 
@@ -230,19 +230,22 @@ class FurtherDomain(CamelModel):
 class Node(CamelModel):
     """A C-ITS entity that runs services.
 
-    ``type`` is its role, any word; ``capabilities`` are words for what it has, ``properties`` its
-    typed values. A demand may ask for them and name no node
-    (:mod:`demandops.plan.nodes.placement`); it then gets none that is ``drained``.
-    Services request no more than ``capacity`` there (:mod:`demandops.plan.nodes.capacity`).
-    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses.
-    If the access domain has a ROS domain, that replaces the one of ``ros``.
-    ``topics`` maps each input role to the node's usual topic. Names of releases and derived topics
-    contain only the node for a usual topic, and the topic as well for any other.
-    Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` has the
-    message types of topics for which a request gives none. ``bridged`` lists topics that the
-    initial deployment already carries to another node under the same name; connections skip them.
-    ``access_domains`` are the node's further domains. In each, it is another node of the
-    configuration, called ``<id>@<domain>`` (:func:`in_domain`).
+    ``type`` is the role of the node, any word. ``capabilities`` are words for what the node has,
+    and ``properties`` are values with a type. A demand may require these three instead of naming a
+    node; the generator then chooses a node that is not ``drained``
+    (:mod:`demandops.plan.nodes.placement`). The services on the node together request at most its
+    ``capacity`` (:mod:`demandops.plan.nodes.capacity`).
+
+    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses. A ROS domain of
+    the access domain replaces the ROS domain in ``ros``. ``topics`` maps each input role to the
+    node's usual topic. The names of releases and derived topics contain the node; for a topic that
+    is not the usual one, these names contain the topic too.
+
+    Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` maps topics to
+    message types, for requests that give no type. ``bridged`` maps other nodes to the topics that
+    the initial deployment already carries there under the same name; connections skip these topics.
+    ``access_domains`` are the node's further domains. For each of them, the configuration has a
+    further node ``<id>@<domain>`` (:meth:`in_domain`).
     """
 
     id: NodeId
@@ -295,8 +298,8 @@ class Node(CamelModel):
     def most(self, resource: str) -> int | None:
         """Return the node's capacity of a resource in thousandths; ``None`` means no limit.
 
-        A node without ``capacity`` limits nothing. If ``capacity`` leaves out cpu or memory, that
-        is not limited. Of any other resource that it leaves out, the node has none.
+        A node without ``capacity`` limits no resource. A ``capacity`` without cpu or memory does
+        not limit cpu or memory. Of any other resource that ``capacity`` leaves out, the node has 0.
         """
         if self.capacity is None:
             return None

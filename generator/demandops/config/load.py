@@ -1,6 +1,7 @@
 """Loading of the configuration: the files' texts become a :class:`Config`.
 
-Pure. If any file has a fault, the whole configuration is rejected, with every fault of every file.
+The functions here are pure. If any file has a fault, the whole configuration is rejected, with
+every fault of every file.
 """
 
 from __future__ import annotations
@@ -67,14 +68,14 @@ _ANY = RepoSettings(
     gitops="flux",
     renderVersion=RENDER_VERSION,
     flux=Flux(url="https://unread.invalid/repo.git"),
-)  # replaces an invalid one, so that the other files can be checked
+)  # stands for invalid settings, so that the other files can be checked
 
 
 def load(files: Mapping[str, str]) -> Config:
     """Return the configuration of a state repo.
 
     Args:
-        files: path in the state repo → text; other folders are ignored.
+        files: path in the state repo → text; files outside of the configuration are ignored.
 
     Raises:
         InvalidInput: with every fault of every file.
@@ -131,7 +132,7 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services; fill in ``runs_at`` of those that run once for each cluster."""
+    """Return the services, with ``runs_at`` set for services that run once for each cluster."""
     found = dict(services)
     for name, service in services.items():
         if service.nodes:
@@ -156,7 +157,7 @@ def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
 
 
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the clients' settings from all files, and for each connection type its file."""
+    """Return the clients' settings from all files, and connection type → the file with settings."""
     found, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
@@ -194,7 +195,7 @@ def _read_versions(reader: ConfigReader) -> Mapping[str, VersionList]:
 def _read_definitions(
     reader: ConfigReader, file: str, model: type[Definition]
 ) -> Mapping[str, Definition]:
-    """Return the definitions in the files of this name, one in each folder of ``appdefs/``."""
+    """Return name → definition, from each file ``appdefs/<name>/<file>``."""
     found = {}
     for path in sorted(reader.files):
         parts = path.split("/")
@@ -217,7 +218,10 @@ def _resolve(
     definitions: Mapping[str, ServiceDefinition],
     reader: ConfigReader,
 ) -> Services:
-    """Return the services of an appdef; none if the appdef or a definition it uses is invalid."""
+    """Return the services of an appdef, and add their faults to the reader.
+
+    Return no services if the appdef, or a definition that it uses, is invalid.
+    """
     files = {f"appdefs/{name}/service.yaml" for name in appdef.uses.keys() - definitions.keys()}
     if files & reader.files.keys():
         return {}
@@ -267,7 +271,11 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return nodes, the domain of each, and the host of each added ``<id>@<domain>``."""
+    """Return the nodes, and for each further access domain of a node the node ``<id>@<domain>``.
+
+    Returns:
+        Three mappings: id → node, id → access domain, and ``<id>@<domain>`` → ``<id>``.
+    """
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
     for node in [one for one in nodes.values() if one.access_domains]:
         file, place = reader.place_of(NODES_FILE, node.id)

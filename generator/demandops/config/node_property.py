@@ -1,8 +1,8 @@
-"""Properties of nodes: typed values in the inventory, and what a place asks of them.
+"""Properties of nodes: typed values in the inventory, and conditions that a place sets for them.
 
-A value is a number, text, true or false. What is asked is a text: ``ros=jazzy``, ``memoryGiB>=8``
-or ``memoryGiB<=64``. On all nodes a property has values of one type. This type says how the text is
-read.
+The value of a property is a number, text, true or false. A condition is a text: ``ros=jazzy``,
+``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values of the same type on all nodes. This
+type decides how the value in a condition is read.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _ASKED = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
 _BOUNDS = {"min": ">=", "max": "<="}
 
 PropertyName = Annotated[str, StringConstraints(pattern=f"^{_NAME}$", max_length=63)]
-"""A name of a property; a unit belongs to it: ``memoryGiB``."""
+"""The name of a property; it includes the unit of the value, as in ``memoryGiB``."""
 
 Kind = Literal["a number", "text", "true or false"]
 """The type of a property's values, in words."""
 
 
 class Asked(NamedTuple):
-    """What is asked of a property."""
+    """A condition: the name of a property, the sign of the comparison, and the value as text."""
 
     name: str
     sign: str
@@ -39,7 +39,7 @@ class Asked(NamedTuple):
 
 
 def kind_of(value: object) -> Kind | None:
-    """Return the type of a property's value; ``None`` if no property may have it."""
+    """Return the type of a property's value; ``None`` if no property may have this value."""
     match value:
         case bool():
             return "true or false"
@@ -85,11 +85,11 @@ PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": 
 AskedValue = Annotated[
     Any, AfterValidator(_asked_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
 ]
-"""The value that a definition asks for, or bounds of a number: ``{min: 8}``."""
+"""The value that a definition requires of a property, or bounds of a number: ``{min: 8}``."""
 
 
 def asked_texts(properties: Mapping[str, object]) -> Iterator[str]:
-    """Yield what a definition's ``properties`` ask for, as texts."""
+    """Yield the conditions in a definition's ``properties`` as texts, like ``memoryGiB>=8``."""
     for name, value in properties.items():
         if isinstance(value, dict):
             yield from (f"{name}{_BOUNDS[bound]}{limit}" for bound, limit in value.items())
@@ -98,20 +98,23 @@ def asked_texts(properties: Mapping[str, object]) -> Iterator[str]:
 
 
 def asked_kind(value: object) -> Kind | None:
-    """Return the type of property that a definition's value can be compared with."""
+    """Return the type of the properties with which a definition's value can be compared.
+
+    Return ``None`` if the value is not valid.
+    """
     return "a number" if isinstance(value, dict) else kind_of(value)
 
 
 @lru_cache(maxsize=1024)
 def asked_in(text: str) -> Asked | None:
-    """Return what a text asks for; ``None`` if the text cannot be read."""
+    """Return the condition that a text states; ``None`` if the text cannot be read."""
     match = _ASKED.fullmatch(text)
     asked = Asked(*match.groups()) if match else None
     return None if asked and asked.sign != "=" and _number(asked.value) is None else asked
 
 
 def problem_of(asked: Asked, kind: Kind) -> str:
-    """Return why what is asked cannot be compared with a property of a type, or an empty text."""
+    """Return why a condition does not fit a property of the type ``kind``; empty if it fits."""
     if _read(asked, kind) is not None:
         return ""
     return f"{quoted(asked.name)} is {kind}; ask for {_EXAMPLES[kind].format(asked.name)}"
@@ -125,7 +128,7 @@ _EXAMPLES: dict[Kind, str] = {
 
 
 def has_asked(properties: Mapping[str, object], text: str) -> bool:
-    """Return whether a node with these properties has what a text asks for."""
+    """Return whether a node with these properties meets the condition in ``text``."""
     asked = asked_in(text)
     value = properties.get(asked.name) if asked else None
     kind = kind_of(value)
@@ -141,7 +144,7 @@ def has_asked(properties: Mapping[str, object], text: str) -> bool:
 
 
 def _read(asked: Asked, kind: Kind) -> object:
-    """Return the asked value as a type; ``None`` if it is not of that type."""
+    """Return the value of a condition, read as ``kind``; ``None`` if it has another type."""
     if kind == "a number":
         return _number(asked.value)
     if asked.sign != "=":

@@ -1,8 +1,8 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
-This module has the model and the rules for one override. Conflicts between two are in
-:mod:`demandops.config.checks.override_conflicts`, effects on releases and claims in
-``plan/overrides``.
+This module has the model and the rules for one override. The module
+:mod:`demandops.config.checks.override_conflicts` finds conflicts between two overrides, and the
+package ``plan/overrides`` applies overrides to releases and claims.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ EFFECTS = (*_SHAPING, "hold", "deny", "keep")
 
 
 def parse_time(text: str) -> datetime:
-    """Return an RFC 3339 time with a zone, in UTC.
+    """Parse an RFC 3339 time that has a time zone, and return it in UTC.
 
     Raises:
         ValueError: if the text is not such a time.
@@ -66,7 +66,7 @@ def parse_time(text: str) -> datetime:
 
 
 def format_time(moment: datetime) -> str:
-    """Return a time in the form of messages and markers."""
+    """Return a time as RFC 3339 text in UTC, as messages and the ledger's markers have it."""
     text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
@@ -103,7 +103,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Refuse an override with a field without a value: it would do less than it seems to."""
+    """Raise an error if a given field has no value, because that field would have no effect."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
@@ -137,14 +137,14 @@ class Selector(FrozenModel):
         return self
 
     def takes(self, service: str, appdef: str) -> bool:
-        """Return whether ``services`` and ``appdefs`` let a service of an appdef match."""
+        """Return whether a service of an appdef matches ``services`` and ``appdefs``."""
         return (not self.services or matches(service, self.services)) and (
             not self.appdefs or matches(appdef, self.appdefs)
         )
 
 
 class OverrideFile(FileModel):
-    """``overrides/<name>.yaml``; if several match, the one with the higher priority wins."""
+    """``overrides/<name>.yaml``. Of several overrides for a release, the highest priority wins."""
 
     kind: Literal["Override"]
     reason: Line
@@ -202,7 +202,7 @@ class OverrideFile(FileModel):
         return any(selector.connections for selector in self.select)
 
     def patches_clients(self) -> bool:
-        """Return whether ``values`` patches the settings of clients, not Helm values."""
+        """Return whether ``values`` patches the settings of clients instead of Helm values."""
         return all(selector.connections for selector in self.select)
 
     def effects(self) -> tuple[str, ...]:
@@ -211,7 +211,7 @@ class OverrideFile(FileModel):
 
     @property
     def end(self) -> datetime | None:
-        """The time at which the override ends."""
+        """The time at which the override ends, or ``None`` if it has no end."""
         return parse_time(self.expires) if self.expires else None
 
 
@@ -231,7 +231,7 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @property
     def path(self) -> str:
-        """The path of its file."""
+        """The path of the override's file."""
         return f"{OVERRIDES_ROOT}/{self.name}.yaml"
 
     @property
@@ -242,12 +242,12 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release, with the effects of each; the last one wins."""
+    """The overrides that shape a release, each with its effects; the last override wins."""
 
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return an image of the registry with the pins of overrides."""
+        """Return an image of the registry, changed by the overrides' pins for its ``name``."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)
@@ -255,7 +255,7 @@ class Shaping:
 
     @property
     def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The files that patch values, and their patches."""
+        """The path and the patch of each override that patches values."""
         return tuple(
             (override.path, override.values or {})
             for override, effects in self.by
@@ -264,7 +264,10 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether a ``hold`` keeps the file as it is: no higher override changes the release."""
+        """Whether a ``hold`` keeps the release's file unchanged.
+
+        A later override that changes the release cancels the ``hold``.
+        """
         held = False
         for _, effects in self.by:
             held = "hold" in effects or (held and set(effects) <= {"keep"})
@@ -303,10 +306,12 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    """Return settings with an override's ``values``; others ignore the fields of MQTT clients.
+    """Return the settings of clients, patched by the ``values`` of an override.
+
+    Fields that only MQTT clients have are ignored for clients of other connection types.
 
     Raises:
-        InvalidInput: if the result is not valid, naming the override's ``file``.
+        InvalidInput: if the result is not valid; the faults name the override's ``file``.
     """
     data = merge_patch(settings.model_dump(by_alias=True), patch)
     of_others = {*_fields(MqttClientSettings)} - {*_fields(type(settings))}
@@ -326,7 +331,11 @@ def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
 
 
 def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    """Return the overrides that have not ended at their current expiry."""
+    """Return the overrides that have not ended.
+
+    ``ended`` maps the name of an override to the expiry at which it ended. An override whose expiry
+    has changed since then is active again.
+    """
     return [
         one
         for name, one in overrides.items()

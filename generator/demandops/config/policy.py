@@ -41,7 +41,7 @@ class Rule(CamelModel):
 
     ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
     brokers, ``peers`` the other access domains that connections may come from and go to.
-    ``approval`` defaults to the access domain's.
+    ``approval`` defaults to that of the access domain.
     """
 
     name: DnsLabel
@@ -67,10 +67,11 @@ class Quotas(CamelModel):
 class LeasePolicy(CamelModel):
     """The time that a demand's claims stay booked without a renewal.
 
-    Demands that request no lease get ``default``; without it their claims last forever. With
-    ``deployment_requests`` that includes the reference's ``DeploymentRequest``, whose clients must
-    then repeat their demands in time. The recorded end of a lease may lag behind the last renewal
-    by ``slack``, so the generator may release a claim late by that much.
+    A demand that requests no lease gets ``default``, or ``longest`` if there is no ``default``. If
+    neither is set, its claims last forever. Goals of the reference's ``DeploymentRequest`` get a
+    lease only with ``deployment_requests``; their clients must then repeat them in time. The
+    recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
+    release a claim late by that much.
     """
 
     default: Duration | None = None
@@ -126,10 +127,13 @@ KINDS = {
 """The kinds that a policy may name by one word."""
 
 NOT_BY_DEFAULT = ("DaemonSet",)
-"""Kinds that a policy must name: a DaemonSet runs on all nodes, not on the demanded one alone."""
+"""Kinds that are allowed only if a policy names them.
+
+A DaemonSet runs on all nodes of a cluster, and not only on the demanded node.
+"""
 
 NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
-"""The kinds that connections' clients need, and Secret, in which Helm keeps its releases."""
+"""The kinds that every domain needs, for the clients of connections and for Helm's releases."""
 
 _NETWORK_POLICY = "NetworkPolicy"
 
@@ -158,16 +162,17 @@ class DomainRos(CamelModel):
 class AccessDomain(CamelModel):
     """A namespace and service account, the nodes whose releases are in it, and who may use them.
 
-    Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves it.
-    ``kinds`` are the kinds that its charts may have (:attr:`allowed_kinds`). ``pod_security``
-    limits what its pods may do: ``baseline`` is that of Kubernetes' Pod Security Standards,
-    ``host-network`` also permits the host's network, ``privileged`` everything.
+    Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves the
+    domain. ``kinds`` are the kinds of objects that its charts may have (:attr:`allowed_kinds`).
+    ``pod_security`` limits what its pods may do: ``baseline`` is the level of this name in
+    Kubernetes' Pod Security Standards, ``host-network`` also permits the host's network, and
+    ``privileged`` permits everything.
 
     ``when_full`` says what happens to a demand if its nodes are suitable but have no room
     (:mod:`demandops.ledger.waiting`).
 
-    ``ros`` replaces the ROS domain of its nodes. ``broker_credentials`` replaces the credentials of
-    brokers, by node, for its ends of connections.
+    ``ros`` replaces the ROS domain of its nodes. ``broker_credentials`` maps the node of a broker
+    to the credentials that the domain's ends of connections use for this broker.
     """
 
     name: DnsLabel
@@ -189,8 +194,8 @@ class AccessDomain(CamelModel):
     def allowed_kinds(self) -> tuple[Kind, ...]:
         """The kinds of objects that the domain's charts may have; the cluster enforces them.
 
-        The default is the kinds of ordinary charts. ``network: namespace`` leaves out
-        NetworkPolicy, with which a chart could open what is closed.
+        Without ``kinds``, these are the kinds of ordinary charts. With ``network: namespace`` they
+        do not include NetworkPolicy, because a chart could use it to open the closed namespace.
         """
         if self.kinds is not None:
             return self.kinds

@@ -114,14 +114,17 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        """Return the image with ``registry`` in place of its host, if the image names a host."""
+        """Return the image pulled from ``registry``.
+
+        ``registry`` replaces the host of the image. It precedes the name of an image without host.
+        """
         host, _, path = self.repository.partition("/")
         named = path and ("." in host or ":" in host or host == "localhost")
         repository = f"{registry}/{path if named else self.repository}"
         return self.model_copy(update={"repository": repository})
 
     def parts(self) -> dict[str, str]:
-        """Return repository, tag and digest as chart values; absent ones are empty."""
+        """Return repository, tag and digest as chart values; an absent value is empty text."""
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
 
     def reference(self) -> str:
@@ -150,7 +153,7 @@ class ImagesFile(FileModel):
 
 
 class ImagePin(FrozenModel):
-    """Changes to an image of the registry; absent fields leave it unchanged."""
+    """Changes to an image of the registry; an absent field changes nothing."""
 
     repository: Repository | None = None
     tag: Tag | None = None
@@ -163,7 +166,11 @@ class ImagePin(FrozenModel):
         return self
 
     def over(self, image: Image) -> Image:
-        """Return the pinned image. A pinned tag removes the image's digest, and the reverse."""
+        """Return the image with this pin applied.
+
+        A pin with only a tag removes the image's digest. A pin with only a digest removes the
+        image's tag.
+        """
         anew = self.tag or self.digest
         return Image(
             repository=self.repository or image.repository,
@@ -184,7 +191,7 @@ class VersionContents(CamelModel):
 
 
 class VersionList(CamelModel):
-    """The versions of one application definition, its default, and channels."""
+    """The versions of one application definition, its default version, and its channels."""
 
     default: ChartVersion
     channels: dict[Word, ChartVersion] = Field(default_factory=dict)
@@ -206,7 +213,7 @@ class VersionList(CamelModel):
 class VersionsFile(FileModel):
     """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
 
-    A definition without an entry has the versions of its charts.
+    An application definition without an entry has the versions of its charts.
     """
 
     kind: Literal["Versions"]
@@ -217,7 +224,7 @@ Precedence = tuple[tuple[int, ...], bool, tuple[tuple[bool, int, str], ...], str
 
 
 def precedence(version: str) -> Precedence:
-    """Return the place of a version in the order of Semantic Versioning 2.0.0 (item 11)."""
+    """Return the key that sorts versions by the rules of Semantic Versioning 2.0.0 (item 11)."""
     numbers, _, before = version.partition("-")
     words = (
         (not word.isdigit(), int(word) if word.isdigit() else 0, word) for word in before.split(".")
@@ -239,7 +246,7 @@ class ApplicationVersion:
 
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
-        """What orders the versions of a definition; versions of one rank are the same."""
+        """The key that sorts the versions of a definition; equal keys mean the same version."""
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 
@@ -278,7 +285,8 @@ class Resources(FrozenModel):
 class ClientSettings(CamelModel):
     """How the containers of one connection type's clients run.
 
-    ``host_network`` is that of the node if not given. A probe is a Kubernetes core/v1 Probe.
+    Without ``host_network``, a client uses the setting of its node. A probe is a Kubernetes core/v1
+    Probe.
     """
 
     env: Annotated[dict[_EnvName, Text], AfterValidator(_free)] = Field(default_factory=dict)
@@ -292,8 +300,8 @@ class ClientSettings(CamelModel):
 class MqttClientSettings(ClientSettings):
     """The settings of MQTT clients, which are ROS nodes.
 
-    ``rmw`` is that of the node if not given. ``messages`` are the packages whose messages the image
-    can carry; an empty list means that they are not known.
+    Without ``rmw``, a client uses the middleware of its node. ``messages`` are the packages whose
+    messages the image can carry; an empty list means that these packages are not known.
     """
 
     launch_file: _LaunchFile = "standalone.launch.xml"
@@ -311,11 +319,11 @@ class ClientsFile(FileModel):
 
     @property
     def connection_types(self) -> tuple[str, ...]:
-        """The words of the connection types for which the file has settings."""
+        """The connection types for which the file has settings, as words like ``mqtt``."""
         return tuple(sorted(self.model_fields_set - {"apiVersion", "kind"}))
 
     def of(self, connection_type: str) -> ClientSettings:
-        """Return the settings of a connection type, by its word in files."""
+        """Return the settings of a connection type, which is a word like ``mqtt``."""
         known: ClientSettings = getattr(self, connection_type, ClientSettings())
         return known
 

@@ -62,7 +62,7 @@ class Flux(FrozenModel):
 class ArgoCd(FrozenModel):
     """Argo CD's access to this repo, and its namespace.
 
-    Argo CD has its own credentials, in a Secret of that namespace that names the URL.
+    Argo CD finds its credentials in a Secret of this namespace. The Secret names the URL.
     """
 
     url: GitUrl
@@ -89,9 +89,9 @@ WebUrl = Annotated[str, without(_web_url_problem), Visible]
 class Proposals(FrozenModel):
     """The forge on which demands that need approval are proposed.
 
-    With ``none`` the branch is pushed and no pull request opened. GitLab opens a merge request by
-    push options. GitHub and Gitea (Forgejo) open one by their API, whose address follows from
-    ``url`` unless ``api`` gives it.
+    With ``none`` the generator pushes the branch, but opens no pull request. With GitLab, the push
+    options of the branch open a merge request. With GitHub and Gitea (Forgejo), the generator opens
+    a pull request through the API, whose address follows from ``url`` unless ``api`` gives it.
     """
 
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
@@ -115,7 +115,7 @@ class Proposals(FrozenModel):
 
     @property
     def project(self) -> tuple[str, ...]:
-        """The project's owner and name, the last two parts of its address."""
+        """The owner and the name of the project: the last two parts of the path in ``url``."""
         path = (self.url or "").partition("://")[2].partition("/")[2]
         return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
 
@@ -123,9 +123,9 @@ class Proposals(FrozenModel):
 class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
-    ``demand_items``: applications, connections, topics and requesters that it lists.
-    ``parameter_bytes``: an application's parameters as JSON. ``file_bytes``: a file that it writes;
-    Kubernetes stores no object above 1.5 MB.
+    ``demand_items``: applications, connections, topics and requesters that the demand lists.
+    ``parameter_bytes``: an application's parameters as JSON. ``file_bytes``: a file that the
+    generator writes for the demand; Kubernetes stores no object above 1.5 MB.
     """
 
     demand_items: Positive = 20_000
@@ -136,8 +136,9 @@ class Limits(CamelModel):
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
-    It may also contain the section of the other controller, which is then not used. ``placement``
-    says which of the nodes that fit an application gets (:mod:`demandops.plan.nodes.placement`).
+    The file may also contain the section of the controller that ``gitops`` does not name; this
+    section is not used. ``placement`` is the rule by which the generator chooses among the nodes
+    that fit an application (:mod:`demandops.plan.nodes.placement`).
     """
 
     kind: Literal["StateRepository"]

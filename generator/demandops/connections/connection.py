@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class Connection:
     """One connection and the topics that it carries.
 
-    ``type`` is ``None`` if a demand leaves it open, ``broker`` is empty if the program chooses it.
-    In a claim there is a type, and the routes are sorted by their source topic, each once
-    (:meth:`booked`).
+    ``type`` is ``None`` if a demand leaves the type open. ``broker`` is empty if the program
+    chooses the broker. The connection of a claim has a type, and its routes are sorted by source
+    topic, without duplicates (:meth:`booked`).
     """
 
     id: str
@@ -48,18 +48,21 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """The type of the connection, which must be chosen already."""
+        """The type of a connection whose type is already chosen."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic, or ``None``; only for a connection of a claim."""
+        """Return the route of a source topic, or ``None`` if there is none.
+
+        The routes must be sorted, as those of a claim are.
+        """
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
         return found[0] if found and found[0].source == source else None
 
     def needs(self, node: str) -> bool:
-        """Return whether the connection depends on a node."""
+        """Return whether a node is an end of the connection or its broker."""
         return node in (self.source, self.target, self.broker)
 
     def booked(self) -> Connection:
@@ -67,12 +70,18 @@ class Connection:
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return ``more`` with this connection's topics and broker added."""
+        """Return ``more`` with this connection's topics added.
+
+        If ``more`` names no broker, it gets this connection's broker.
+        """
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether a shutdown's ``listed`` means this connection; empty fields match any."""
+        """Return whether ``listed``, an item of a shutdown, means this connection.
+
+        An empty source, target or type in ``listed`` matches any value.
+        """
         return (
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -90,7 +99,10 @@ class Connection:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each topic of ``listed`` as text, with the key of the same own topic, if any."""
+        """Yield each topic of ``listed`` as text, with a list of its keys in this connection.
+
+        The list has one key, or none if this connection does not carry the topic.
+        """
         assert isinstance(listed, Connection)  # noqa: S101 - see is_meant_by
         known = {*self.topic_keys()}
         for key in listed.topic_keys():
@@ -102,7 +114,10 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return the connection without the broker ``node``; ``None`` if the node is an end."""
+        """Return what remains of the connection without ``node``, its broker or one of its ends.
+
+        Without an end, nothing remains: the result is ``None``. Otherwise the result has no broker.
+        """
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:

@@ -3,8 +3,9 @@
 Each type has one module with a subclass of :class:`ConnectionType` and its clients. The subclass
 defines what the type supports and needs, and plans the clients of each connection as data.
 :mod:`demandops.render.connection_client` makes a client's file from that data and from
-``templates/connections/<type>/``. There ``client.yaml.j2`` is a Deployment with the client's name,
-and ``schema.json`` lists the fields that the program reads.
+``templates/connections/<type>/``. In that folder, ``client.yaml.j2`` is the template of a
+Deployment with the client's name, and ``schema.json`` lists the fields that the client's program
+reads.
 """
 
 from __future__ import annotations
@@ -69,21 +70,25 @@ class Client(ABC):
 
     @abstractmethod
     def configuration(self) -> dict[str, Any]:
-        """Return the configuration that the program reads."""
+        """Return the configuration that the client's program reads."""
 
     def written(self, configuration: Mapping[str, Any]) -> str:
-        """Return a configuration as the text that the program reads."""
+        """Return a configuration as the text that the client's program reads."""
         return strict_yaml.dump(configuration)
 
     def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return the part of a configuration that the program reads only at its start."""
+        """Return the part of a configuration whose changes need a restart of the client.
+
+        The client's program reads this part only at its start.
+        """
         return configuration
 
     def settings(self, config: Config) -> ClientSettings:
         """Return the settings with which the client runs, patched by overrides.
 
         Raises:
-            InvalidInput: naming the override whose patch gives no valid settings.
+            InvalidInput: if an override's patch gives no valid settings. The error names the
+                override.
         """
         found = config.clients.of(self.type.word)
         for file, patch in self.shaping.patches:
@@ -91,7 +96,7 @@ class Client(ABC):
         return found
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
-        """Return the environment that the program needs in addition to that of its settings."""
+        """Return the environment variables that the program needs besides those of ``settings``."""
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
@@ -116,7 +121,7 @@ class End(Client):
         return f"{self.type.name} {self.side} of connection {connection} on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return the topics."""
+        """Return one line for each topic."""
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
@@ -125,13 +130,17 @@ class End(Client):
 
 
 def message_type(route: Route, sender: str, config: Config) -> str:
-    """Return the message type of a route from ``sender``, as the route or the inventory says."""
+    """Return the message type of a route whose messages come from the node ``sender``.
+
+    The route's own type comes first, then the type that the inventory gives. The result is empty if
+    neither is known.
+    """
     known = config.nodes.get(sender)
     return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of the fault that inventory or registry lack an entry that the type needs."""
+"""The code of a fault: the inventory or the registry lacks what a connection type needs."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 
@@ -140,14 +149,14 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return a connection, or ``None`` if no claim has the connection with this type.
+        """Return the connection with an id, or ``None`` if no claim of this type has it.
 
         Raises:
-            Refused: if the type cannot carry it.
+            Refused: if the type cannot carry the connection.
         """
 
     def at(self, node: str) -> Iterable[str]:
-        """Return the connections that end at a node, sorted."""
+        """Return the ids of the connections that end at a node, sorted."""
 
 
 class ConnectionType(ABC):
@@ -189,7 +198,7 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield why the inventory does not let the type link two ends.
+        """Yield a fault for each reason why the type cannot link the two nodes of a connection.
 
         Unknown nodes are skipped; :mod:`demandops.demand.admission` reports them.
         """
@@ -197,18 +206,29 @@ class ConnectionType(ABC):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield the other faults of a route from ``sender``, for example of its options."""
+        """Yield those faults of a route that only this type can find.
+
+        Args:
+            where: the path of the route in the connection, such as ``topics[0]``.
+            route: the route.
+            sender: the node that the messages come from.
+            config: the configuration.
+        """
         return iter(())
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection as clients will carry it, and what differs from the request.
+        """Return the connection as clients will carry it, and a note.
 
-        The caller ensures that the inventory can fulfill the demand.
+        The note is how the connection differs from the demanded one; empty if it does not differ.
+        The caller must have checked that the inventory can fulfill the demand.
         """
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return (field of an access rule, needed value) for what is needed besides the nodes."""
+        """Return what a demand of the connection must be allowed to use besides the nodes.
+
+        Each item is a field of an access rule, and the value that this field must allow.
+        """
         return []
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
@@ -217,7 +237,7 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
-        """Return the client at a key, or ``None`` if it carries no topic.
+        """Return the client with a key, or ``None`` if the client carries no topic.
 
         Raises:
             Refused: if connections contradict each other, or the configuration no longer has what
@@ -232,10 +252,10 @@ def make_end(
     config: Config,
     **more: Any,  # noqa: ANN401 - any field
 ) -> AnyEnd:
-    """Return one end of a connection; ``more`` are the fields that only this kind of end has.
+    """Return one end of a connection; ``more`` has the fields that only this kind of end has.
 
     Raises:
-        Refused: if its node is gone.
+        Refused: if the end's node is no longer in the inventory or in an access domain.
     """
     own, peer = connection.source, connection.target
     if key.side == "target":

@@ -23,7 +23,7 @@ CONNECTION_TYPES: tuple[ConnectionType, ...] = (ZENOH, MQTT, ROS)
 
 
 def type_numbered(number: int) -> ConnectionType | None:
-    """Return the type with a number in ``DeploymentRequest``, or ``None``."""
+    """Return the type that has a number in ``DeploymentRequest``, or ``None`` if none has it."""
     return next((known for known in CONNECTION_TYPES if known.number == number), None)
 
 
@@ -43,7 +43,10 @@ def by_number() -> list[ConnectionType]:
 
 
 def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
-    """Return the validator of a field that accepts the types' words and the given words."""
+    """Return the validator of a field that accepts the types' words and the given words.
+
+    A message about a wrong word lists ``before``, then the types' words, then ``after``.
+    """
 
     def words() -> tuple[str, ...]:
         return (*before, *(known.word for known in by_number()), *after)
@@ -81,9 +84,10 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 
 
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
-    """Yield why ``kind`` cannot carry a connection, by fields of :class:`Connection`.
+    """Yield a fault for each reason why ``kind`` cannot carry a connection.
 
-    It skips nodes that are not in the inventory; :mod:`demandops.demand.admission` reports them.
+    The field of a fault is a field of :class:`Connection`. Nodes that are not in the inventory are
+    skipped; :mod:`demandops.demand.admission` reports them.
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:
@@ -114,7 +118,7 @@ def route_faults(
     """Yield a fault for everything in a connection's routes that ``kind`` does not support."""
     for index, route in enumerate(topics):
         if topic_problem(route.source) or topic_problem(route.target):
-            continue  # the request's own checks report it
+            continue  # the checks of the request report this topic
         where = f"topics[{index}]"
         for name in route.options():
             if name not in _ALWAYS and name not in kind.options:

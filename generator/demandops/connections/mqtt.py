@@ -39,7 +39,7 @@ _NO_BROKER = "no-broker"
 
 
 class Mqtt(ConnectionType):
-    """Both ends are clients of one broker."""
+    """The connection type MQTT: both ends are clients of one broker."""
 
     name = "MQTT"
     number = 1
@@ -72,7 +72,7 @@ class Mqtt(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield a fault if the clients' image does not carry the route's messages."""
+        """Yield a fault if the clients' image lacks the package of the route's messages."""
         package = message_type(route, sender, config).partition("/")[0]
         carried = config.clients.mqtt.messages
         if package and carried and package not in carried and not route.primitive:
@@ -85,7 +85,11 @@ class Mqtt(ConnectionType):
             )
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection with the broker that it gets, and a note if another was named."""
+        """Return the connection, and a note if it gets another broker than it names.
+
+        A named broker is replaced if :func:`choose_broker` chooses another one. A connection that
+        names no broker stays as it is.
+        """
         broker = choose_broker(connection, config)
         if not connection.broker or broker is None or broker.node == connection.broker:
             return connection, ""
@@ -96,12 +100,12 @@ class Mqtt(ConnectionType):
         return replace(connection, broker=broker.node), note
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the broker."""
+        """Return the broker as the value that ``brokers`` of an access rule must allow."""
         broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
-        """Return one end of a connection."""
+        """Return the end with a key, or ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -122,9 +126,10 @@ MQTT = Mqtt()
 
 
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
-    """Return a connection's broker as the reference chooses it, or ``None``.
+    """Return the broker of a connection, or ``None`` if no broker fits.
 
-    If there is only one broker, it is chosen; else the named one, the target's or the source's.
+    The choice is that of the reference. If there is only one broker, it is chosen. Otherwise it is
+    the broker on the named node, or else on the target, or else on the source.
     """
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))
@@ -143,7 +148,7 @@ class MqttEnd(End):
     """The prefix of this connection's MQTT topics, the same at both ends."""
 
     def facts(self) -> list[str]:
-        """Return the topics and the broker."""
+        """Return one line for each topic, and one for the broker."""
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
@@ -166,8 +171,8 @@ class MqttEnd(End):
     def configuration(self) -> dict[str, Any]:
         """Return the content of one end's ROS parameter file.
 
-        Each ROS topic has one MQTT topic, named after the connection and the source topic: a
-        topic's name may differ between the ends.
+        Each ROS topic has one MQTT topic. The MQTT topic is named after the connection and the
+        source topic, because the name of the ROS topic may differ between the ends.
         """
         bridge: dict[str, Any] = {}
         read = {route.read_topic: route for route in self.topics if self.reads(route)}

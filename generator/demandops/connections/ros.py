@@ -33,7 +33,7 @@ _LOCAL, _WAN = "local", "wan"
 
 
 class Ros(ConnectionType):
-    """One end listens at its node's address, and the other connects to it."""
+    """The connection type ROS: each end is a router; one listens, and the other connects to it."""
 
     name = "ROS"
     number = 0
@@ -55,7 +55,10 @@ class Ros(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield a fault if the message type is unknown, and one if a QoS policy is missing."""
+        """Yield a fault if the message type is unknown.
+
+        Yield another one if durability is set without reliability.
+        """
         if sender in config.nodes and not message_type(route, sender, config):
             yield fault(
                 f"{where}.type",
@@ -71,7 +74,7 @@ class Ros(ConnectionType):
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
-        """Return one end of a connection."""
+        """Return the end with a key, or ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -106,7 +109,10 @@ ROS = Ros()
 
 
 def _listener(connection: Connection, config: Config) -> Node | None:
-    """Return the end that listens: the target if it has a wan address, else the source."""
+    """Return the end that listens, or ``None`` if neither end has a wan address.
+
+    If both ends have a wan address, the target listens.
+    """
     for id in (connection.target, connection.source):
         node = config.nodes.get(id)
         if node is not None and node.wan is not None:
@@ -127,7 +133,7 @@ def _number(connection: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class RosEnd(End):
-    """One end of a ROS connection. Every route of ``topics`` has its message type."""
+    """One end of a ROS connection. Each route in ``topics`` has its message type set."""
 
     listener: str
     """The node that listens, at ``port`` of its address ``wan``."""
@@ -135,14 +141,15 @@ class RosEnd(End):
     port: int
 
     def facts(self) -> list[str]:
-        """Return the topics and the address."""
+        """Return one line for each topic, and one for the listening address."""
         return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
 
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of one end's router.
 
-        A topic passes only from the end that reads it to the end that writes it. Most topics come
-        from the source. The general routes cover these, so that a new one needs no restart.
+        A topic passes only from the end that reads it to the end that writes it. The general routes
+        are for topics that come from the source. Most topics do, so a new topic needs no route of
+        its own and no restart.
         """
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []
@@ -177,7 +184,10 @@ class RosEnd(End):
         }
 
     def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return the configuration without the list of topics."""
+        """Return the configuration without the list of topics.
+
+        A running router reads a changed list of topics again.
+        """
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 
 
@@ -193,7 +203,11 @@ def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
 
 
 def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
-    """Return a topic's settings; the sending end limits the rate, before the link."""
+    """Return a topic's QoS settings in the router's format.
+
+    ``reads`` is true for the end that reads the topic. Only this end limits the rate, so that no
+    surplus messages cross the link.
+    """
     qos: dict[str, Any] = {}
     if route.reliability:
         qos["reliability"] = route.reliability == "reliable"

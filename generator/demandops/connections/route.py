@@ -26,8 +26,8 @@ class Route:
     messages go from the target to the source. ``type`` is the ROS message type
     (``std_msgs/msg/String``), empty if not given. The options are ``qos`` (MQTT, 0 to 2),
     ``retained`` and ``primitive`` (MQTT), ``reliability``, ``durability`` and ``queue`` (of the ROS
-    endpoints), ``rate`` (the highest rate in Hz; 0 for all messages). Their defaults keep the
-    client's own behavior.
+    endpoints), ``rate`` (the highest rate in Hz; 0 for all messages). An option with its default
+    leaves the client's own behavior unchanged.
     """
 
     source: str
@@ -67,7 +67,10 @@ class Route:
         return f"topic {self.source} {direction} {self.target}" + (f" ({listed})" if listed else "")
 
     def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
-        """Return the sending and the receiving node of a connection between two nodes."""
+        """Return the node that sends the topic, and the node that receives it.
+
+        ``source`` and ``target`` are the nodes of the connection.
+        """
         return (target, source) if self.reverse else (source, target)
 
 
@@ -151,7 +154,11 @@ def _shown(value: object) -> str:
 
 
 def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
-    """Return routes by source topic, each once; a route with a message type is preferred."""
+    """Return one route for each source topic, sorted by source topic.
+
+    If several routes have the same source topic, the first route with a message type is kept, or
+    else the first route.
+    """
     merged: dict[str, Route] = {}
     for route in routes:
         first = merged.get(route.source)

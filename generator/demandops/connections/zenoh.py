@@ -1,7 +1,7 @@
 """Zenoh connections: each node has one zenoh-bridge-ros2dds for all its connections.
 
-Two bridges on one host and ROS domain do not work. The configuration is that of
-eclipse-zenoh/zenoh-plugin-ros2dds 1.10, which reads it only at its start.
+Two bridges must not share a host and a ROS domain. The configuration is that of
+eclipse-zenoh/zenoh-plugin-ros2dds 1.10. A bridge reads it only at its start.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from demandops.errors import Fault, Refused, fault
 
 
 class Zenoh(ConnectionType):
-    """All Zenoh connections of a node share its bridge."""
+    """The connection type Zenoh: all Zenoh connections of a node share its bridge."""
 
     name = "ZENOH"
     number = 2
@@ -84,7 +84,7 @@ class Zenoh(ConnectionType):
         return ClientKey(self, source), ClientKey(self, target)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
-        """Return a node's bridge."""
+        """Return the bridge of a node, or ``None`` if it carries no topic."""
         publishers: dict[str, tuple[float, str]] = {}
         subscribers: set[str] = set()
         peers: dict[str, str] = {}
@@ -131,8 +131,8 @@ ZENOH = Zenoh()
 def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
     """Return the endpoints that a bridge connects to: its routers, and some of its peers.
 
-    If two peers can reach each other, only the peer whose id sorts first connects. So the two
-    have one link.
+    If two peers can reach each other, only the peer whose id sorts first connects to the other. So
+    there is only one link between the two.
     """
     if node.zenoh is None:
         message = (
@@ -181,8 +181,9 @@ class Bridge(Client):
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of a node's bridge.
 
-        ``allow`` lists the topics that pass; a missing list lets none pass. Multicast scouting is
-        off: Git says which bridges connect.
+        ``allow`` lists the topics that pass. If ``publishers`` or ``subscribers`` is missing there,
+        no topic of that kind passes. Multicast scouting is off, because the state repo defines
+        which bridges connect.
         """
         lists = {"publishers": self.publishers, "subscribers": self.subscribers}
         ros: dict[str, Any] = {

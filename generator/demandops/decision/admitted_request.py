@@ -28,7 +28,7 @@ _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
-"""Yields a fault if a request comes too soon after others of its requesters."""
+"""A function that yields a fault if a request follows others of its requesters too soon."""
 
 
 def admitted(
@@ -38,10 +38,11 @@ def admitted(
     throttle: Throttle,
     trial: placement.Trial | None = None,
 ) -> DemandRequest:
-    """Return the request of a goal; if only room is lacking, the request to wait for room.
+    """Return the request of a goal, or a request to wait if only room on a node is lacking.
 
     Raises:
-        Refused: if the demand can neither be booked nor wait. A demand with claims never waits.
+        Refused: if the demand can neither be booked nor wait. A demand that already holds claims
+            never waits.
     """
     try:
         return admit(state, goal, throttle, trial)
@@ -73,7 +74,7 @@ def admit(
 ) -> DemandRequest:
     """Return the request of a goal, checked against the configuration and the throttle.
 
-    With a ``trial``, nodes with which the request cannot be booked are passed over.
+    If ``trial`` is given, nodes for which it returns ``False`` are not chosen.
 
     Raises:
         Refused: with every fault, of form and of content.
@@ -122,7 +123,10 @@ def admit(
 
 
 def completed(request: DemandRequest, state: State) -> DemandRequest:
-    """Return a request completed by leases, connections and their types; its nodes are chosen."""
+    """Return a request with its leases, implied connections and connection types filled in.
+
+    The nodes of the request are chosen already.
+    """
     config, ledger = state.config, state.ledger
     request = permission.with_lease_terms(request, config)
     if request.is_reference:
@@ -133,7 +137,7 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
 
 
 def leaves_nodes_open(state: State, goal: object) -> bool:
-    """Return whether the generator chooses a node for a goal."""
+    """Return whether the generator chooses nodes for a goal's applications or services."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request: DemandRequest | None = demand_goal.parse(goal)[0]
     else:
@@ -142,7 +146,7 @@ def leaves_nodes_open(state: State, goal: object) -> bool:
 
 
 def _refuse_large(request: DemandRequest, config: Config) -> None:
-    """Refuse a request that is too large, before other checks read all that it lists."""
+    """Raise :class:`Refused` if a request is too large for the limits of the settings."""
     faults = list(admission.size_faults(request, config.repo_settings.limits))
     if faults:
         raise Refused(faults)
@@ -163,6 +167,9 @@ def _with_parents(field: str) -> Iterator[str]:
 
 
 def _subject_of(field: str) -> tuple[str, int]:
-    """Return the subject of a field, to report faults of one subject together."""
+    """Return (list, index) of the subject that a field belongs to.
+
+    Faults are sorted by this key, so that the faults of one subject are reported together.
+    """
     match = _SUBJECT.match(field)
     return (match[1], int(match[2])) if match else ("", 0)

@@ -1,4 +1,4 @@
-"""Claims that a person wrote: what follows from them, and why they are refused."""
+"""Claims that a person edits: the changes that an edit causes, and the faults of an edit."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The decision on one demand: from the goal to the files of a commit.
 
-It is one pure function of these stages: parse, admit, book, plan, render. It reads the state repo
-only through ``read`` and writes nothing. So a dry run, a replay on a moved remote
-and the real run are the same call.
+:func:`decide` is one pure function with these stages: parse, admit, book, plan, render. It reads
+the state repo only through ``read`` and writes nothing. So the real run, a dry run, and a replay
+after the remote got newer commits all call the same function.
 """
 
 from __future__ import annotations
@@ -68,9 +68,11 @@ _OUTCOMES: dict[str, Outcome] = {
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """The effect of a demand. ``files`` is empty if it changes nothing.
+    """The effect of a demand.
 
-    ``approval`` names the access domains, rules and appdefs that require a person's approval first.
+    ``files`` maps each path to the new text, or to ``None`` if the file is to be removed. It is
+    empty if the demand changes nothing. ``approval`` names the access domains, rules and appdefs
+    that require a person's approval first.
     """
 
     request: DemandRequest
@@ -97,8 +99,8 @@ class Decision:
     def lease_s(self) -> int | None:
         """The shortest lease of the demand, in seconds; ``None`` if it has no lease.
 
-        For a waiting demand it is the shortest lease that the demand may get, so that the client
-        keeps renewing it.
+        For a waiting demand this is the shortest lease that the demand may get, so that the client
+        renews the demand often enough.
         """
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:
@@ -121,7 +123,7 @@ def decide(
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda request, config: (),
 ) -> Decision:
-    """Decide on a goal of the reference's action or of our own.
+    """Return the decision on a goal of the reference's action or of our own action.
 
     Args:
         state: the configuration and ledger to decide on.
@@ -131,10 +133,11 @@ def decide(
         now: when the demand was received, with time zone.
         read: returns the current text of a file in the state repo, or ``None``.
         on_stage: called when the demand is admitted and when it is booked.
-        throttle: checked last before a request is admitted.
+        throttle: called last before a request is admitted; the faults that it yields refuse the
+            request.
 
     Raises:
-        Refused: with every fault, by the goal's fields. Nothing may be written then.
+        Refused: with every fault, each with its field in the goal.
         InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
     if isinstance(goal, DemandRequest):
@@ -156,7 +159,7 @@ def decide(
         by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
         if not by_node or not leaves_nodes_open(state, goal):
             raise
-        # look for a node that avoids the refusal; other demands do not pay for this search
+        # look for a node on which the demand is not refused; only a refused demand costs this time
         with suppress(Refused):
             request = admit(state, goal, throttle, partial(_can_be_booked, state, now))
             return _decided(state, request, now, read, once)
@@ -166,7 +169,7 @@ def decide(
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
 )
-"""The codes of refusals that another node may avoid."""
+"""The fault codes of demands that are refused, but may be possible on another node."""
 
 
 def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:
@@ -245,7 +248,7 @@ def _booked(
     """Return the state with a request booked, the changes, and the releases that may change.
 
     Raises:
-        Refused: if existing claims, an override, a quota or a topic forbid it.
+        Refused: if existing claims, an override, a quota or a topic clash forbid the booking.
     """
     ledger, changes = _book(state, request, now)
     after = replace(state, ledger=ledger)
@@ -267,7 +270,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
     request releases.
 
     Raises:
-        Refused: if existing claims, an override or a quota forbid it.
+        Refused: if existing claims, an override or a quota forbid the booking.
     """
     subjects = request.subjects()
     ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
@@ -284,7 +287,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return how much more services request of each node; empty if no node has a capacity."""
+    """Return (node, resource) → how much more services request; empty without capacities."""
     return (
         capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
     )
@@ -293,7 +296,9 @@ def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.N
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state without a service's expired extra replicas, and the files that change.
+    """Return the state after a service stops keeping replicas whose time is over.
+
+    The second value is the changeset, which has the files to write.
 
     Raises:
         Refused, InvalidInput: if the service cannot be planned or rendered.

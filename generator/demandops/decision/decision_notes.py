@@ -42,7 +42,10 @@ def notes_on(
 
 
 def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield warnings: inputs without a connection, topics that are bridged already, and notes."""
+    """Yield warnings about inputs without a connection and topics that are bridged already.
+
+    Each note on a connection of the request is a warning, too.
+    """
     ledger = without_suspended(world).ledger
     for one in request.demanded if request.adds_claims else ():
         held = one.held

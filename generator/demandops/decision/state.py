@@ -50,7 +50,10 @@ class State(World):
         return self._usage
 
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
-        """Return the state after a decision, with the releases that the decision planned."""
+        """Return the state after a decision, with the releases that the decision planned.
+
+        ``usage`` is what services request of each node after the decision.
+        """
         known = self.plans
         for key, release in rendered.plans.items():
             known = known.insert(key, release) if release else known.discard(key)
@@ -60,10 +63,13 @@ class State(World):
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
-        """Return the state with another ledger; only changed claims are counted anew."""
+        """Return the state with another ledger, whose claims differ by ``changes``.
+
+        If the usage of nodes is known, only the changed claims are counted again.
+        """
         state = replace(self, ledger=ledger)
         if self._usage is not None:
-            with suppress(Refused):  # a definition is gone; then ``usage`` counts all anew
+            with suppress(Refused):  # a definition is gone; ``usage`` then counts all services
                 usage = self._usage.plus(capacity.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state

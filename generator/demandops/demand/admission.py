@@ -29,7 +29,8 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
     A shutdown may name nodes that are not in the inventory, so that their claims can be released.
     """
-    if request.id and request.id != request.demand:  # a request without an id has the demand's
+    # a request without an id of its own has the id of its demand
+    if request.id and request.id != request.demand:
         yield from _id("id" if request.is_reference else "request", request.id)
     if not request.is_reference:
         yield from _own_fields(request)
@@ -46,7 +47,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         found = [*_id("id", one.held.id), *_requesters(one.requesters)]
         if isinstance(one.held, Application):
             of_app = _application(one.held, config, request.adds_claims)
-            # if no node was found for it, the placement reports that
+            # if the placement found no node for the application, the placement reports this
             placed = one.held.node or one.held.place is None
             found += [each for each in of_app if placed or each.field != "node"]
         else:
@@ -55,7 +56,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
 
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault if the request is larger than the state repo's limits allow."""
+    """Yield a fault for each limit of the state repo that the request exceeds."""
     items = len(request.demanded) + len(request.own_requesters)
     items += len(request.positions) if isinstance(request, Put) else 0
     for one in request.demanded:
@@ -85,7 +86,7 @@ def _too_large(size: str, limit: str, most: int) -> str:
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of the fields that a Demand has and a DeploymentRequest has not."""
+    """Yield the faults of the fields that only a Demand has, not a DeploymentRequest."""
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         message = (
@@ -93,7 +94,7 @@ def _own_fields(request: DemandRequest) -> Iterator[Fault]:
             "demand id"
         )
         yield fault("demand", message)
-    if not request.demanded:  # else each of them is checked
+    if not request.demanded:  # otherwise the requesters of each item are checked
         yield from _requesters(request.own_requesters)
     lease_s = request.lease_s if isinstance(request, Put) else None
     if lease_s is not None and not 0 < lease_s <= LONGEST_S:
@@ -206,7 +207,10 @@ def _named_services(app: Application, appdef: str, config: Config) -> Iterator[F
 def _instance(
     app: Application, appdef: ApplicationDefinition, versions: Collection[str]
 ) -> Iterator[Fault]:
-    """Yield a fault if a separate instance has the wrong id, or another application has its id."""
+    """Yield a fault if the id of a separate instance is wrong.
+
+    Also yield a fault if another application has an id that is reserved for a separate instance.
+    """
     id, _, named = app.id.rpartition("@")
     if app.separate and (not id or named != app.version):
         message = f"{quoted(app.id)} of a separate instance does not end in '@{app.version}'"
@@ -305,8 +309,13 @@ def with_chosen_types(
 ) -> AnyRequest:
     """Return ``request`` with the type and the broker that each connection gets.
 
-    A claimed connection keeps its current type. A new one gets the first type that can carry it
-    (:func:`connection_types.type_faults`); if no type can, it gets none.
+    A claimed connection keeps its current type. A new connection gets the first type that can carry
+    it (:func:`connection_types.choose_type`), or no type if none can.
+
+    Args:
+        request: the request.
+        config: the configuration, which has the nodes and brokers.
+        current: returns the claimed connection with an id, or ``None``.
     """
 
     def chosen(one: Demanded) -> Demanded:

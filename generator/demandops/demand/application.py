@@ -17,7 +17,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 class InputTopic(NamedTuple):
     """An input topic of an application, and the node that publishes it.
 
-    ``further``: when this topic was booked, another one was the usual topic of the node
+    ``further``: when this topic was booked, another topic was the usual topic of the node
     (:mod:`demandops.plan.output_topics`).
     """
 
@@ -28,15 +28,21 @@ class InputTopic(NamedTuple):
 
     @property
     def part(self) -> str:
-        """The source as part of a topic name; a further topic adds its own name."""
+        """The part of topic names for this input: the source, and a further topic's own name."""
         return self.part_in("")
 
     def part_in(self, version: str) -> str:
-        """Return :attr:`part` for the separate instance of ``version``, if given."""
+        """Return :attr:`part` for the separate instance of a version; it has the version too.
+
+        An empty ``version`` stands for the shared instance.
+        """
         return naming.topic_part(self.source, self.told_apart_by(self.further, version))
 
     def told_apart_by(self, further: bool, version: str) -> str:
-        """Return the text that distinguishes names of one source: further topic and version."""
+        """Return the text that distinguishes names with the same source.
+
+        The text is the topic if it is ``further``, and the version if it is not empty.
+        """
         if not further:
             return version
         return f"{self.topic} {version}" if version else self.topic
@@ -71,7 +77,7 @@ class Requirement:
         return len(self.labels) + len(self.capabilities) + len(self.properties)
 
     def united(self, other: Requirement) -> Requirement:
-        """Return the requirement that includes both requirements."""
+        """Return the requirement that a node meets if it meets this one and ``other``."""
         return Requirement(
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
@@ -85,12 +91,12 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: an appdef at a node with inputs by role.
 
     ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
-    are sorted by topic (:meth:`booked`). ``place`` is what its node must have; it is ``None`` if
-    the demand names the node. ``separate`` says that this version runs at the same time as others,
-    and that the id ends in it (:mod:`demandops.demand.separate_instance`). ``services`` maps each
-    service that is placed alone to its node. ``named`` lists the services whose node the demand
-    names; the generator chose the other nodes. ``moved`` maps each service that an override moves
-    to its node.
+    are sorted by topic (:meth:`booked`). ``place`` is what the node must have; it is ``None`` if
+    the demand names the node. ``separate`` says that this version runs at the same time as other
+    versions, and that the id ends in the version (:mod:`demandops.demand.separate_instance`).
+    ``services`` maps each service that has a node of its own to this node. ``named`` lists the
+    services whose node the demand names; the generator chose the nodes of the other services.
+    ``moved`` maps each service that an override moves to the node where it runs then.
     """
 
     id: str
@@ -124,7 +130,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def own_version(self) -> str:
-        """The version in the names of the services and topics; empty if not separate."""
+        """The version in the names of services and topics; empty unless ``separate`` is set."""
         return self.version if self.separate else ""
 
     @property
@@ -142,7 +148,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs of a role with this source and this topic."""
+        """Return the inputs of a role with this source and topic; all inputs must be sorted."""
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
@@ -151,10 +157,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further inputs of a role with this part of topic names (:attr:`part`).
+        """Return the further inputs of a role whose :attr:`part` is ``part``.
 
-        A separate instance returns usual inputs too. The parts are computed once, because each
-        service for a further topic looks one up.
+        For a separate instance, return the usual inputs with this part too. The parts of all inputs
+        are computed only once, because the plan of each service for a further topic needs them.
         """
         if not self._further:
             for known, topic in self.all_inputs():
@@ -182,18 +188,18 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def chosen_nodes(self) -> set[str]:
-        """The application's node, and the nodes of services that are placed one by one."""
+        """The application's node, and the nodes of the services that have a node of their own."""
         return {self.node, *self.services.values()}
 
     def decided_like(self, other: Application) -> bool:
-        """Return whether both are of one type and run on the same nodes."""
+        """Return whether both applications have the same appdef and run on the same nodes."""
         one, two = ((app.appdef, app.node, app.services, app.moved) for app in (self, other))
         return one == two
 
     def placed_as(self, first: Application) -> Application:
         """Return the application moved to the nodes of ``first``.
 
-        ``first`` is the application in the first claim.
+        ``first`` is the application in the first claim on the same subject.
         """
         if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
             return self
@@ -212,7 +218,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, inputs=MappingProxyType(kept))
 
     def extended(self, more: Application) -> Application:
-        """Return ``more`` with this application's inputs, parameters and deliveries added."""
+        """Return ``more`` with this application's inputs, parameters and deliveries added.
+
+        A parameter of ``more`` has precedence over this application's parameter of the same name.
+        """
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
         parameters = MappingProxyType({**self.parameters, **more.parameters})
@@ -222,7 +231,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def is_meant_by(self, listed: object) -> bool:
-        """Return whether a shutdown's ``listed`` means this application; no node matches any."""
+        """Return whether a shutdown that lists ``listed`` means this application.
+
+        A listed application without a node means an application on any node.
+        """
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -234,14 +246,14 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
-        """Yield the key of each input: role, topic, source. Without inputs, the key is empty."""
+        """Yield the key of each input, (role, topic, source), or one empty key without inputs."""
         for role, topic in self.all_inputs():
             yield role, topic.topic, topic.source
         if not any(self.inputs.values()):
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each input of ``listed`` as text, with the keys of own inputs that it matches."""
+        """Yield each input of ``listed`` as text, with the keys of the matching inputs here."""
         assert isinstance(listed, Application)  # noqa: S101 - see is_meant_by
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():
@@ -252,7 +264,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield f"{role} {topic.topic} of {topic.source}", keys
 
     def without_topics(self, gone: Container[TopicKey]) -> Application | None:
-        """Return the application without these inputs; ``None`` if no input is left."""
+        """Return the application without the inputs in ``gone``; ``None`` if no input is left."""
         left = {
             role: tuple(one for one in topics if (role, one.topic, one.source) not in gone)
             for role, topics in self.inputs.items()

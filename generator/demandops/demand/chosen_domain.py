@@ -1,10 +1,12 @@
-"""The choice of an access domain if a demand names a node that is in several.
+"""The choice of an access domain if a demand names a node that is in several domains.
 
 In each further domain the node has a name of its own, ``<node>@<domain>``, which a demand may give
-wherever it names a node. ``<node>@<first domain>`` is the node itself. If a demand names only the
-node for an application, one of its services or an end of a connection, the domain follows from what
-is booked already, or else from the rules: it is the only domain in which the requesters may use the
-node.
+wherever it names a node. ``<node>@<first domain>`` is the node itself.
+
+A demand may name the node without a domain for an application, for a service of an application, or
+for an end of a connection. The domain is then the one in which the subject is booked already. If
+the subject is not booked yet, the domain is the only one in which the rules let the requesters use
+the node.
 """
 
 from __future__ import annotations
@@ -30,7 +32,10 @@ Booked = Callable[[Subject], "Held | None"]
 def with_chosen_domains(
     request: AnyRequest, config: Config, booked: Booked
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with an access domain for each node, and a fault for unclear ones."""
+    """Return the request with a chosen access domain for each node.
+
+    Return also a fault for each node whose domain is not clear.
+    """
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
@@ -74,7 +79,7 @@ def _with_first_names(held: Held, config: Config) -> Held:
 
 
 def _named(held: Held) -> Iterator[tuple[str, str]]:
-    """Yield (field, node) for each node whose domain may follow from the rules."""
+    """Yield (field, node) for each node whose access domain can be chosen."""
     if isinstance(held, Connection):
         yield from (("source", held.source), ("target", held.target))
     else:
@@ -89,7 +94,10 @@ def _field(service: str) -> str:
 def _chosen(
     one: Demanded, booked: Held | None, config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
-    """Yield (field, ``<node>@<domain>``) for each field whose node is in several domains."""
+    """Yield (field, chosen name of the node) for each field whose node is in several domains.
+
+    Add a fault for a field if the rules allow several of these domains.
+    """
     held, known = one.held, dict(_named(booked)) if booked else {}
     for field, node in _named(held):
         current = known.get(field, "")

@@ -19,7 +19,7 @@ OVERRIDE_PREFIX = "override:"
 
 @dataclass(frozen=True, slots=True)
 class ClaimKey:
-    """The identity of a claim; each is one file of the ledger."""
+    """The identity of a claim; the ledger has one file for each claim."""
 
     subject: Subject
     demand: str
@@ -29,9 +29,9 @@ class ClaimKey:
 class Claim:
     """One demand's hold on an application or a connection.
 
-    ``joined`` is true if a goal of the reference's action booked the claim: only goals of that
-    action shut it down. ``partial`` maps each topic that only some of the ``requesters`` hold to
-    these requesters.
+    ``joined`` is true if a goal of the reference's action booked the claim; then only goals of that
+    action can shut the claim down. If only some of the ``requesters`` hold a topic, ``partial``
+    maps this topic to the requesters that hold it.
     """
 
     held: Application | Connection
@@ -45,13 +45,13 @@ class Claim:
 
     @property
     def application(self) -> Application:
-        """The held application; only for a claim on an application."""
+        """The held application; the claim must be on an application."""
         assert isinstance(self.held, Application), self.subject  # noqa: S101
         return self.held
 
     @property
     def connection(self) -> Connection:
-        """The held connection; only for a claim on a connection."""
+        """The held connection; the claim must be on a connection."""
         assert isinstance(self.held, Connection), self.subject  # noqa: S101
         return self.held
 
@@ -94,11 +94,11 @@ class Claim:
     def with_holders(
         self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
     ) -> Claim:
-        """Return the claim with ``held``, and with the requesters that hold a topic of it.
+        """Return the claim with ``held`` as its content, and with new holders of its topics.
 
         Args:
-            held: what is left of the application or the connection.
-            holders: the sorted requesters of each of its topics.
+            held: the application or the connection that the returned claim holds.
+            holders: each topic of ``held`` → its requesters, sorted.
         """
         requesters = tuple(sorted({who for names in holders.values() for who in names}))
         partial = {topic: names for topic, names in holders.items() if names != requesters}
@@ -117,7 +117,8 @@ class Claim:
     ) -> Claim | None:
         """Return the claim without a requester's holds on ``topics``, or on all topics.
 
-        The claim loses topics that nobody holds any longer. Return ``None`` if none is left.
+        A topic that no requester holds any longer leaves the claim. Return ``None`` if no topic is
+        left.
         """
         holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
         for topic in self.held.topic_keys():
@@ -139,7 +140,7 @@ class Claim:
         return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
-        """Return the claim, with the booking time of ``current`` if only the leases differ."""
+        """Return the claim; if ``current`` differs only in the lease, keep its booking time."""
         if current is None:
             return self
         kept = replace(self, booked=current.booked)
@@ -152,10 +153,10 @@ def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:
-    """Return a demand id for a request of the reference's action, which has none.
+    """Return the demand id for a request of the reference's action, which names no demand.
 
-    It is a digest of the request id and the set of requesters, so a repeated request is the same
-    demand.
+    The id is a digest of the request id and the set of requesters. So a repeated request gets the
+    same demand id.
     """
     exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
     return hashlib.sha256(exact.encode()).hexdigest()[:20]

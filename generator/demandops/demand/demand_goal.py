@@ -78,8 +78,8 @@ class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
     ``parameters`` maps names to values, ``parameters_json`` to values as JSON text. ``version`` is
-    a version or a channel of the registry. ``connect`` is the connection type for inputs that come
-    from other nodes without a connection of the demand. ``services`` maps service names to nodes.
+    a version or a channel of the registry. ``connect`` is the connection type for inputs from other
+    nodes that no connection of the demand carries. ``services`` maps service names to nodes.
     """
 
     id: str = ""
@@ -122,7 +122,10 @@ def _lease_form(value: object) -> object:
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""A duration or seconds. It is no union: pydantic would report a fault for each member."""
+"""A duration or seconds.
+
+A validator of its own checks the form, because pydantic reports a fault for each member of a union.
+"""
 
 
 class DemandGoal(FrozenModel):
@@ -145,7 +148,7 @@ class DemandGoal(FrozenModel):
 _DEEPEST = 50
 """The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
 _LONGEST_KEY = 128
-"""The longest key in a parameter's value: YAML reads 1024 characters, escapes included."""
+"""The longest key in a parameter's value. YAML reads keys of up to 1024 characters with escapes."""
 _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
@@ -191,7 +194,10 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the goal's field for ``path`` of an item; the requesters are those of the goal."""
+    """Return the field of the goal that has the field ``path`` of an item.
+
+    An item has the requesters of the goal, so their fields are not inside of the item.
+    """
     if path.startswith("requesters"):
         return path
     return f"{item}.{'type' if path == 'appdef' else path}"
@@ -214,7 +220,7 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return what a place requires; ``None`` if it is empty."""
+    """Return what a place requires, and add its faults; ``None`` if the place is empty."""
     if place == GoalPlace():
         return None
     told = {found.field for found in faults}

@@ -19,11 +19,11 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""Maps a field of an item (``inputs.ego_data[2].source``) to the goal's field that gave it."""
+"""Maps a field of an item (``inputs.ego_data[2].source``) to the field of the goal that has it."""
 
 
 def place_in(field: str) -> Place:
-    """Return the map for an item at the goal's ``field``: ``path`` becomes ``<field>.<path>``."""
+    """Return a function that maps ``path`` to ``<field>.<path>``, for an item at ``field``."""
     return lambda path: f"{field}.{path}"
 
 
@@ -36,9 +36,9 @@ class Demanded:
     place: Place
     term: Term | None = None
     connect: str = "none"
-    """How to carry an application's inputs from other nodes: a type's word, ``auto``, ``none``."""
+    """How to carry inputs from other nodes: a connection type, ``auto`` (any type) or ``none``."""
     note: str = ""
-    """How a connection differs from the request; the receipt has this as a warning."""
+    """How a connection differs from the requested one; the receipt has this text as a warning."""
     placed: tuple[str, ...] = ()
     """Where the generator placed the application and its services, and why."""
 
@@ -51,9 +51,10 @@ class Demanded:
 class DemandRequest:
     """A request; it is booked or refused as a whole.
 
-    ``demand`` is the demand's id. The reference's requests have none; for them
-    :func:`demandops.demand.claim.demand_id` makes one for each subject. ``own_requesters`` are the
-    requesters of the request itself, even if it lists no subject.
+    ``demand`` is the demand's id. The reference's requests have no demand id; for each subject of
+    such a request, :func:`demandops.demand.claim.demand_id` makes an id. ``own_requesters`` are the
+    requesters that the request names as a whole; for example, a release lists no item, but has
+    requesters.
     """
 
     id: str
@@ -100,7 +101,7 @@ class Shutdown(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Put(DemandRequest):
-    """Our own goal: its demand then holds exactly the listed applications and connections.
+    """Our own goal, after which its demand holds exactly the listed applications and connections.
 
     ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that
     have none in the inventory. ``priority`` ranks the demand among those that wait for room.
@@ -139,9 +140,9 @@ class Expire(DemandRequest):
 class Decommission(DemandRequest):
     """An operator's request to remove a node or a requester, named by ``id``, for good.
 
-    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` has the node's id in each of its
-    access domains. ``by`` is the operator, ``name <email>``, who may give a ``reason``. Only the
-    journal contains the request as plain data; actions and demand files do not.
+    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` lists the names of the node in its
+    access domains. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. Only the
+    journal contains the request as plain data; actions and demand files cannot contain it.
     """
 
     kinds: frozenset[str] = frozenset()
@@ -163,7 +164,7 @@ class Decommission(DemandRequest):
 
     @classmethod
     def parse(cls, data: dict[str, Any]) -> Decommission:
-        """Return the request of plain data.
+        """Return the request that plain data describes.
 
         Raises:
             Refused: if the name is invalid.

@@ -88,7 +88,10 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the message's field for ``path`` of an application; ``lists`` maps roles to lists."""
+    """Return the field of the message that has the field ``path`` of an application.
+
+    ``item`` is the application's field (``apps[0]``). ``lists`` maps roles to the message's lists.
+    """
     name, _, rest = path.partition(".")
     if name in ("id", "node"):
         return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
@@ -105,9 +108,10 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the message's field for ``path`` of a connection.
+    """Return the field of the message that has the field ``path`` of a connection.
 
-    The message has a connection's topics in two lists.
+    ``item`` is the connection's field (``connections[0]``). The message has two lists of topics:
+    the names at the source, and the names at the target.
     """
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"
@@ -141,7 +145,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     ]
     for index, connection in enumerate(goal.connections):
         where = f"connections[{index}]"
-        # without a valid type, none is assumed, so that no type's rules apply
+        # an invalid type becomes None, so that the rules of no type apply
         kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
         demanded.append(_connection(where, connection, kind))
         if kind is None and f"{where}.type" not in faulty:
@@ -155,7 +159,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
                 "target topic i, so list as many of each"
             )
             faults.append(fault(f"{where}.target_topics", message))
-    # if "shutdown" is invalid, check as a shutdown: its rules apply to a join too
+    # if "shutdown" is invalid, check a shutdown, because its rules are also rules for a join
     operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
     return operation(id=goal.id, demanded=tuple(demanded)), faults
 

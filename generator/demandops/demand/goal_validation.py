@@ -1,7 +1,7 @@
 """Validation of the form of a goal: the valid part of plain data, and the faults.
 
-Fields of the wrong form are left out and the others kept, so that faults of form and of content
-can be reported together.
+Fields of the wrong form are left out, and the other fields are kept. So the caller can report
+faults of form and of content together.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Goal = TypeVar("Goal", bound=BaseModel)
 def parse_valid_part(
     data: dict[str, Any], model: type[Goal], lists_of_text: Container[str]
 ) -> tuple[Goal, list[Fault]]:
-    """Return the part of ``data`` that has the form of ``model``, and a fault for each other part.
+    """Return the part of ``data`` that has the form of ``model``, and a fault for each wrong part.
 
     Args:
         data: the goal.
@@ -68,7 +68,7 @@ def _with_keys_of_text(
 
 
 def is_unicode(text: str) -> bool:
-    """Return whether text can be stored: it has no half of a surrogate pair."""
+    """Return whether a text is valid Unicode, which has no surrogate characters."""
     return not any("\ud800" <= char <= "\udfff" for char in text)
 
 

@@ -1,9 +1,9 @@
 """Leases: how long a claim stays booked without a renewal.
 
-The recorded end may lag behind the last renewal by ``slack``, so that not every renewal makes a
-commit. A renewal within the slack changes nothing, and a claim is released only after end and slack
-have passed. So no generator, restarted or not, releases a claim early. A release may be late by the
-slack.
+The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
+commit. A renewal within the slack changes nothing, and a claim is released only after the recorded
+end and the slack have passed. So no generator, not even a restarted one, releases a claim early,
+but a release may be late by the slack.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
 class Term:
     """The requested lease and its slack, both in seconds.
 
-    The lease starts when the request is received; with ``on_approval``, at its approval.
+    The lease starts when the request is received; with ``on_approval``, when a person approves the
+    request.
     """
 
     seconds: int
@@ -49,7 +50,10 @@ class Lease:
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease with its full term from ``now``; it ends no sooner than ``before``."""
+        """Return the lease with its full term from ``now``.
+
+        If ``before`` is given, the result ends no earlier than this lease.
+        """
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)
 
@@ -77,7 +81,10 @@ class Lease:
 
 
 def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | None:
-    """Return the lease of a requested claim, renewed if it has one; ``None`` without a term."""
+    """Return the lease of a claim that is requested with ``term``; ``None`` without a term.
+
+    If the claim has the lease ``current``, the result is that lease after a renewal.
+    """
     if term is None:
         return None
     return current.renewed(term, now) if current else term.lease_from(now)

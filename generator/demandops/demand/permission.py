@@ -1,8 +1,8 @@
 """Permission: the check that requesters may demand these applications, nodes and leases.
 
 The access domains of the nodes decide. Every refusal names the rule. A connection between two
-domains needs a rule of each that names the other. A domain, one of its rules or an application
-definition can also require a person's approval of claims before they are booked.
+domains needs a rule in each domain that names the other domain. A domain, one of its rules or an
+application definition can also require that a person approves claims before they are booked.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from demandops.demand.lease import Term
 from demandops.errors import Fault, fault
 
 Access = list[tuple[str, str]]
-"""Fields of a rule (``nodes``, ``applications``) and the values that a demand needs in them."""
+"""Pairs of a rule's field (``nodes``, ``applications``) and a value that a demand needs there."""
 
 PEERS = "peers"
 """The field of a rule with the access domains at the other ends of connections."""
 _NO_RULES = (Rule(name="everything"),)
-"""The rules of a domain that has none: everybody may do everything."""
+"""The rules of a domain without rules: everybody may demand everything inside of the domain."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -116,7 +116,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
 
 
 def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
-    """Return what a rule does not let a requester have, as a sentence."""
+    """Return a sentence about the access that a rule does not grant a requester."""
     where = f"access domain '{domain.name}'"
     if kind == PEERS:
         whose = f"rule '{rule.name}' of {where}" if domain.rules else where
@@ -128,7 +128,7 @@ def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: 
 
 
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
-    """Return the first access that a rule does not grant; ``None`` if the rule grants all."""
+    """Return the first pair of ``access`` that a rule does not grant; ``None`` if it grants all."""
     return next(
         ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
     )
@@ -157,7 +157,7 @@ def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
 
 
 def term(request: DemandRequest, domain: AccessDomain) -> Term | None:
-    """Return the lease that a request gets in an access domain; ``None`` without one."""
+    """Return the lease term that a request gets in an access domain; ``None`` for no lease."""
     policy = domain.leases
     if request.is_reference and not policy.deployment_requests:
         return None
@@ -179,7 +179,7 @@ def approval_reasons(
 
     Args:
         request: an admitted request.
-        changes: each claim that the request changes, before and after it.
+        changes: each changed claim as (before the request, after the request).
         config: the access domains and application definitions.
     """
     if not request.adds_claims:

@@ -1,4 +1,4 @@
-"""The events that had started before a restart, found from the demands that are booked."""
+"""Finds the events that had started before a restart, by the demands that are booked."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from demandops.detection.rules.rule_file import RuleFile
 
 
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
-    """Return the events whose demands are booked, and a goal by which each can be ended.
+    """Return each event whose demand is booked, with a goal that can end this demand.
 
     Args:
         file: the rules.

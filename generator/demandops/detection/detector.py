@@ -19,7 +19,7 @@ from demandops.detection.rules.rule_template import Values
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """The goal that an event wants from now on; ``None`` ends the event's demand."""
+    """What an event wants from now on: a goal, or ``None`` to end the event's demand."""
 
     key: Key
     goal: Goal | None
@@ -44,23 +44,28 @@ class Detector:
 
     @property
     def entities(self) -> int:
-        """How many entities are seen now."""
+        """How many entities have been seen and do not count as gone."""
         return len(self._state.seen)
 
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
-        """Go on with events whose demands were booked before the start; return what each wants.
+        """Continue the events whose demands were booked before the start; return what each wants.
 
         Args:
-            booked: a goal for each event; events for which there is no rule any longer are ended.
+            booked: a goal for each event. An event ends if there is no longer a rule for it.
             now: the time.
-            settle_s: how long the events' entities may stay unseen until they count as gone.
+            settle_s: how many seconds the events' entities may stay unseen until they count as
+                gone.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
         return [self._want(key, goal if key in lasting else None) for key, goal in booked.items()]
 
     def step(self, observations: Iterable[Observation], now: float) -> list[tuple[Event, Want]]:
-        """Return the events that observations and passing time cause, each with what it wants."""
+        """Apply observations and the time that has passed.
+
+        Returns:
+            The events that start or stop, each with what it wants.
+        """
         self._state, events = self._engine.step(self._state, observations, now)
         found = []
         for event in events:
@@ -74,14 +79,14 @@ class Detector:
         return found
 
     def set_clock(self, seconds: float) -> None:
-        """Adjust all times, because the clock was set forward by ``seconds``; negative: back."""
+        """Adjust all times after the clock was set forward by ``seconds``, or back if negative."""
         self._state = self._state.shifted(seconds)
 
     def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
-        """Replace the rules; return what changes for the events that have not ended.
+        """Replace the rules; return the changed wants of the events that have not ended.
 
-        An event ends if its rule is gone or is no longer for its entities. If the rule demands
-        something else now, the event wants that instead.
+        An event ends if its rule is gone or is no longer for its entities. If the rule's demand has
+        changed, the event wants the new demand instead. ``settle_s`` is as in :meth:`resume`.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)
@@ -99,7 +104,10 @@ class Detector:
         return changed
 
     def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the values of an event's start; ``None`` if the rule needs one that is unknown."""
+        """Return the values for the rule's template, as they were when the event started.
+
+        The result is ``None`` if the template needs a value that is not known.
+        """
         named = dict(zip(rule.subjects, key[1], strict=True))
         values: Values = {**self._values.get(key, {}), "rule": rule.name, **named}
         return values if rule.template.names() <= set(values) else None

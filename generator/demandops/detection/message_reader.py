@@ -21,14 +21,14 @@ Getter = Callable[[Any], Any]
 
 
 class Unreadable(Exception):
-    """Raised for a message without a usable value for a field; the text names it on one line."""
+    """Raised for a message with a missing or unusable field; its text is one line."""
 
 
 class MessageReader:
     """Reads the messages of one source."""
 
     def __init__(self, file: RuleFile, source: str) -> None:
-        """Make a reader of the fields that the rules in ``file`` use of the source's messages."""
+        """Make a reader of the messages of ``source``; it reads the fields that ``file`` needs."""
         definition = file.sources[source]
         self._source = source
         self._entity = definition.entity and _getter(definition.entity)
@@ -38,12 +38,12 @@ class MessageReader:
         self._fields = {field: _getter(field) for field in sorted(fields)}
 
     def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
-        """Return the observation that a message makes.
+        """Return what a message reports, as an observation.
 
         Args:
             message: the message.
-            entity: the entity that its topic names; empty if a field names it.
-            at: the time of its arrival.
+            entity: the entity that the topic names; empty if a field of the message names it.
+            at: the time at which the message arrived.
 
         Raises:
             Unreadable: if a field is missing or has the wrong kind of value.

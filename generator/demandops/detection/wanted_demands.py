@@ -1,8 +1,8 @@
 """Which demands are wanted, which are held, and which goal to send next.
 
-It sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the outcome.
-Each event has at most one goal under way. If an event ends before its demand was sent, nothing is
-sent for it.
+This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
+outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
+nothing is sent for it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ class Sending:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The answer to a goal: an empty code if it succeeded. ``lease_s`` is 0 without a lease."""
+    """The answer to a goal.
+
+    ``code`` is empty if the goal succeeded. ``lease_s`` is 0 without a lease.
+    """
 
     code: str = ""
     message: str = ""
@@ -48,7 +51,11 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Entry:
-    """One event. ``held`` is the goal that the node has booked; ``is_sure`` if that is certain."""
+    """The demand of one event: what is wanted, and what is held.
+
+    ``held`` is the goal that the node has booked. ``is_sure`` is false if it is not certain that
+    the node has booked it.
+    """
 
     wanted: Goal | None = None
     held: Goal | None = None
@@ -73,13 +80,16 @@ class _Entry:
         return ("renew", self.wanted.renewed()) if now >= self.renew_at else None
 
     def _replaces(self, held: Goal) -> bool:
-        """Return whether the wanted goal changes the held demand in place, or is the same."""
-        assert self.wanted is not None  # noqa: S101 - asked for a wanted one only
+        """Return whether the wanted goal can be sent without ending the held demand first."""
+        assert self.wanted is not None  # noqa: S101 - callers check this before
         is_put = self.wanted.action == held.action == "demand" and self.wanted.id == held.id
         return is_put or self.wanted == held
 
     def due(self) -> float:
-        """Return when :meth:`next` may have a goal to send."""
+        """Return the time from which :meth:`next` may have a goal to send.
+
+        It is infinite while a goal is under way, and if nothing remains to be sent.
+        """
         if self.is_under_way:
             return inf
         is_steady = self.wanted is not None and self.wanted == self.held and self.is_sure
@@ -102,16 +112,20 @@ class WantedDemands:
         self._enqueue(want.key, entry)
 
     def hold(self, key: Key, goal: Goal) -> None:
-        """Record that a demand was booked before the start; call :meth:`want` for it next.
+        """Record that a demand was booked before the start.
 
-        The next goal renews the demand, because its lease is not known.
+        The caller then calls :meth:`want` for the same event. If the event still wants the demand,
+        the next goal renews it, because the time left of its lease is not known.
         """
         entry = self._entries.setdefault(key, _Entry())
         entry.held, entry.renew_at = goal, -inf
         self._enqueue(key, entry)
 
     def next(self, now: float) -> Sending | None:
-        """Return a goal to send now, or ``None``; it counts as under way until it is answered."""
+        """Return a goal to send now, or ``None`` if there is none.
+
+        The goal counts as under way until :meth:`answered` is called for it.
+        """
         while self._queue and self._queue[0][0] <= now:
             _, _, key = heappop(self._queue)
             entry = self._entries.get(key)
@@ -121,11 +135,19 @@ class WantedDemands:
         return None
 
     def next_at(self) -> float:
-        """Return when to call :meth:`next` again, if no event or answer comes earlier."""
+        """Return the time at which to call :meth:`next` again; infinite if nothing is to be sent.
+
+        A call of :meth:`want`, :meth:`hold` or :meth:`answered` may make that time earlier.
+        """
         return self._queue[0][0] if self._queue else inf
 
     def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:
-        """Record the outcome of a goal; return a new problem for the log, else an empty text."""
+        """Record the outcome of a goal.
+
+        Returns:
+            The problem for the log, if the goal failed for another reason than the event's last
+            goal; otherwise an empty text.
+        """
         entry = self._entries[sending.key]
         entry.is_under_way = False
         text = self._record(entry, sending, outcome, now)
@@ -159,7 +181,7 @@ class WantedDemands:
             self._number += 1
             heappush(self._queue, (at, self._number, key))
 
-    # ---- for people ----
+    # ---- the state, for log and diagnostics ----
 
     def __len__(self) -> int:
         return len(self._entries)

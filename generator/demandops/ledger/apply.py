@@ -41,7 +41,8 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         now: when the request was received, with time zone; changed claims record it.
 
     Returns:
-        The new ledger and what changed. Booking twice changes nothing.
+        The new ledger and what changed. If the same request is booked already, at most the leases
+        of its claims change.
 
     Raises:
         Refused: with every conflict with an existing claim, or if the request releases or renews
@@ -63,7 +64,7 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         case Decommission():
             return decommission(ledger, request, now)
         case Wait():
-            assert request.waiting is not None  # noqa: S101 - decided so
+            assert request.waiting is not None  # noqa: S101 - the decision sets it
             waiting = ledger.waiting.insert(request.demand, request.waiting)
             is_new = ledger.waiting.get(request.demand) != request.waiting
             changes = Changes(waiting=(request.demand,) * is_new)

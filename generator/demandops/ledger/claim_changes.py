@@ -14,7 +14,10 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class ClaimChange:
-    """One claim before and after: ``None`` before it is booked and after it is released."""
+    """One claim before and after a change.
+
+    ``before`` is ``None`` if the claim is new, ``after`` is ``None`` if it is released.
+    """
 
     before: Claim | None
     after: Claim | None
@@ -36,10 +39,10 @@ class ClaimChange:
 class Changes:
     """The claims that a request changed.
 
-    ``not_held``: what a shutdown lists and nobody holds. ``shutdowns``: the digests of shutdowns
-    that the ledger now records or forgets. ``repeats``: the earlier shutdown that this one repeats.
-    ``kept``: the service instances whose kept replicas changed.
-    ``waiting``: the demands that begin or cease to wait.
+    ``not_held``: what a shutdown lists, but its requesters do not hold. ``shutdowns``: the digests
+    of shutdowns that the ledger now records or forgets. ``repeats``: the earlier shutdown that the
+    request repeats, or ``None``. ``kept``: the service instances whose kept replicas changed.
+    ``waiting``: the ids of the demands that begin or cease to wait.
     """
 
     claims: tuple[ClaimChange, ...] = ()

@@ -1,8 +1,9 @@
 """Claim files: one YAML file for each claim, with a schema version.
 
-The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. ``hh`` spreads the
-folders, because a Git tree with 100,000 entries costs 100 ms a commit. Path segments are slugs with
-a hash of the exact id. The file contains the exact ids, so a moved file is noticed.
+The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. The subjects are
+spread over many folders ``hh``, because a Git tree with 100,000 entries adds 100 ms to each commit.
+``subject`` and ``demand`` are slugs with a hash of the exact id. The file contains the exact ids,
+so a file that was moved to another path is noticed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only a later generator writes, for the nodes of services."""
+"""Folders that only newer versions of the generator write, with the nodes of services."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
@@ -121,7 +122,7 @@ class _Route(RouteOptions):
 
 
 def _plain_route(value: object) -> object:
-    """Return ``/a: /b`` as a route without options."""
+    """Return the data of a route as a mapping; a plain text, as in ``/a: /b``, is the target."""
     return {"target": value} if isinstance(value, str) else value
 
 
@@ -148,7 +149,7 @@ class _Claim(FrozenModel):
         raise NotImplementedError
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
-        """Yield the topics that name their requesters, each with its place in the file."""
+        """Yield (place in the file, topic, requesters) for each topic that lists requesters."""
         raise NotImplementedError
 
     def faults(self) -> Iterator[Fault]:
@@ -302,7 +303,7 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
 
 
 def place_data(place: Requirement) -> dict[str, Any]:
-    """Return the requirement on a node as a claim's file has it."""
+    """Return the requirement on a node as plain data, in the form of a claim's file."""
     listed = {
         "role": place.role,
         "labels": dict(place.labels),

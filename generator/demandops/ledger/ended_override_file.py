@@ -1,8 +1,8 @@
 """Markers: files of the ledger that record which overrides ended, and when.
 
-Only the repo may decide whether an override applies: a replay and ``verify`` must give the same
-bytes as the original run. So the generator commits a marker when an override ends. If a person
-then writes a later end into the override, the override is in effect again.
+The repo alone, not the clock, decides whether an override applies, because a replay and ``verify``
+must give the same bytes as the original run. So the generator commits a marker when an override
+ends. If a person then writes a later end into the override, the override is in effect again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def text_of(override: Override) -> str:
 
 
 def read(files: Mapping[str, str]) -> dict[str, str]:
-    """Return override → the time at which it ended.
+    """Return override name → the end that the override had when it ended.
 
     Files that are not markers are skipped; :func:`stale_markers` lists them for removal.
     """
@@ -63,7 +63,11 @@ def read(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def stale_markers(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
-    """Return the markers whose override is gone or has another end."""
+    """Return the paths of the markers that no longer apply, sorted.
+
+    These are the markers that are not valid, whose override is gone, or whose override now has
+    another end or no end.
+    """
     ended = read(paths)
     current = {
         path_of(name)

@@ -1,10 +1,11 @@
 """Replicas that services keep for a while after the demands for them ended.
 
 A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service has
-the highest number of replicas that its demands needed in that time. Each record is one file,
-``ledger/replicas/<hh>/<name>.yaml``. It lists the numbers above the present need, each with its
-end. A service gets fewer replicas only by the commit that removes a number from the record, not
-when the end of the number passes. So a replay gives the same bytes.
+the highest number of replicas that its demands needed within this time. Each record is one file,
+``ledger/replicas/<hh>/<name>.yaml``. It lists each number of replicas above the present need, with
+the time until which the service keeps this number. When that time passes, the generator publishes a
+commit that removes the number from the record. Only this commit reduces the replicas, so a replay
+gives the same bytes.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ from demandops.settings import LEDGER_API_VERSION
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
 Instance: TypeAlias = "tuple[str, ...]"
-"""A service instance: ``replicas``, then its :data:`_FIELDS`."""
+"""The identity of a service instance: ``replicas``, then a value for each of ``_FIELDS``."""
 
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
 
 
 class Kept(NamedTuple):
-    """A number of replicas that a service has at least, until ``until``."""
+    """The least number of replicas that a service has until the time ``until``."""
 
     replicas: int
     until: datetime
@@ -76,7 +77,11 @@ def _minute(moment: datetime) -> str:
 
 @dataclass(frozen=True, slots=True)
 class KeptReplicas:
-    """The steps of each instance, and the instances by the minute in which a first step ends."""
+    """What all services keep.
+
+    ``steps`` maps each service instance to its steps. ``by_minute`` maps a minute to the instances
+    whose first step ends in it.
+    """
 
     steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
@@ -113,14 +118,14 @@ class KeptReplicas:
 
 
 def path_of(instance: Instance) -> str:
-    """Return the path of an instance's file."""
+    """Return the path of a service instance's record."""
     exact = json.dumps(instance[1:], ensure_ascii=True)
     fan = hashlib.sha256(exact.encode()).hexdigest()[:2]
     return f"{REPLICAS_ROOT}/{fan}/{segment(exact)}.yaml"
 
 
 def text_of(instance: Instance, steps: Steps) -> str:
-    """Return the text of an instance's file."""
+    """Return the text of a service instance's record."""
     named = zip(_FIELDS, instance[1:], strict=True)
     return strict_yaml.dump(
         {

@@ -1,7 +1,7 @@
 """The ledger: which demand holds which subject, as a set of persistent maps.
 
-A :class:`Ledger` never changes. The cost of a new one depends on the request, not on the ledger's
-size.
+A :class:`Ledger` never changes: a request gives a new one. The cost of the new ledger depends on
+the request, not on the ledger's size.
 """
 
 from __future__ import annotations
@@ -37,14 +37,15 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 class Ledger:
     """All claims, and an index of them.
 
-    ``claims`` has the claims on each subject, sorted by demand id, because the planner asks for
-    all of them. All claims on a subject agree on its type and nodes. If a person writes a claim
-    that disagrees, the first claim decides.
-    ``index`` maps each entry of :func:`index_entries` to the claims that have it.
+    ``claims`` maps each subject to the claims on it, sorted by demand id, because the planner asks
+    for all claims on a subject. All claims on a subject agree on its type and nodes. If a person
+    writes a claim that disagrees, the first claim decides.
+    ``index`` maps each entry of :func:`index_entries` to the claims that have this entry.
     ``minutes`` has each minute in which a lease ends, to find the next end without a full scan.
-    ``ended`` maps the name of each ended override to the expiry that it had at its end.
-    ``shutdowns`` are the recent shutdowns. ``applications_on`` counts the applications
-    for which each node was chosen, even if only for one of their services.
+    ``ended`` maps the name of each ended override to the end that the override then had.
+    ``shutdowns`` are the recent shutdowns.
+    ``applications_on`` maps each node to the number of applications for which the node was chosen.
+    An application counts even if the node was chosen only for one of its services.
     ``kept`` are the replicas that services keep for a while.
     ``waiting`` are the demands that wait for room.
     """
@@ -68,7 +69,7 @@ class Ledger:
         return held[0] if held else None
 
     def held(self, subject: Subject) -> Application | Connection | None:
-        """Return the application or connection that ``subject`` names, from its first claim."""
+        """Return the application or connection in the first claim on ``subject``, or ``None``."""
         first = self.first_claim(subject)
         return first.held if first else None
 
@@ -81,12 +82,12 @@ class Ledger:
         return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
 
     def application(self, id: str) -> Application | None:
-        """Return a claimed application as its first claim has it."""
+        """Return a claimed application as its first claim has it; ``None`` without a claim."""
         first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
         return first.application if first else None
 
     def connection(self, id: str) -> Connection | None:
-        """Return a claimed connection as its first claim has it."""
+        """Return a claimed connection as its first claim has it; ``None`` without a claim."""
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 
@@ -105,7 +106,7 @@ class Ledger:
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
     def claims_taking(self, source: str, topic: str) -> tuple[Claim, ...]:
-        """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
+        """Return the claims with ``topic`` of ``source`` as an input, sorted by application."""
         return self._claims("takes", source, topic)
 
     def each_taking(self, source: str, topic: str) -> Iterator[Claim]:
@@ -116,7 +117,7 @@ class Ledger:
                 yield claim
 
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
-        """Return ``topic`` of ``source`` in ``role`` from any claim that has it, or ``None``."""
+        """Return the input ``topic`` of ``source`` in ``role`` as a claim has it, or ``None``."""
         for claim in self.each_taking(source, topic):
             if found := claim.application.inputs_from(role, source, topic):
                 return found[0]
@@ -125,7 +126,7 @@ class Ledger:
     def has_usual_topic(self, role: str, source: str, *, but_of: str | None = None) -> bool:
         """Return whether a claim has the usual topic of ``source`` in ``role``.
 
-        The demand ``but_of`` does not count.
+        Claims of the demand ``but_of`` do not count.
         """
         keys = self.index.get(("usual", source, role)) or ()
         return any(key.demand != but_of for key in keys)
@@ -134,23 +135,25 @@ class Ledger:
         """Yield the usual topics of ``source`` in ``role`` that claims have, except ``but``."""
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("takes", source, but)) or ()):
-            return  # they all take ``but``
+            return  # all these claims take ``but``
         found = (claim for key in keys if (claim := self.get(key)))
         topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
         usual = {one.topic for one in topics if one.source == source and not one.further}
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for the further inputs in ``role`` with this part of topic names.
+        """Yield (input, version) for the inputs in ``role`` for which ``part`` names an instance.
 
-        The version is that of the application if it is a separate instance, else empty.
+        ``part`` is the text that replaces ``{instance}`` in names of topics. Only further inputs
+        and the inputs of separate instances are yielded. The version is that of the separate
+        instance, else empty.
         """
         for claim in self._claims("further", part):
             app = claim.application
             yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
-        """Return the connections that bring ``topic`` to the node ``target``, sorted."""
+        """Return the ids of the connections that bring ``topic`` to the node ``target``, sorted."""
         return self._ids("brings", target, topic)
 
     def is_carried_to(self, target: str, topic: str) -> bool:
@@ -166,7 +169,7 @@ class Ledger:
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def moved_applications(self) -> tuple[str, ...]:
-        """Return the applications with a service that an override moves, sorted."""
+        """Return the ids of the applications with a service that an override moves, sorted."""
         return self._ids("moved")
 
     def is_only_kept(self, subject: Subject) -> bool:
@@ -194,11 +197,11 @@ class Ledger:
         return self._claims("node", node)
 
     def applications_at(self, node: str) -> tuple[str, ...]:
-        """Return the applications that run on, read from or deliver to a node, sorted."""
+        """Return the ids of applications that run on, read from or deliver to a node, sorted."""
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the applications whose id becomes ``part`` in names of topics, sorted."""
+        """Return the ids of the applications that become ``part`` in names of topics, sorted."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
@@ -207,9 +210,10 @@ class Ledger:
         return min((claim.lease.expires_at for claim in found if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
-        """Return the claims whose leases end first, in the same minute.
+        """Return the keys of the claims whose leases end in the first minute with any lease end.
 
-        The set is the same object while no claim joins it, leaves it or gets another end.
+        Return ``None`` if there is no lease. As long as no claim enters the set, leaves it or gets
+        another end, each call returns the same object.
         """
         return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 
@@ -239,11 +243,11 @@ class Ledger:
         return tuple(claim for claim in found if claim is not None)
 
     def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
-        """Return the connections of a type that end at ``node``, sorted."""
+        """Return the ids of the connections of a type that end at ``node``, sorted."""
         return self._ids("link", kind.name, node)
 
     def connections_needing(self, node: str) -> tuple[str, ...]:
-        """Return the connections that end at a node or name its broker, sorted."""
+        """Return the ids of the connections that end at a node or use its broker, sorted."""
         found = {
             id
             for kind in connection_types.CONNECTION_TYPES
@@ -252,18 +256,21 @@ class Ledger:
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return all names of one kind of index entry, such as ``requester``. Scans the index."""
+        """Return all names in one kind of index entry, such as ``requester``.
+
+        This scans the whole index.
+        """
         return {known[-1] for known in self.index if known[0] == entry}
 
     def get(self, key: ClaimKey) -> Claim | None:
-        """Return one claim."""
+        """Return the claim at ``key``, or ``None``."""
         held = self.claims.get(key.subject) or ()
         place = bisect_left(held, key.demand, key=_DEMAND)
         found = held[place : place + 1]
         return found[0] if found and found[0].demand == key.demand else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
-        """Return the ledger with ``claim`` at ``key``; with ``None``, without a claim there."""
+        """Return the ledger with ``claim`` at ``key``; ``None`` removes the claim at ``key``."""
         held, old = self.claims.get(key.subject) or (), self.get(key)
         if old == claim:
             return self
@@ -278,7 +285,7 @@ class Ledger:
             if not others and entry[0] == _ENDS:
                 minutes = minutes.remove(entry[1])
         added = after - before
-        if old and claim and old.lease != claim.lease:  # perhaps by less than a minute
+        if old and claim and old.lease != claim.lease:  # makes a new set even in the same minute
             added |= {entry for entry in after if entry[0] == _ENDS}
         for entry in added:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
@@ -325,7 +332,7 @@ class Ledger:
 def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
-    """Return the counts after the first claim on an application changed."""
+    """Return ``applications_on`` after the first claim on an application changed."""
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):
         for node in nodes:
@@ -335,7 +342,7 @@ def _counted(
 
 
 def index_entries(claim: Claim | None) -> set[Entry]:
-    """Return the index entries of a claim."""
+    """Return the index entries of a claim; ``None`` has no entries."""
     found = set(claim.index_entries()) if claim else set()
     if claim and claim.lease:
         found.add((_ENDS, _minute(claim.lease.expires_at)))

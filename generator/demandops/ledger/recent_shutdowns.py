@@ -1,8 +1,8 @@
 """Recent shutdowns, so that a shutdown that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
-record the repeat would release another demand of the same requesters. A join that adds something
-in the name of one of the requesters ends the record: a later shutdown may mean what was joined.
+record the repeat would release another demand of the same requesters. If a join adds something for
+one of the requesters, the record is removed, because the next shutdown may mean what was added.
 
 Each record is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
 """
@@ -30,10 +30,13 @@ from demandops.settings import LEDGER_API_VERSION
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
 REMEMBERED = timedelta(minutes=15)
-"""For how long the same shutdown counts as a repeat, not as a new one."""
+"""How long after a shutdown the same shutdown counts as a repeat, not as a new one."""
 
 _KEPT = timedelta(hours=1)
-"""How long a record is kept: longer, because a repeat may have waited in a journal."""
+"""How long a record is kept.
+
+This is longer than :data:`REMEMBERED`, because a repeat may have waited in a journal.
+"""
 
 _FORGOTTEN = 10
 """How many old records of shutdowns one booking removes at most."""
@@ -43,7 +46,11 @@ _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
 @dataclass(frozen=True, slots=True)
 class RecentShutdown:
-    """A shutdown that released something; ``digest`` covers everything that it lists."""
+    """The record of a shutdown that released something.
+
+    ``digest`` is a hash of the request id and of everything that the shutdown lists. ``at`` is the
+    time at which the shutdown was received.
+    """
 
     digest: str
     request: str
@@ -82,7 +89,7 @@ class RecentShutdowns:
         return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        """Return the shutdowns with ``shutdown`` at ``digest``; with ``None``, with none there."""
+        """Return the shutdowns with ``shutdown`` at ``digest``; ``None`` removes the one there."""
         known = self.by_digest.get(digest)
         if known == shutdown:
             return self
@@ -104,7 +111,8 @@ class RecentShutdowns:
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
         """Return the shutdowns that are left, and the digests of the forgotten ones.
 
-        Shutdowns of ``requesters`` are forgotten, and some that are older than an hour.
+        All shutdowns of ``requesters`` are forgotten. Of the shutdowns that are older than an hour,
+        the oldest are forgotten, at most ten.
         """
         first = _minute(now - _KEPT)
         ended = sorted(one for one in self.by_minute if one < first)

@@ -1,8 +1,8 @@
 """Waiting demands: no node has room for them, so they are kept until a node has.
 
-A waiting demand holds nothing. When room may be free, the generator decides waiting demands again:
-those of the highest priority first, and among these the one that came first. A demand that still
-does not fit does not delay the others.
+A waiting demand holds nothing. When room may be free, the generator tries to book the waiting
+demands: those with the highest priority first and, if the priority is the same, the oldest first. A
+demand that still does not fit does not delay the other waiting demands.
 
 Each waiting demand is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
 """
@@ -36,7 +36,7 @@ WAITING_ROOT = f"{LEDGER_ROOT}/waiting"
 
 @dataclass(frozen=True, slots=True)
 class WaitingDemand:
-    """A demand that waits, its goal as plain data, and when it was received first."""
+    """A demand that waits. ``goal`` is plain data; ``since`` is when it was first received."""
 
     demand: str
     request: str

@@ -16,13 +16,13 @@ from demandops.migration.reference_files import (
 from demandops.migration.reference_map import ReferenceMap
 from demandops.migration.remaining_joins import Join, remaining, replayed
 
-_MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # numbers in the messages
+_MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # the numbers of these types in ROS messages
 
 
 def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
-    """Return the joins that are still held, by resource, and warnings.
+    """Return resource → the joins whose holds are not shut down yet, and warnings.
 
-    A detection has no joins: it is held by the applications that use its object list.
+    Detections are left out, because the applications that use their object lists need them.
 
     Raises:
         InvalidInput: if the files do not say who holds a resource.
@@ -34,7 +34,7 @@ def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
             continue
         book = files.books.get(name)
         if book is None and any(name.startswith(prefix) for prefix in files.booked) and not spec:
-            continue  # of a deleted resource, the operator keeps only the requests
+            continue  # the resource is deleted: the operator keeps only its requests
         if book is None and requests:
             if name.startswith(CONNECTION) and len(requests) > 1:
                 faults.append(_rewritten(name))
@@ -88,7 +88,7 @@ def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list
     ledger counts a repeated goal once.
 
     Raises:
-        InvalidInput: if the map, which is in ``file``, has no entry for a resource or a topic.
+        InvalidInput: if the map in ``file`` has no entry for a resource or a topic.
     """
     found: dict[tuple[int, frozenset[str]], dict[str, Any]] = {}
     faults = list[Fault]()

@@ -1,10 +1,12 @@
 """The files of the reference's operators, and its custom resources.
 
-Each operator keeps two files. The bookkeeping maps a resource to the requesters that hold the
-resource, and lists each requester as often as it joined. For a fusion it has a list for each topic.
-The versioning file maps a resource to the requests that reached it, by the version of the resource.
+Each operator keeps two files. The bookkeeping maps a resource to the list of requesters that hold
+the resource; a requester is listed as often as it joined. For a fusion there is such a list for
+each topic. The versioning file maps a resource to its requests; the key of a request is the version
+of the resource.
 
-A file is recognized by its content, so it may have any name.
+A file is recognized by its content, so it may have any name. Only a bookkeeping without entries
+(``{}``) is recognized by its name.
 """
 
 from __future__ import annotations
@@ -23,14 +25,14 @@ from demandops.errors import Fault, InvalidInput, fault
 from demandops.quoting import quoted
 
 CONNECTION, DETECTION, FUSION = "mqtt-connection-", "od-", "of-"
-"""The prefixes of the resources' names; what follows is made of ids."""
+"""The prefixes of the resources' names; the rest of a name is made from ids."""
 
 _BOOKS = {
     "mqtt_bookkeeping": CONNECTION,
     "object_detection_bookkeeping": DETECTION,
     "object_fusion_bookkeeping": FUSION,
 }
-"""The bookkeeping files by name; an empty one says that nothing is held."""
+"""Name of a bookkeeping file → prefix of its resources; ``{}`` in the file means no holds."""
 
 _NUMBER = re.compile(r"[0-9]{1,20}")
 _CLOUD = re.compile(r"\bpoint_cloud_topic:=(\S+)")
@@ -68,7 +70,11 @@ class _RosTopic(_Part):
 
 
 class _Ros2Mqtt(_Part):
-    """The source's bridge: the last request's topics, and a field for each topic of any request."""
+    """The bridge at the source of a connection.
+
+    ``ros_topics`` has the topics of the last request. There is an extra field for each topic that
+    any request listed.
+    """
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _MqttTopic] = Field(init=False)
@@ -76,7 +82,11 @@ class _Ros2Mqtt(_Part):
 
 
 class _Mqtt2Ros(_Part):
-    """The target's bridge: the same fields, for topics of MQTT."""
+    """The bridge at the target of a connection.
+
+    ``mqtt_topics`` has the topics of the last request. There is an extra field for each topic that
+    any request listed.
+    """
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, _RosTopic] = Field(init=False)
@@ -87,7 +97,11 @@ _BRIDGE = ("configMQTT", "bridge")
 
 
 class MqttConnection(_Part):
-    """The spec of a connection; an end whose topics the initial deployment carries is empty."""
+    """The spec of a connection.
+
+    If the initial deployment already carries the topics at one end, the fields of this end are
+    empty.
+    """
 
     operator: Request
     host: str = Field(validation_alias=AliasPath("configCommon", "broker", "host"))
@@ -127,7 +141,7 @@ class ObjectDetection(_Part):
 
     @property
     def topic(self) -> str:
-        """The topic of the point cloud; only the command names it."""
+        """The topic of the point cloud, as the command names it; empty if it names none."""
         found = _CLOUD.search(" ".join(self.command))
         return found[1] if found else ""
 
@@ -147,7 +161,7 @@ KINDS: dict[str, type[Spec]] = {
     "ObjectDetection": ObjectDetection,
     "ObjectFusion": ObjectFusion,
 }
-"""The kinds of custom resources, and their specs."""
+"""Kind of custom resource → the class of its spec."""
 
 
 class _Metadata(_Part):
@@ -174,7 +188,7 @@ class ReferenceFiles:
     """The prefixes of the resources whose bookkeeping was given, even if it is empty."""
 
     def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
-        """Return the specs of one kind, by resource."""
+        """Return resource name → spec for the resources of one kind."""
         return {name: spec for name, spec in sorted(self.specs.items()) if isinstance(spec, kind)}
 
     def names(self) -> list[str]:

@@ -1,7 +1,8 @@
 """The map from the reference's resources to the applications and connections of demands.
 
-Ids give the names of resources, but a name does not give the ids: ``/``, ``_`` and ``-`` all become
-``-``. So :func:`propose` only proposes a map, and a person checks it.
+The reference makes the name of a resource from ids: ``/``, ``_`` and ``-`` all become ``-``. So the
+ids cannot be derived from the name with certainty. :func:`propose` proposes a map, and a person
+checks this map.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _OBJECT_LIST = "_local_objectlist"
 
 
 class PointCloud(CamelModel):
-    """The point cloud from which a detection makes an object list, and the node it comes from."""
+    """The topic of a point cloud from which a detection makes an object list, and its source."""
 
     topic: _Filled
     source: _Filled
@@ -40,8 +41,8 @@ class PointCloud(CamelModel):
 class MappedApplication(CamelModel):
     """An application of the reference's only type.
 
-    ``egoData`` maps each topic to the node that it comes from, ``pointClouds`` maps each topic
-    with an object list to the point cloud behind it.
+    ``egoData`` maps each topic with ego data to the node that publishes the topic. ``pointClouds``
+    maps each topic with an object list to the point cloud from which the list is made.
     """
 
     id: _Filled
@@ -68,7 +69,10 @@ class MappedConnection(CamelModel):
 
 
 class ReferenceMap(FileModel):
-    """The meaning of each resource. ``request`` is the demands' id, which the reference lacks."""
+    """The application or connection that each resource of the reference stands for.
+
+    ``request`` is the request id for the imported goals, because the reference records no id.
+    """
 
     kind: Literal["ReferenceMap"]
     request: _Filled
@@ -82,7 +86,11 @@ def slug(id: str) -> str:
 
 
 def is_host(broker: Broker, host: str, port: object) -> bool:
-    """Return whether a broker is at an address; the broker's host may add the namespace."""
+    """Return whether a broker is at the address ``host`` and ``port``.
+
+    The host in the inventory may be longer than ``host``: it may end in the namespace, as in
+    ``broker.c-its``.
+    """
     return port == broker.port and f"{broker.host}.".startswith(f"{host}.")
 
 
@@ -94,7 +102,7 @@ def propose(
     A field whose value is not known is empty, and a person fills it in.
 
     Args:
-        joins: the joins that are still held, by resource.
+        joins: resource → the joins whose holds are not shut down yet.
         files: has the resources' specs.
         config: has the nodes and brokers of the inventory.
     """
@@ -144,7 +152,11 @@ class _Inventory:
         return {"topic": topics[0] if topics else "", "source": source}
 
     def _source(self, topic: str, node: str) -> str:
-        """Return the source of a connection that brings the topic, else a node that lists it."""
+        """Return the node that probably publishes a topic, or an empty text.
+
+        This is the source of a connection that brings the topic to ``node``, else a node whose
+        inventory entry lists the topic.
+        """
         over = [
             spec.source
             for spec in self._connections.values()

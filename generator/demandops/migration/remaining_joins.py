@@ -1,9 +1,9 @@
 """The joins that are still held, from what the reference's operators recorded.
 
-The bookkeeping says who holds what, and how often. The versioning file has the requests that led to
-it. But for connections and detections the operator later changes the first request: it adds
-requesters to the request's list and removes them. So the counts always come from the bookkeeping,
-and the requests only show which requesters joined together.
+The bookkeeping records who holds what, and how often. The versioning file has the requests that led
+to these holds. But for connections and detections the operator later changes the recorded first
+request: it adds requesters to this request, and removes requesters from it. So the counts always
+come from the bookkeeping, and the requests only show which requesters joined together.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class Join:
 def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join]:
     """Return the joins whose holds add up to ``book``, oldest first.
 
-    The requests are undone, from the newest back to the one that created the resource. The rest is
-    what this first request asked for. Then the other requests are applied again, and each join
-    stays separate.
+    First, the requests are undone, from the newest back to the request that created the resource.
+    The holds that are left are those of the creating request. Then the undone requests are applied
+    again, the oldest first, and each join stays separate.
 
     Args:
         book: the bookkeeping: how many times each hold counts.
@@ -58,7 +58,11 @@ def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join
 
 
 def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
-    """Remove a shutdown's holds from the join of its requesters, else from the oldest with them."""
+    """Remove a shutdown's holds from the joins.
+
+    A hold is removed from a join of exactly the shutdown's requesters, if one has this hold. Else
+    it is removed from the oldest join that has it.
+    """
     named = set(shutdown.requester)
     same_first = sorted(joins, key=lambda join: {who for _, who in join[1]} != named)
     for hold in shutdown.holds().elements():
@@ -68,7 +72,11 @@ def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
 
 
 def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
-    """Yield joins that hold nothing twice, because in the ledger a repeated demand counts once."""
+    """Yield joins with these holds, in which each requester holds each topic only once.
+
+    A hold that counts several times is split over several joins, because in the ledger a repeated
+    demand counts once.
+    """
     for count in range(1, max(holds.values(), default=0) + 1):
         topics: dict[str, list[str]] = {}
         for (topic, who), held in holds.items():

@@ -20,10 +20,10 @@ from demandops.subject import TopicKey
 
 
 class Made(NamedTuple):
-    """A topic that a service reads and the node where it is made.
+    """A topic that a service reads, and the node that publishes the topic.
 
-    ``root`` is the demanded topic itself, or the one that the topic is made from; empty if the
-    topic is made for the whole application.
+    ``root`` is the key of the demanded topic: of ``topic`` itself, or of the one that ``topic`` is
+    made from. It is empty if ``topic`` is not made from one particular demanded topic.
     """
 
     topic: InputTopic
@@ -35,9 +35,10 @@ class Made(NamedTuple):
 class Flow:
     """A topic that is made on one node and needed on another.
 
-    ``name`` is the role, or ``<service>.<output>``. ``target`` is the topic's name at the receiver.
-    ``root`` is the demanded topic that needs the flow. If the flow is a delivery, ``delivery`` is
-    its index in ``deliver``. ``type`` is the message type, if the demand names it.
+    ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
+    topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
+    flow is needed. ``delivery`` is the flow's index in the application's ``deliver``, or ``None``
+    if the flow delivers no output. ``type`` is the message type, if the demand names it.
     """
 
     name: str
@@ -51,15 +52,15 @@ class Flow:
 
     @property
     def is_output(self) -> bool:
-        """Whether a service makes the topic; else it is an input of the demand."""
+        """Whether a service makes the topic; otherwise the demand lists the topic as an input."""
         return "." in self.name
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
     """Return the node on which an application's service runs for the inputs of ``source``.
 
-    The result is empty if the service has no node yet, or if it runs once for each cluster, but not
-    in the application's cluster.
+    The result is an empty text in two cases: no node is chosen for the service yet, or the service
+    runs once for each cluster and has no node in the application's cluster.
     """
     if service.nodes:
         return service.runs_at.get(app.node, "")
@@ -69,7 +70,7 @@ def node_of(app: Application, service: Service, source: str) -> str:
 
 
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
-    """Yield the instances of a service that an application needs."""
+    """Yield the key of each instance of a service that an application needs."""
     if service.scope == "application":
         yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:
@@ -84,12 +85,16 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
 
 
 def version_of_instance(app: Application, service: Service) -> str:
-    """Return the version in an instance's key; empty unless the instance is separate."""
+    """Return the version that the keys of a service's instances contain.
+
+    This is the version of a separate application. It is an empty text for any other application
+    and for a shared service.
+    """
     return "" if service.shared else app.own_version
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
-    """Return the demanded topics of an application that need an instance of a service."""
+    """Return the keys of an application's demanded topics for which a service instance runs."""
     if service.root is not None:
         found = app.inputs_from(service.root, str(key.source), str(key.topic))
         return [(service.root, one.topic, one.source) for one in found]
@@ -98,7 +103,10 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
 
 
 def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
-    """Yield an application's topics for ``origin``, which is a role or ``<service>.<output>``."""
+    """Yield the topics of an application that ``origin`` names.
+
+    ``origin`` is an input role of the application, or ``<service>.<output>``.
+    """
     name, _, output = origin.partition(".")
     if not output:
         for one in app.inputs.get(origin, ()):
@@ -142,7 +150,7 @@ def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
         name, _, output = delivery.output.partition(".")
         service = config.services.get(app.appdef, {}).get(name)
         if service is None or output not in service.outputs:
-            continue  # admission reports it
+            continue  # admission reports an unknown output
         for one in made(config, app, delivery.output):
             topic = one.topic.topic
             target = delivery.topic or topic
@@ -151,7 +159,10 @@ def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
-    """Yield each service instance's node, and the application reduced to the instance's inputs."""
+    """Yield (node, application) for each instance of a service.
+
+    This application has only the inputs that the instance runs for.
+    """
     if service.root is not None:
         for one in app.inputs.get(service.root, ()):
             yield node_of(app, service, one.source), app.with_inputs({service.root: (one,)})

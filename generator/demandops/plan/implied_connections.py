@@ -1,7 +1,8 @@
-"""Connections that a demand needs for its services' inputs from other nodes, but does not list.
+"""Implied connections: those that a demand needs, but does not list.
 
-The demand claims such a connection as if it had listed it. So the connection is shared with other
-demands, changes when the application moves, and is released with the demand.
+A service that reads a topic of another node needs a connection. The demand claims this connection
+in the same way as a listed one. So the connection is shared with other demands, changes when the
+application moves, and is released with the demand.
 """
 
 from __future__ import annotations
@@ -27,15 +28,20 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
-    """Return the goal's field for a fault of an implied connection: the input or a requester."""
+    """Return the field of the goal that a fault of an implied connection names.
+
+    A fault of a requester keeps its ``path``. Any other fault names ``field``: the input, delivery
+    or node because of which the connection is needed.
+    """
     return path if path.startswith("requesters") else field
 
 
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request with a connection for each flow that no listed connection carries.
 
-    If a claimed connection carries the flow, the demand joins it. Otherwise the demand gets a
-    derived connection between the two nodes. An invalid input adds none; admission reports it.
+    If a claimed connection carries the flow, the demand claims this connection too. Otherwise the
+    demand gets a derived connection between the two nodes. An invalid input adds no connection;
+    admission reports the input.
     """
     first: dict[_Ends, Demanded] = {}
     routes: dict[_Ends, dict[tuple[str, str], Route]] = {}
@@ -82,7 +88,10 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
 
 
 def _note(needed: Connection, type: str) -> str:
-    """Return a note on a connection that others demanded with another type."""
+    """Return a note for the requester if a connection already has another type than ``type``.
+
+    Otherwise return an empty text.
+    """
     if needed.type is None or type in ("auto", needed.type.word):
         return ""
     topic = needed.topics[0].source
@@ -103,10 +112,16 @@ def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
 def without_idle_deliveries(
     before: Ledger, after: World, changes: Changes
 ) -> tuple[Ledger, Changes]:
-    """Return the booking without connections that deliver outputs which are no longer made.
+    """Return the ledger and the changes without deliveries of outputs that are no longer made.
 
-    A demand releases its connections itself. But if a decommissioned node reduces a demand, the
-    demand may still hold connections between other nodes.
+    If a node is decommissioned, a demand may lose an input and with it an output of its
+    application. The demand may still hold the connection that delivers this output between two
+    other nodes. This function takes the output's topic from the demand's claim on the connection.
+
+    Args:
+        before: the ledger before the node is decommissioned.
+        after: the world afterwards.
+        changes: what the decommissioning changes.
     """
     ledger, keys = after.ledger, [change.key for change in changes.claims]
     for change in changes.claims:
@@ -132,10 +147,10 @@ def _is_valid(flow: Flow, config: Config) -> bool:
 
 
 def carrying(flow: Flow, type: str, ledger: Ledger) -> Connection:
-    """Return the connection that carries a flow, with only the flow's topic.
+    """Return the connection for a flow, with the flow's topic as its only topic.
 
-    This is a claimed connection that already carries the flow, else a derived connection of
-    ``type``, which may be ``auto``.
+    If a claimed connection already carries the flow, the result is this connection. Otherwise it is
+    a derived connection of ``type``. If ``type`` is ``auto``, the connection has no type yet.
     """
     ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
     for id in ledger.connections_bringing(flow.receiver, flow.target):

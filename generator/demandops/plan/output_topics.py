@@ -1,8 +1,9 @@
 """The topics that services publish, named as the reference names them.
 
-``{instance}`` in a pattern is the application or the node that a service runs for, or the source of
-a service with ``each``. A source has one usual topic for an input: the one in its inventory entry,
-else the first that a demand booked. Only names for its further topics contain the topic as well.
+``{instance}`` in a pattern stands for the application or the node that a service runs for. For a
+service with ``each``, it stands for the source of the input. A source has one usual topic for an
+input: the one in its inventory entry, else the first that a demand booked. Any other topic is a
+further topic of the source; names that are made from a further topic contain this topic as well.
 The claims record which topics are further ones, so a name stays the same while anybody demands the
 topic.
 """
@@ -25,9 +26,9 @@ from demandops.plan.release import ServiceKey
 def outputs(
     config: Config, service: Service, key: ServiceKey, *, further: bool = False
 ) -> dict[str, str]:
-    """Return the topics that a service instance publishes, by the names of the appdef's outputs.
+    """Return output name → topic for each output that a service instance publishes.
 
-    ``further`` says whether the instance's input is a further topic of its source.
+    ``further`` is true if the instance's input is a further topic of its source.
     """
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
@@ -38,7 +39,7 @@ def outputs(
 
 
 def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
-    """Return the text for ``{instance}`` of the service that has ``topic`` as its input.
+    """Return the text for ``{instance}`` of the service instance that runs for ``topic``.
 
     ``version`` is the version of a separate instance, else empty.
     """
@@ -46,7 +47,11 @@ def instance_of(config: Config, role: str, topic: InputTopic, version: str = "")
 
 
 def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text that distinguishes the topic names of a service for the same source."""
+    """Return the text that distinguishes the names of topics that are made for one source.
+
+    The text has the topic, if that is a further topic of its source, and the version of a separate
+    instance. It is empty if neither applies.
+    """
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return topic.told_apart_by(further, version)
@@ -54,26 +59,30 @@ def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) ->
 
 @lru_cache(maxsize=65_536)
 def published(pattern: str, source: str, told: str) -> InputTopic:
-    """Return a topic that a service publishes for a source, from a cache: a fusion has hundreds."""
+    """Return the topic that a service publishes for ``source``.
+
+    ``told`` is the result of :func:`told_apart_by`. A fusion reads hundreds of such topics, so the
+    results are cached.
+    """
     return InputTopic(named(pattern, naming.topic_part(source, told)), source)
 
 
 def named(pattern: str, instance: str) -> str:
-    """Return the name of an instance's topic, by the pattern of the appdef."""
+    """Return a topic name: the appdef's ``pattern`` with ``{instance}`` replaced."""
     return pattern.replace("{instance}", instance)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
-    """Return the usual topic of a source as the inventory has it, or ``None``."""
+    """Return the usual topic of a source for an input, or ``None`` if the inventory has none."""
     node = config.nodes.get(source)
     return node.topics.get(role) if node else None
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request with each input marked that is a further topic of its source."""
+    """Return the request with ``further`` set in each input that is a further topic."""
     if not request.adds_claims:
         return request
-    # a put may release topics of its own demand
+    # topics of the put's own demand do not count, because the put may release them
     own = request.demand if isinstance(request, Put) else None
     first: dict[tuple[str, str], str] = {}
 
@@ -104,9 +113,9 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return a ledger of an earlier format, changed so that further topics are marked.
+    """Return a ledger of an earlier format with ``further`` set in the inputs of its claims.
 
-    The usual topic of a source is the one that was booked first.
+    The usual topic of a source is the one in the inventory, else the one that was booked first.
     """
     first: dict[tuple[str, str], str] = {}
 
@@ -122,7 +131,7 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
 
 
 def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
-    """Yield the role and the topic of each input that may have a service of its own."""
+    """Yield (role, topic) for each input in a role whose topics each get a service instance."""
     for role in config.roles_with_services:
         for topic in app.inputs.get(role, ()):
             yield role, topic

@@ -1,8 +1,8 @@
 """Changes to the ledger when overrides change or end: kept claims, moved services, markers.
 
 A marker is a file of the ledger that says that an override has ended. An override whose end had
-passed when it was merged never applies. The generator ends an override that was in effect with a
-commit of its own.
+passed when it was merged never applies. When an override in effect reaches its end, the generator
+publishes a commit that ends it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from demandops.subject import Subject
 class LedgerUpdate:
     """The ledger after a change of overrides or claims, and the ledger files to write.
 
-    ``keys`` are the claims that may have changed.
+    ``keys`` are the keys of the claims that may have changed. ``files`` maps each path to the new
+    text, or to ``None`` if the file is to be removed.
     """
 
     ledger: Ledger
@@ -47,8 +48,8 @@ def update_ledger(
     Args:
         before, after: the world before and after the change.
         subjects: the subjects whose claims a person changed.
-        markers: the current markers, by path, as text.
-        now: the time; new overrides whose end has passed do not apply.
+        markers: path → text of each marker in the ledger.
+        now: the current time. A new override whose end has passed does not apply.
     """
     known = {one.name: one for one in before.overrides}
     expired = [
@@ -78,7 +79,9 @@ def update_ledger(
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """Return the update that changed claims require, without a changed configuration.
+    """Return the changes to the ledger that a change of claims requires.
+
+    The configuration is the same before and after.
 
     Args:
         before: the ledger before the change.
@@ -95,7 +98,7 @@ def update_claims(
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the update that ends an override."""
+    """Return the changes to the ledger that end an override, with the override's marker."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
@@ -111,7 +114,7 @@ def _marker(override: Override) -> dict[str, str]:
 def changed_claim_files(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> dict[str, str | None]:
-    """Return the claim files at ``keys`` that differ, path → text; ``None`` removes a file."""
+    """Return path → new text for each claim at ``keys`` that changed; ``None`` removes a file."""
     files: dict[str, str | None] = {}
     for key in keys:
         claim = after.get(key)

@@ -47,10 +47,12 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
 
 
 def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
-    """Return a service's release without kept replicas and without the effects of overrides.
+    """Return a service's release as its demands need it, or ``None`` if no claim needs it.
+
+    The release has neither kept replicas nor the effects of overrides.
 
     Raises:
-        Refused: as :func:`plan`.
+        Refused: for the same reasons as :func:`plan`.
     """
     world = without_suspended(world)
     kept = world.ledger.kept.replace(key.instance, ())
@@ -58,7 +60,7 @@ def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    """Return the release at ``key`` and the override that denies it, or ``None``."""
+    """Return the release at ``key`` and the override that denies it; ``None`` if none does."""
     world = without_suspended(world)
     release = _unshaped(world, key)
     by = release_overrides.service_denied_by(release, world) if release else None
@@ -108,12 +110,15 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def _as_claimed(world: World, app: Application) -> Application:
-    """Return an application as in its first claim, which decides the appdef and the node."""
+    """Return an application as its first claim has it: that claim decides appdef and node."""
     return world.ledger.application(app.id) or app
 
 
 def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
-    """Return the requesters of a service; if it runs for topics, only holders of these topics."""
+    """Return the requesters of a service instance.
+
+    If the instance runs for certain topics, these are only the requesters that hold such a topic.
+    """
     if not service.roots:
         return requesters_of(claims)
     holders = (
@@ -174,10 +179,10 @@ def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str
 def demanded_inputs(
     world: World, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield role and topic of each input that an application gives a service, and its root.
+    """Yield (role, topic, root) for each input of a service that comes from an application.
 
-    The root is the demanded topic: the input itself, or what the input is made from. It may be
-    empty.
+    The root is the key of the demanded topic: of the input itself, or of the topic that the input
+    is made from. It is empty if the input is not made from one particular demanded topic.
     """
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
@@ -196,8 +201,9 @@ def demanded_inputs(
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     """Return the release name of a service instance.
 
-    For a topic, the name leaves out a source's usual topic (``topics`` of its inventory entry):
-    ``od-edge-vehicle00``. For other topics it has a slug of the topic.
+    If the instance runs for a topic, the name has the node and the topic's source, as in
+    ``od-edge-vehicle00``. The name also has a slug of the topic, unless the inventory lists the
+    topic as a usual one of the source (``topics``).
     """
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)

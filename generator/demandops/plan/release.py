@@ -25,9 +25,10 @@ class ServiceKey:
     """The identity of one instance of a service.
 
     ``application`` is set if the service runs once for each application. ``source`` and ``topic``
-    are set if it runs once for each topic, which all applications with this topic share. If none of
-    these is set, all applications on the node share it; with ``for_cluster`` all applications in
-    the node's cluster. ``version`` is set for a separate instance of an application.
+    are set if the service runs once for each topic; all applications with this topic share the
+    instance. If neither is set, all applications on the node share the instance. With
+    ``for_cluster``, all applications in the node's cluster share it. ``version`` is set for a
+    separate instance of an application.
     """
 
     service: str
@@ -40,7 +41,7 @@ class ServiceKey:
 
     @property
     def scope(self) -> Scope:
-        """What the service has one instance for: a topic, a node, a cluster or an application."""
+        """What this instance is for: a topic, a node, a cluster or an application."""
         if self.application is not None:
             return "application"
         if self.for_cluster:
@@ -49,14 +50,14 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """The key of the service instance in the ledger's kept replicas."""
+        """This key in the form of the ledger's kept replicas: a tuple of texts."""
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
 
     @classmethod
     def of(cls, instance: Instance) -> ServiceKey:
-        """Return the key of an instance."""
+        """Return the key whose :attr:`instance` is ``instance``."""
         service, node, *others, version, scope = instance[1:]
         application, source, topic = (name or None for name in others)
         return cls(service, node, application, source, topic, version, scope == "cluster")
@@ -66,8 +67,9 @@ class ServiceKey:
 class ServiceRelease:
     """The desired state of one service: one Helm release.
 
-    ``chart`` is the chart of ``version``, unless an override pins another. ``keeps`` says until
-    when the service has more replicas than its demands need.
+    ``chart`` is the chart of ``version``, unless an override pins another chart version. ``keeps``
+    is set while the service keeps more replicas than its demands need, and has the time until which
+    it keeps them.
     """
 
     key: ServiceKey
@@ -88,7 +90,7 @@ class ServiceRelease:
 
     @property
     def autoscaler(self) -> Autoscaler | None:
-        """The autoscaler that chooses the number of replicas, if one does."""
+        """The autoscaler that chooses the number of replicas; ``None`` if the number is fixed."""
         return self.replicas if isinstance(self.replicas, Autoscaler) else None
 
     @property
@@ -127,7 +129,7 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what it decides) for each configuration entry behind the release."""
+        """Yield (file, entry, what it decides) for each file entry that shapes the release."""
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "its definition"

@@ -1,7 +1,7 @@
 """The keys of the releases that claims need, and that a change of claims affects.
 
 :func:`affected_keys` names the releases that a change of claims may touch, so the cost of a demand
-does not grow with the number of others. :mod:`demandops.plan.planner` derives each release.
+does not grow with the number of other demands. :mod:`demandops.plan.planner` derives each release.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ ReleaseKey = ServiceKey | ClientKey
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
     """Yield the keys of the releases that the unsuspended claims on ``subject`` need.
 
-    If an application's definition is missing, yield none. With ``strict``, raise ``Refused``
-    instead: a deleted definition must not stop running services.
+    If the application's definition is missing, there are no keys. With ``strict``, this raises
+    ``Refused`` instead, because a deleted definition must not stop running services.
     """
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
@@ -67,7 +67,7 @@ def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceK
 
 
 def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
-    """Return the claims that need a service instance, by application and demand."""
+    """Return the claims that need a service instance, sorted by application and demand."""
     ledger = world.ledger
     if key.application is not None:
         needed = _service(world, key.application, key) is not None
@@ -100,14 +100,14 @@ def is_needed(world: World, key: ServiceKey) -> bool:
 
 
 def takes(app: Application, service: Service, key: ServiceKey) -> bool:
-    """Return whether an application with this service needs this instance of it."""
+    """Return whether an application that has ``service`` needs the instance at ``key``."""
     return not service.roots or bool(roots_of(app, service, key))
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the application's service that ``key`` may be an instance of.
+    """Return the service of an application that may have the instance ``key``.
 
-    It is ``None`` if there is none, for example because the application moved.
+    Return ``None`` if no service may have it, for example because the application moved.
     """
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}
@@ -125,7 +125,7 @@ def affected_keys(
     """Return the key of every release that these changes of claims may add, change or remove.
 
     The cost grows with the number of changed topics. If a change moves or redefines an application
-    or changes its version, it grows with all topics of the application.
+    or changes its version, the cost grows with the number of all topics of the application.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.
@@ -143,16 +143,18 @@ def affected_keys(
 
 
 def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
-    """Return a claim before and after a change; if only inputs differ, without the equal inputs.
+    """Return the claim before and the claim after a change, reduced to what differs.
 
-    Other requesters count as a difference only if a definition or an override depends on them.
+    If only the inputs differ, the inputs that are in both claims are left out of both. Otherwise
+    both claims are whole. Different requesters count only if a service definition or an override
+    depends on the requesters.
     """
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
     old, new = before.application, after.application
     same = replace(new, inputs=old.inputs) == old
-    if not same or old.parameters:  # the latest booking may decide a parameter
+    if not same or old.parameters:  # a parameter may have the value of the latest booking
         return before, after
     others = (before.requesters, before.partial) != (after.requesters, after.partial)
     if others and _looks_at_requesters(new.appdef, world):
@@ -180,7 +182,10 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
 
 
 def _decided_alike(before: World, after: World, subject: Subject) -> bool:
-    """Return whether an application has the same node, definition and version in both worlds."""
+    """Return whether an application has the same node, definition and version in both worlds.
+
+    Return ``True`` for a connection, and for an application that only one world has.
+    """
     if subject.kind is not SubjectKind.APPLICATION:
         return True
     one, other = before.ledger.application(subject.id), after.ledger.application(subject.id)

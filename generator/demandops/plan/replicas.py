@@ -15,19 +15,22 @@ from demandops.ledger.kept_replicas import Kept, Steps
 
 @dataclass(frozen=True, slots=True)
 class Autoscaler:
-    """A number that a HorizontalPodAutoscaler chooses between two bounds, by its targets."""
+    """A HorizontalPodAutoscaler, which chooses a number of replicas from ``min`` to ``max``.
+
+    ``targets`` maps each resource to the usage, in percent, that the autoscaler aims at.
+    """
 
     min: int
     max: int
     targets: Mapping[Resource, int]
 
     def __str__(self) -> str:
-        """Return bounds and targets as a fact of a release."""
+        """Return the bounds and targets as text for a commit message."""
         by = ", ".join(f"{name} {percent} %" for name, percent in self.targets.items())
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
     def values(self) -> dict[str, int]:
-        """Return the variables for a values template."""
+        """Return the bounds and targets as variables for a template of Helm values."""
         targets = {str(name): percent for name, percent in self.targets.items()}
         return {"min": self.min, "max": self.max} | targets
 
@@ -39,10 +42,13 @@ def replicas_of(
     claims: Collection[Claim],
     requesters: Collection[str],
 ) -> int | Autoscaler:
-    """Return the replicas for the parameters, inputs, claims and requesters of a service.
+    """Return how many replicas a service needs, or the autoscaler that chooses the number.
+
+    The definition derives the number from the service's parameters, input topics, claims or
+    requesters.
 
     Raises:
-        Refused: if a parameter names no size.
+        Refused: if the parameter that names a size has a value that is not a size.
     """
     if scaling.autoscaler:
         return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
@@ -67,10 +73,14 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return a service's replicas, at least those that it keeps, and the step that keeps them."""
+    """Return the replicas of a service, and the step that keeps them.
+
+    If the service still keeps more replicas than ``needed``, the result is the kept number and the
+    step that keeps it. Otherwise the result is ``needed`` and ``None``.
+    """
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None
-    kept = min(steps[0].replicas, scaling.most)  # the definition may have been changed since
+    kept = min(steps[0].replicas, scaling.most)  # the definition may have a lower limit by now
     return (kept, steps[0]) if kept > needed else (needed, None)
 
 

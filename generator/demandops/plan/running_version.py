@@ -1,9 +1,9 @@
-"""The version that runs: the newest version that is asked for.
+"""The version of an application that is deployed: the newest that its claims ask for.
 
-A claim on an application asks for a version, or else for the default. The application runs the
-newest version asked for. A service that applications share runs the newest version of these
-applications. So the order of the claims does not matter. Before that,
-:mod:`demandops.plan.checks.version_difference` decides whether a demand may ask for a version.
+A claim on an application asks for a named version, or for the default version. A service that
+several applications share has the newest version of these applications. So the order of the claims
+does not matter. :mod:`demandops.plan.checks.version_difference` decides whether a demand may ask
+for another version than the existing demands.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from demandops.ledger.world import World
 
 
 def running_version(world: World, application: str) -> ApplicationVersion | None:
-    """Return the version that an application runs; ``None`` without claims or appdef."""
+    """Return the deployed version of an application.
+
+    Return ``None`` if no claim holds the application, or if its appdef is missing.
+    """
     app = world.ledger.application(application)
     known = world.config.application_versions.get(app.appdef) if app else None
     return newest_asked(world.ledger, application, known) if known else None
@@ -46,7 +49,7 @@ def version_of_service(
     If the applications have several appdefs, the one with the newest chart decides.
 
     Raises:
-        Refused: if two appdefs have the same chart with different images.
+        Refused: if two appdefs have the same chart version, but different images.
     """
     newest: dict[str, ApplicationVersion] = {}
     for found in filter(None, (running_version(world, id) for id in applications)):
@@ -69,6 +72,6 @@ def version_of_service(
 
 
 def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
-    """Return a version's contents for a service: the chart's version and the images' pins."""
+    """Return what a version fixes for a service: the chart's version and the images' pins."""
     pins = (version.images.get(name) for name in service.images)
     return version.charts[service.chart].version, *pins

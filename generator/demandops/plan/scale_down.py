@@ -1,8 +1,8 @@
 """When a service gets fewer replicas: at once, or after the time in the service's definition.
 
-A decision records what a service keeps when its demands need fewer replicas
-(:mod:`demandops.ledger.kept_replicas`). When that time is over, the generator removes the record in
-a commit of its own, as it ends an override.
+If demands need fewer replicas than before, the decision records how many replicas the service
+keeps, and until when (:mod:`demandops.ledger.kept_replicas`). When that time is over, the generator
+publishes a commit that removes the record.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _number(release: ServiceRelease | None) -> int:
 
 
 def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    """Return the ledger without the steps of an instance that have ended."""
+    """Return the ledger without the ended steps of a service instance's kept replicas."""
     kept = world.ledger.kept
     left = tuple(one for one in kept.steps.get(instance) or () if one.until > now)
     return replace(world.ledger, kept=kept.replace(instance, left))

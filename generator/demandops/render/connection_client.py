@@ -1,8 +1,8 @@
 """The file of a communication client: a Deployment, and a ConfigMap with its configuration.
 
 Each connection type has a template and a schema in ``templates/connections/<type>/``. The schemas
-are our own and list the fields that each program reads. A program ignores an unknown field or
-crashes on it, and this shows only when it runs on the node.
+are part of DemandOps and list the fields that each client program reads. Without this check, an
+unknown field would be noticed only on the node: the program ignores the field or crashes.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ def check_configuration(kind: str, configuration: dict[str, Any], client: str) -
     """Check the configuration of a client against the schema of its connection type.
 
     Raises:
-        InvalidInput: naming each field that does not match. It is a fault of the program, not of a
-            demand.
+        InvalidInput: if fields do not match; it names each of them. The cause is a fault of
+            DemandOps, not of a demand.
     """
     schema = data_folder("templates") / "connections" / kind / "schema.json"
     faults = [

@@ -49,7 +49,7 @@ _MAX_LENGTH = 100_000
 
 
 class _Verbatim(str):
-    """The YAML that one of our filters returns; it is written unchanged."""
+    """YAML text that a filter of this module returns. The engine writes it unchanged."""
 
 
 class _FilesLoader(BaseLoader):
@@ -70,7 +70,7 @@ class _FilesLoader(BaseLoader):
 
 
 class _CompiledTemplates(BytecodeCache):
-    """Keeps compiled templates, so that each text is compiled once in a process."""
+    """Keeps compiled templates, so that a process compiles each text only once."""
 
     _LIMIT = 256
 
@@ -78,11 +78,11 @@ class _CompiledTemplates(BytecodeCache):
         self._kept: dict[tuple[str, str], CodeType] = {}
 
     def load_bytecode(self, bucket: Bucket) -> None:
-        """Give the bucket the kept code of the template with this path and text, or None."""
+        """Set the bucket's code to the kept code of its template; None if there is none."""
         bucket.code = self._kept.get((bucket.key, bucket.checksum))
 
     def dump_bytecode(self, bucket: Bucket) -> None:
-        """Keep the template's code; at the limit drop all other code, as texts change often."""
+        """Keep the code of the bucket's template; at the limit, first drop all code kept so far."""
         if len(self._kept) >= self._LIMIT:
             self._kept.clear()
         if bucket.code:
@@ -112,13 +112,17 @@ def _block(value: Mapping[str, Any], indent: int) -> _Verbatim:
 
 
 def _literal(value: str, indent: int) -> _Verbatim:
-    """Return ``value`` as the body of a literal block (``|``)."""
+    """Return ``value`` as the indented body of a YAML literal block (``|``)."""
     pad = " " * indent
     return _Verbatim("\n".join(pad + line for line in value.rstrip("\n").split("\n")))
 
 
 def _bare(value: str) -> _Verbatim:
-    """Return a plain path without quotes, for comments."""
+    """Return a path that a template can write into a comment without quotes.
+
+    Raises:
+        ValueError: if the path has characters that need quotes.
+    """
     if not re.fullmatch(r"[A-Za-z0-9._/-]+", value):
         raise ValueError(f"'{value}' is not a plain path, so it cannot be written in a comment")
     return _Verbatim(value)
@@ -145,18 +149,18 @@ _OWN_COMPILED, _CONFIG_COMPILED = _CompiledTemplates(), _CompiledTemplates()
 
 
 class Engine:
-    """Renders the program's templates and those of one configuration."""
+    """Renders the program's own templates and the templates of one configuration."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
         self._files = files
         own, config = FileSystemLoader(data_folder("templates")), _FilesLoader(files)
         self._own = Environment(loader=own, bytecode_cache=_OWN_COMPILED, **_OPTIONS)  # noqa: S701 - YAML, not HTML
-        del self._own.filters["tojson"]  # values become JSON anyway; converting twice adds quotes
+        del self._own.filters["tojson"]  # every value becomes JSON anyway; twice would add quotes
         self._own.filters |= _FILTERS
         self._config = Sandbox(_FILTERS, loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
 
     def text(self, template: str, **context: object) -> str:
-        """Return a rendered template of the program (``flux/release.yaml.j2``)."""
+        """Return the rendered text of a program's template, such as ``flux/release.yaml.j2``."""
         return self._own.get_template(template).render(**context)
 
     def data(
@@ -165,22 +169,22 @@ class Engine:
         check: Callable[[dict[str, Any]], None] = lambda values: None,
         **context: object,
     ) -> dict[str, Any]:
-        """Return the data that a values template of the configuration renders to.
+        """Return the Helm values that a values template of the configuration renders to.
 
         Args:
             template: the path of the template.
-            check: raises InvalidInput for values that do not fit.
+            check: raises InvalidInput if the values are not valid.
             context: the variables of the template.
 
         Raises:
-            InvalidInput: if the template fails, or the check; it names the template and, if known,
-                the line.
+            InvalidInput: if the template or the check fails. The error names the template and, if
+                known, the line.
         """
         text = ""
         try:
             with budget():
                 compiled: Template = self._config.get_template(template)
-            with budget():  # a new budget, so that an earlier compilation makes no difference
+            with budget():  # a new budget, because the template may be compiled already
                 text = compiled.render(**context)
             values = _mapping(text, template)
             check(values)

@@ -25,7 +25,8 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
 
     Raises:
         InvalidInput: if the template fails, the values do not match the chart's schema, or an
-            override stops an autoscaler; it names the template or the override.
+            override sets the replicas of an autoscaled service to 0. The error names the template
+            or the override.
     """
     template = config.values_template(release.service)
     if release.autoscaler and release.autoscaler.max == 0:
@@ -44,7 +45,10 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
 
 
 def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
-    """Yield the faults of a template; name the overrides that change its variables."""
+    """Yield the faults of a template.
+
+    Each message also names the overrides that change the variables of the template.
+    """
     changing = {"version", "images", "replicas", "node"}
     files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
     note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"

@@ -1,8 +1,7 @@
 """The last check of rendered files before a commit.
 
-Helm values must match the chart's ``values.schema.json``, built-in kinds must match the schemas of
-Kubernetes, and every path must be in a folder that the generator owns. Validators are compiled
-once.
+Helm values must match the chart's ``values.schema.json``. Objects of Kubernetes' built-in kinds
+must match the schemas of Kubernetes. Every path must be in a folder that the generator owns.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from demandops.errors import Fault, InvalidInput, fault
 from demandops.render import values_validator
 
 KUBERNETES_VERSION = "1.36.0"
-"""The Kubernetes release whose schemas check built-in kinds."""
+"""The version of Kubernetes whose schemas are used to check objects of built-in kinds."""
 
 OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 
@@ -48,17 +47,17 @@ def check_values(
 ) -> None:
     """Check Helm values against the chart's schema, if the chart is in the state repo.
 
-    Like Helm, it merges the values into the chart's defaults first: a schema may require a value
-    that has a default.
+    Like Helm, the function first merges the values into the chart's defaults, because a schema may
+    require a value that has a default.
 
     Args:
         values: the values to check.
         chart: the chart's source and version.
         config: the configuration, which holds the chart's files.
-        template: the file that gives the values: a template or an override.
+        template: the path of the file that the values come from: a template or an override.
 
     Raises:
-        InvalidInput: naming ``template`` and each value that does not fit.
+        InvalidInput: if values do not match the schema; it names ``template`` and each value.
     """
     schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:
@@ -82,8 +81,8 @@ def check_files(files: Mapping[str, str | None]) -> None:
     """Check files that are about to be committed; ``None`` removes a file.
 
     Raises:
-        InvalidInput: with all faults. They are faults of the program or of a template, not of a
-            demand.
+        InvalidInput: if a file is not valid; it lists all faults. Their cause is DemandOps or a
+            template, not a demand.
     """
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
@@ -101,9 +100,10 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield the documents of a file; objects of Flux and Argo CD come without their ``spec``.
+    """Yield the documents of a file, and append the faults of the others to ``faults``.
 
-    The program's own template writes such a ``spec``, and its values are checked elsewhere.
+    Documents for Flux and Argo CD are yielded without their ``spec``, which needs no check here: a
+    template of the program writes it, and :func:`check_values` checks the values in it.
     """
     for part in text.split("\n---\n"):
         api = _API.search(part)
@@ -148,10 +148,10 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
 
 @lru_cache(maxsize=64)
 def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
-    """Return the compiled schema of a built-in kind."""
+    """Return the validator for a built-in kind of Kubernetes."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
-    package = find_spec("kubernetes_validate")  # its import is slow, and only its files are used
+    package = find_spec("kubernetes_validate")  # only its files are used; an import is slow
     assert package and package.origin  # noqa: S101 - it is one of our dependencies
     folder = Path(package.origin).parent / "kubernetes-json-schema"
     folder = folder / f"v{KUBERNETES_VERSION}-local-strict"

@@ -1,7 +1,7 @@
 """The file of a release: comment lines that name the overrides, then the rendered body.
 
-A ``hold`` override keeps the body of a file byte for byte; only the comments above it may change.
-The comments still name the overrides that shaped the body at the start of the hold.
+A ``hold`` override keeps the body of a file byte for byte. Only the comments above the body may
+change. They still name the overrides that shaped the body when the hold started.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, engine: Engine, current: str | None) -> str:
-    """Return the text of a release's file; a held file keeps its current body.
+    """Return the text of a release's file. If an override holds the file, the body stays the same.
 
     Args:
         release: the release.
-        config: the configuration that it was planned with.
+        config: the configuration with which the release was planned.
         engine: the engine of that configuration.
         current: the file's text in the state repo; ``None`` if there is no file.
 
@@ -76,13 +76,13 @@ def split_comments(text: str) -> tuple[list[str], str]:
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
-    """Return the chart sources to keep because a held release may still use them.
+    """Return path → text of the chart sources to keep because a held release may still use them.
 
-    If a chart lies in the state repo, its source is not kept: the old source would fetch the
-    changed chart.
+    If the files of a chart are in the state repo, the old source is not kept, because it would
+    fetch the changed chart.
 
     Args:
-        files: the generated files as they will be.
+        files: the new generated files.
         current: the generated files in the state repo.
         world: the overrides that apply.
     """

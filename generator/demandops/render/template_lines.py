@@ -1,4 +1,4 @@
-"""Finds the line of a values template that wrote a faulty line of the rendered text."""
+"""Finds the line of a values template that produced a faulty line of the rendered text."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from demandops.errors import Fault
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")
 _LONGEST = 2_000
-"""How long a line may be; comparing a longer one could take long."""
+"""The highest number of characters of a line to search for; a longer line could take too long."""
 _VALUES = "values."
 
 
 class TemplateLines:
-    """The lines of a template, and of the text that it rendered to."""
+    """The lines of a template, and the lines of the text that it rendered to."""
 
     def __init__(self, template: str, rendered: str) -> None:
         self._template, self._rendered = template.splitlines(), rendered.splitlines()
@@ -24,7 +24,7 @@ class TemplateLines:
         self._fields: dict[str, int] | None = None
 
     def located(self, fault: Fault) -> Fault:
-        """Return a fault of the rendered text with the line of the template, if one is known."""
+        """Return a fault of the rendered text, with the line of the template if it is known."""
         place = _PLACE.match(fault.field)
         number = int(place[1]) if place else self._number_of(fault.field.removeprefix(_VALUES))
         return replace(fault, line=fault.line or (self._line_of(number) if number else None))
@@ -35,9 +35,10 @@ class TemplateLines:
         return field_lines.nearest(path, self._fields)
 
     def _line_of(self, number: int) -> int | None:
-        """Return the line of the template that wrote a line of the text; None if several may have.
+        """Return the number of the template's line that produced a line of the rendered text.
 
-        An identical line of the template goes before a line with expressions.
+        Prefer an identical line of the template to a line with expressions. Return None if no line
+        or more than one line may have produced it.
         """
         if number > len(self._rendered) or len(self._rendered[number - 1]) > _LONGEST:
             return None
@@ -49,7 +50,10 @@ class TemplateLines:
 
 
 def _may_write(line: str, rendered: str) -> bool:
-    """Return whether the text around the expressions of a line occurs in a rendered line."""
+    """Return whether a line of a template may have produced a rendered line.
+
+    The line needs expressions, and the rendered line must contain all text around them in order.
+    """
     first, *others = _EXPRESSION.split(line)
     if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):
         return False

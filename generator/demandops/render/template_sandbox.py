@@ -1,9 +1,9 @@
-"""A Jinja sandbox in which a template of the state repo cannot run long, grow or be random.
+"""A Jinja sandbox that limits a template's time and memory, and prevents random results.
 
-Each loop, call, filter and comparison takes steps from a budget, by the size of what it works on,
-and no value can become large. So a template fails at the same place on every machine, without a
-clock. Only the filters and methods listed here exist: the others are random, name addresses in
-memory, or make HTML.
+Each loop, call, filter and comparison takes steps from a budget. The number of steps depends on the
+size of the values, and no value can become large. So a template that exceeds the budget fails at
+the same place on every machine. Templates can use only the filters and methods that this module
+lists: the others give random results, expose memory addresses, or make HTML.
 """
 
 from __future__ import annotations
@@ -33,11 +33,14 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
 MAX_STEPS = 1_000_000
-"""How many steps a rendering may take, a few seconds of work; 100 topics take some thousand."""
+"""How many steps a rendering may take: a few seconds of work.
+
+A template with 100 topics takes several thousand steps.
+"""
 MAX_LENGTH = 1_000_000
-"""How many characters a text may have. Kubernetes takes no object above 1.5 MB."""
+"""How many characters a text may have. Kubernetes accepts objects of at most 1.5 MB."""
 MAX_SIZE = 100_000
-"""How many parts a value may have: each item, each key and every 16 characters count as one."""
+"""How many parts a value may have. An item, a key and 16 characters of text each count as one."""
 _MAX_BITS = 1024
 
 _DIGITS = re.compile(r"\d{1,9}")
@@ -50,11 +53,11 @@ _FILTERS = re.findall(
     "wordcount",
 )
 _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
-"""Filters that take one step for any size: they only look at a value or return a part of it."""
+"""Filters that take one step for a value of any size, because they do not process its parts."""
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
-"""Filters that call a filter or test for each item; these calls take the steps."""
+"""Filters that call another filter or test for each item; each call takes its own steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
-"""Filters that take more steps for the same size."""
+"""Slow filter → the factor by which it takes more steps than other filters."""
 _PADDING = frozenset(
     {"batch", "center", "indent", "literal", "block", "round", "slice", "truncate"}
 )
@@ -69,7 +72,7 @@ _METHODS: dict[type, list[str]] = {
     list: ["count", "index"],
     tuple: ["count", "index"],
 }
-_MAPPING = (dict, Mapping)  # ``dict`` first, because that check is quick
+_MAPPING = (dict, Mapping)  # ``dict`` first, because its check is faster
 _PLAIN = (str, int, float, type(None), Undefined)
 
 
@@ -80,7 +83,7 @@ class _Budget:
         self.left = MAX_STEPS
 
     def take(self, steps: int) -> None:
-        """Take steps from the budget; raise if none is left."""
+        """Take steps from the budget; raise SecurityError if too few are left."""
         self.left -= steps
         if self.left < 0:
             raise SecurityError(f"the template takes more than {MAX_STEPS} steps; make it simpler")
@@ -91,7 +94,7 @@ _budget: ContextVar[_Budget] = ContextVar("budget")
 
 @contextmanager
 def budget() -> Iterator[None]:
-    """Give templates that are compiled or rendered in the block a full budget."""
+    """Provide a full budget for the templates that are compiled or rendered in the block."""
     token = _budget.set(_Budget())
     try:
         yield
@@ -102,7 +105,8 @@ def budget() -> Iterator[None]:
 def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts; a part that occurs twice counts twice.
 
-    With ``data``, refuse objects that are not data, because their text has a memory address.
+    With ``data``, raise SecurityError for an object that is no text, number, list or mapping. Its
+    text could contain a memory address, which differs between machines.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -133,7 +137,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Take steps for the size of a new value and return it; iterators and views become lists."""
+    """Take steps for the size of a new value; return the value, with iterators as lists."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
@@ -148,7 +152,7 @@ def _refuse_large(name: str, size: int, most: int = MAX_LENGTH) -> None:
 
 
 def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
-    """Refuse a format whose result may be too large."""
+    """Raise SecurityError if the text of ``values`` in the format ``form`` may be too large."""
     if _WIDTH_AS_ARGUMENT.search(form):
         _refuse_large(name, MAX_LENGTH + 1)
     fields = form.count("%") + form.count("{")
@@ -157,7 +161,7 @@ def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
 
 
 def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
-    """Refuse a filter or a method of text whose result may be far larger than its arguments."""
+    """Raise SecurityError if a filter or method may give too large a result for its arguments."""
     subject, *others = values or ("",)
     if name in _PADDING or name in ("ljust", "rjust", "zfill"):
         numbers = [abs(each) for each in others if isinstance(each, int)]
@@ -182,7 +186,7 @@ def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
 
 
 def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a filter or test that takes steps and refuses what is too large."""
+    """Return a filter that takes steps too, and raises SecurityError for too large a result."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -202,7 +206,7 @@ def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _test(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a test that takes steps."""
+    """Return a test that also takes steps for the size of its arguments."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -239,7 +243,7 @@ def _concatenated(context: Context, parts: list[Any]) -> str:
 
 
 class _Counting(NodeTransformer):
-    """Makes a parsed template take steps for its loops, literals and comparisons."""
+    """Changes a parsed template so that its loops, literals and comparisons take steps."""
 
     def __init__(self, environment: Sandbox) -> None:
         self._environment = environment
@@ -299,12 +303,17 @@ def _is_text(node: nodes.Const) -> bool:
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox with a budget; templates must be used inside :func:`budget`."""
+    """Jinja's sandbox with a budget. Templates work only in a block of :func:`budget`."""
 
     intercepted_binops = frozenset({"+", "*", "**", "%"})
 
     def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
-        """Make a sandbox whose templates may use some of Jinja's filters, and ``filters``."""
+        """Create a sandbox.
+
+        Args:
+            filters: the filters that templates may use besides Jinja's filters in ``_FILTERS``.
+            options: the options of Jinja's environment.
+        """
         super().__init__(**options)
         written = self.finalize
         assert written is not None  # noqa: S101 - our own options
@@ -331,7 +340,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return found
 
     def concat(self, parts: Iterable[str]) -> str:
-        """Return the text of these parts if it is not too large."""
+        """Return the joined parts; raise SecurityError if the text is too long."""
         pieces, length = [], 0
         for part in parts:
             pieces.append(part)
@@ -341,7 +350,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return "".join(pieces)
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        """Return the result of an operator; refuse one that is too large."""
+        """Return the result of an operator; raise SecurityError if it would be too large."""
         if isinstance(left, int) and isinstance(right, int):
             bits = left.bit_length() * right if operator == "**" else left.bit_length()
             _refuse_large(
@@ -358,13 +367,17 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _kept(super().call_binop(context, operator, left, right))
 
     def getitem(self, obj: Any, argument: Any) -> Any:  # noqa: ANN401
-        """Return an item of a value."""
+        """Return an item of a value; a key that is a tuple takes steps for its size."""
         if isinstance(argument, tuple):
             _budget.get().take(_size(argument))
         return super().getitem(obj, argument)
 
     def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        """Return the result of a macro, function or method; refuse methods that are not listed."""
+        """Return the result of a macro, function or method.
+
+        Raises:
+            SecurityError: for a method of a built-in type that ``_METHODS`` does not list.
+        """
         steps = _budget.get()
         for value in (*args, *kwargs.values()):
             steps.take(_size(value, data=False))
@@ -379,7 +392,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _kept(super().call(__context, __obj, *args, **kwargs))
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        """Return ``str.format`` wrapped, so that it refuses a result that is too large."""
+        """Return a function that replaces ``str.format`` and refuses too large a result.
+
+        Return None if ``value`` is not a format method.
+        """
         wrapped = super().wrap_str_format(value)
         if wrapped is None:
             return None

@@ -1,4 +1,4 @@
-"""A check of new configuration: it is rendered for invented demands before a real one arrives."""
+"""A check of a new configuration: render it for invented demands before real ones arrive."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return appdef → its services for a trial demand on the first node, without overrides.
+    """Return appdef → the releases of its services for a trial demand, without overrides.
+
+    Each trial demand names the first suitable node (:func:`_trial_node`). Without a node in an
+    access domain there are no trials.
 
     Raises:
         Refused: if a service cannot be planned.
@@ -41,7 +44,10 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
 
 
 def _trial_node(appdef: str, config: Config) -> str:
-    """Return the first node on which all services of an appdef can run, else the first node."""
+    """Return the id of the first node that can run all services of an appdef.
+
+    Without such a node, return the id of the first node.
+    """
     services = config.services.get(appdef, {}).values()
     nodes = sorted(config.domain_of)
     fitting = (n for n in nodes if all(n in one.runs_at for one in services if one.nodes))
@@ -51,7 +57,7 @@ def _trial_node(appdef: str, config: Config) -> str:
 def _other_versions(
     config: Config, trials: Mapping[str, list[ServiceRelease]]
 ) -> Iterator[ServiceRelease]:
-    """Yield the services of a trial demand for each listed version that is not the default."""
+    """Yield the releases of a trial demand for each listed version except the default version."""
     plain = replace(config, overrides={})
     for name, listed in config.versions.items() if trials else ():
         node = _trial_node(name, config)
@@ -79,7 +85,7 @@ def _services(
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases that an override may select, with the override's effects."""
+    """Yield the trial releases that an override may select, with its effects except ``hold``."""
     for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(
@@ -94,12 +100,13 @@ def overridden_releases(
 def render_trial_demands(world: World, engine: Engine) -> None:
     """Render every service of every appdef once, with invented claims on a real node.
 
-    A service is rendered once for each version that ``registry/versions.yaml`` lists. This checks
-    an appdef before its first demand, without overrides and with each override that is
-    in effect. An override is at fault only if none of its appdefs renders with it.
+    A service is rendered for each version that ``registry/versions.yaml`` lists. This checks an
+    appdef before its first demand, both without overrides and with each override that is in effect.
+    An override counts as faulty only if no appdef that it applies to can be rendered with it.
 
     Raises:
-        Refused, InvalidInput: naming the template, the values or the override that does not work.
+        Refused, InvalidInput: if a service cannot be planned or rendered; it names the template,
+            the values or the override at fault.
     """
     config = world.config
     invented = trial_releases(config)

@@ -1,4 +1,7 @@
-"""A chart's ``values.schema.json``, compiled so that it reads no other file and never runs long."""
+"""Validators for a chart's ``values.schema.json``.
+
+A validator reads no other file. Schemas whose validation could take long are refused.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from demandops.quoting import quoted
 _MAX_WORK = 100_000
 _MAX_VISITS = 1_000_000
 _MAX_DEPTH = 100
-"""The greatest depth of values; strict YAML allows no deeper nesting."""
+"""The greatest depth of nested values, which is also the limit of strict YAML."""
 
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 _SAME_VALUE = ("allOf", "anyOf", "oneOf", "not", "if", "then", "else")
@@ -31,11 +34,11 @@ _TOO_MUCH = (
 
 @lru_cache(maxsize=256)
 def validator(text: str, file: str) -> Any:  # noqa: ANN401
-    """Return the validator of a schema.
+    """Return the validator for a schema, given the text and the path of its file.
 
     Raises:
-        InvalidInput: if ``text`` is no schema, refers to another document, or applies too many
-            schemas.
+        InvalidInput: if ``text`` is not a valid schema, refers to another document, or applies too
+            many schemas to a value.
     """
     schema: Any = None
     try:
@@ -65,7 +68,7 @@ def _refuse(uri: str) -> None:
 
 
 def _outside(schema: object, place: tuple[int | str, ...]) -> Iterator[tuple[Any, str]]:
-    """Yield place and target of each reference that does not start with ``#``."""
+    """Yield the place and the target of each reference to another document."""
     if isinstance(schema, dict):
         for key, part in schema.items():
             if key in _REFERENCES and isinstance(part, str) and not part.startswith("#"):
@@ -77,7 +80,10 @@ def _outside(schema: object, place: tuple[int | str, ...]) -> Iterator[tuple[Any
 
 
 class _Work:
-    """Computes how many schemas a validation may apply along one path into the values."""
+    """Computes an upper limit of the work of a validation.
+
+    The work is the number of schemas that the validation may apply along one path into the values.
+    """
 
     def __init__(self, document: object) -> None:
         self._document = document
@@ -87,16 +93,16 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return the highest number of schemas that a schema applies to values of this depth.
+        """Return the highest number of schemas that ``schema`` applies to values of this depth.
 
         Raises:
-            RecursionError: if a schema applies itself to the same value, or applies too many.
+            RecursionError: if a schema applies itself to the same value, or the number is too high.
         """
         if not isinstance(schema, dict) or depth < 0:
             return 1
         key = (id(schema), depth)
         if key not in self._known:
-            # too high while it is being counted, so that a schema that contains itself is found
+            # above the limit while it is computed, so that a schema that applies itself is refused
             self._known[key] = _MAX_WORK + 1
             self._known[key] = self._counted(schema, depth)
         work = self._known[key]
@@ -120,7 +126,10 @@ class _Work:
         )
 
     def _target(self, reference: object) -> object:
-        """Return the schema that a reference names; the whole document for an unknown name."""
+        """Return the schema that a reference names.
+
+        A path (``#/…``) to nothing gives None. An unknown anchor gives the whole document.
+        """
         found = self._anchors.get(str(reference), self._document)
         if not isinstance(reference, str) or not reference.startswith("#/"):
             return found

@@ -73,8 +73,9 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
 
     Args:
         plan: the application to write.
-        config: the configuration that it is added to.
-        library: path → text of the library chart, which is added if the state repo has none.
+        config: the configuration that the application is added to.
+        library: path → text of the library chart; the result contains these files too if the
+            state repo lacks the library chart.
 
     Raises:
         InvalidInput: if :func:`refuse_name` refuses the application's name.
@@ -98,7 +99,7 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with its inputs: role → where it comes from."""
+    """Yield each service with its inputs: role → an input of the application, or another output."""
     inputs = {role: role for role in plan.inputs}
     for service in plan.services:
         yield service, inputs
@@ -278,10 +279,10 @@ A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas
 
 
 def _requester(plan: ApplicationPlan, config: Config) -> str:
-    """Return who may demand the example, by the rules of its node's access domain.
+    """Return the requester of the example demand, whom the rules of the node's access domain allow.
 
-    If no rule allows the example, take the first rule, which a person must widen
-    (``closed_domain``).
+    If no rule allows the example, the requester is one of the first rule. A person must then extend
+    the rules (:func:`closed_domain`).
     """
     domain = config.domain_of.get(plan.node)
     rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
@@ -304,7 +305,10 @@ def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
 
 
 def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
-    """Return the example node's access domain if it has rules and none allows the application."""
+    """Return the access domain whose rules do not allow the example demand.
+
+    Return None if the rules allow it, or if there are no rules.
+    """
     domain = config.domain_of.get(plan.node)
     return domain if domain and domain.rules and not _rules_for(plan, config) else None
 

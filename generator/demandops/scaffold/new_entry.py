@@ -12,7 +12,7 @@ from demandops.scaffold.yaml_document import document
 
 
 def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
-    """Return path → text of a new node, and of its cluster if that is new."""
+    """Return path → text of a file for a new node, and of a file for its cluster if that is new."""
     if id in config.nodes:
         raise InvalidInput.at("ID", f"'{id}' is a node already; choose another id")
     path = f"inventory/nodes/{object_name('', id)}.yaml"
@@ -31,10 +31,13 @@ def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
 def access_domain(
     name: str, namespace: str, nodes: Iterable[str], requesters: Iterable[str], config: Config
 ) -> dict[str, str]:
-    """Return path → text of a new access domain. Without requesters all may demand everything.
+    """Return path → text of a file for a new access domain.
+
+    Only ``requesters`` may demand something in the domain. If there are none, everybody may demand
+    everything.
 
     Raises:
-        InvalidInput: a domain of this name exists, or a domain has every node.
+        InvalidInput: if a domain of this name exists, or another domain has all nodes (``*``).
     """
     if name in config.domains:
         raise InvalidInput.at("NAME", f"'{name}' is an access domain already; choose another name")
@@ -62,7 +65,7 @@ def override(
     effect: Mapping[str, Any],
     config: Config,
 ) -> dict[str, str]:
-    """Return path → text of a new override with one effect."""
+    """Return path → text of a file for a new override with one effect."""
     if name in config.overrides:
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
     path = f"overrides/{name}.yaml"

@@ -25,13 +25,13 @@ _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A
 
 
 def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str]) -> dict[str, str]:
-    """Return path → text of the files.
+    """Return path → text of the container file and the pipelines.
 
     Args:
         name: the image's name in the registry of the state repo.
         repository: the image's repository, with its host.
         state_repo: the URL of the state repo, without a password.
-        texts: the files of ``templates/scaffold/image``.
+        texts: name → text of the files in ``templates/scaffold/image``.
 
     Raises:
         InvalidInput: if ``name``, ``repository`` or ``state_repo`` has characters that the files

@@ -4,15 +4,15 @@
 | --- | --- | --- |
 | arrived | was submitted | waiting, done |
 | waiting | is in the journal and may be evaluated | committed, proposed, withdrawn, done |
-| committed | has a commit that may be published, so it gets an answer | committed, proposed, done |
+| committed | has a commit, and can no longer be withdrawn | committed, proposed, done |
 | proposed | awaits a person's approval | proposed, waiting, withdrawn, done |
 | withdrawn | was taken back, released or replaced | done |
 | done | is answered | |
 
-A method writes to the journal, then changes the state, then wakes the worker, all under one lock.
-So a committed demand can no longer be withdrawn. Any thread may submit or withdraw a demand. One
-thread journals the demands that arrive, even while the worker publishes others. Only the worker's
-thread makes the other changes.
+A method that changes a state holds one lock while it writes to the journal, changes the state and
+wakes the worker. So two threads cannot commit and withdraw a demand at the same time. Any thread
+may submit or withdraw a demand. A separate thread journals the demands that arrive, even while the
+worker publishes other demands. The worker's thread makes all other changes of state.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _NEXT: dict[State, tuple[State, ...]] = {
 class Demands:
     """The demands without an answer, and the journal.
 
-    ``blocked`` is why no demand can be published now, or empty; the text of a
-    :class:`QueueFull` includes it.
+    ``blocked`` is the reason why no demand can be published now; it is empty if demands can be
+    published. The text of a :class:`QueueFull` quotes this reason.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Demands:
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether the worker has work that must not wait for a fetch."""
+        """Whether the worker must interrupt a fetch: a demand waits, or the generator stops."""
         return self.has_waiting or self._closed
 
     # ---- waiting for demands ----
@@ -119,13 +119,17 @@ class Demands:
         self._arrival.set()
 
     def wake(self) -> None:
-        """End the worker's wait without a demand; any thread may call it."""
+        """End the worker's wait even if no demand has arrived; any thread may call this."""
         with self._changed:
             self._woken = True
             self._changed.notify()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait for a demand, :meth:`wake` or ``timeout``; return False if closed and none waits."""
+        """Wait until a demand arrives, :meth:`wake` or :meth:`close` is called, or time runs out.
+
+        Returns:
+            False if no demand waits and no further demand is accepted, else True.
+        """
         with self._changed:
             self._wait(timeout, self.must_not_wait)
             return self.has_waiting or not self._closed
@@ -136,7 +140,7 @@ class Demands:
         The list is empty if ``timeout`` seconds, a withdrawal or :meth:`wake` ended the wait.
 
         Raises:
-            Unsound: nobody knows what is in the journal.
+            Unsound: if a failed write left the journal in an unknown state.
         """
         with self._changed:
             self._wait(timeout, bool(self._new))
@@ -153,7 +157,7 @@ class Demands:
         """Journal the demands that arrived, and fill ``batch`` with up to ``limit`` demands.
 
         Raises:
-            Unsound: nobody knows what is in the journal.
+            Unsound: if a failed write left the journal in an unknown state.
         """
         self._take_in()
         with self._changed:
@@ -165,7 +169,7 @@ class Demands:
     # ---- changes of state ----
 
     def arrive(self, ticket: Ticket) -> None:
-        """Add a demand without waiting; :meth:`journal_arrivals` journals it."""
+        """Add a demand without blocking; the thread of :meth:`journal_arrivals` journals it."""
         ticket.state = "arrived"
         self._arrived.append(ticket)
         self._arrival.set()
@@ -175,7 +179,7 @@ class Demands:
     def journal_arrivals(self) -> None:
         """Journal demands as they arrive, until no more are accepted.
 
-        Demands that arrive during a sync share the next sync.
+        Demands that arrive during an fsync of the journal share the next fsync.
         """
         while not self._closed:
             self._arrival.wait()
@@ -218,7 +222,10 @@ class Demands:
             ticket.refuse(error)
 
     def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
-        """Return why a demand is not accepted, or None; ``others`` were accepted just before it."""
+        """Return the error for a demand that is not accepted, or None.
+
+        ``others`` is the number of demands that were accepted just before, but are not queued yet.
+        """
         if self._closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
         if others + len(self._waiting) >= self._limit:
@@ -234,14 +241,17 @@ class Demands:
         return None
 
     def commit(self, ticket: Ticket) -> bool:
-        """Refuse further withdrawals of a demand; return False if it is already withdrawn."""
+        """Mark a demand as committed; return False if it was withdrawn before.
+
+        A committed demand can no longer be withdrawn.
+        """
         with self._changed:
             return _change(ticket, "committed")
 
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
-        """Journal the proposal that a demand waits for; return False if the demand was withdrawn.
+        """Mark a demand as proposed and journal its proposal; return False if it was withdrawn.
 
-        A demand that awaits approval can still be withdrawn.
+        A proposed demand can still be withdrawn.
         """
         with self._changed:
             if not _may_become(ticket, "proposed"):
@@ -252,9 +262,9 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Put demands that no longer need approval back into the state waiting.
+        """Put demands that no longer need approval back into the state ``waiting``.
 
-        A person may have merged one of them meanwhile.
+        Each demand is marked as maybe published, because a person may have merged it meanwhile.
         """
         with self._changed:
             for ticket in tickets:
@@ -266,7 +276,10 @@ class Demands:
             self._changed.notify()
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return False if that is not possible any longer."""
+        """Withdraw a demand; return whether the demand is withdrawn now.
+
+        A demand that is unknown, committed or answered cannot be withdrawn.
+        """
         self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
@@ -289,20 +302,20 @@ class Demands:
 
     def _withdraw(self, ticket: Ticket, reason: str) -> None:
         if ticket.proposal is None:
-            # a restart must not resume it
+            # a restart must not resume the withdrawn demand
             self._journal.mark_done([ticket.operation], durably=True)
             self._taken_back.append(ticket)
-        else:  # it stays in the journal until its branch is deleted and nobody can merge it
+        else:  # the demand stays in the journal until its branch is deleted
             record = replace(ticket.proposal, withdrawn=reason)
             self._journal.append([ticket.journal_entry(record)])
             ticket.proposal = record
         _change(ticket, "withdrawn")
-        self.wake()  # the worker answers it even while nothing can be published
+        self.wake()  # the worker answers the demand even while nothing can be published
 
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
-        """Answer the demands that were withdrawn before a commit, and remove them from a batch.
+        """Answer the demands that were withdrawn while waiting, and remove them from the batch.
 
-        The demands of a proposal are answered after its branch is deleted.
+        Withdrawn demands of a proposal are not answered here, but after its branch is deleted.
         """
         with self._changed:
             withdrawn, self._taken_back = self._taken_back, []
@@ -315,19 +328,20 @@ class Demands:
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
     ) -> None:
-        """Answer each demand with its result and remove it from the journal, unless ``keep``.
+        """Answer each demand with its result; remove it from the journal unless ``keep`` is set.
 
-        A demand is answered once: a later result is dropped. A listener is notified of a refusal
-        before the journal forgets the demand, because after a crash no commit shows the refusal.
+        A demand is answered once: a later result is dropped. The listener of a refused demand is
+        notified before the journal forgets the demand. Otherwise a crash could lose the refusal,
+        because a refused demand has no commit.
 
         Raises:
-            Unsound: nobody knows what is in the journal; no demand is answered.
+            Unsound: if a failed write left the journal in an unknown state; no demand is answered.
         """
         results = list(results)
         for ticket, result in results if not keep else ():
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
-            if str(result) != TAKEN_BACK:  # the client itself took it back, so it knows
+            if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
                 ticket.notify("refused", reason_of(result))
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
@@ -345,9 +359,10 @@ class Demands:
                 ticket.future.set_exception(result)
 
     def _mark_done(self, results: list[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Remove demands from the journal, durably unless commits show all their outcomes.
+        """Remove demands from the journal.
 
-        Otherwise a refused demand could be decided again after a crash, and booked.
+        The removal is fsynced if the outcome of a demand is in no commit, for example a refusal.
+        Without the fsync, a crash could bring a refused demand back, and it could then be booked.
         """
         operations = [ticket.operation for ticket, _ in results]
         durably = any(
@@ -358,12 +373,12 @@ class Demands:
         )
         try:
             self._journal.mark_done(operations, durably=durably)
-        except StateRepoError as error:  # no room: the next write that succeeds makes it durable
+        except StateRepoError as error:  # the next successful write makes the removal durable
             log.error("a demand that was answered may be decided again after a crash: %s", error)
             self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand of a batch with an error; ``keep`` leaves them in the journal."""
+        """Answer every demand with ``error``; with ``keep``, the demands stay in the journal."""
         self.answer([(ticket, error) for ticket in batch], keep)
 
     def end(self, error: Unsound) -> None:
@@ -378,7 +393,7 @@ class Demands:
         self._waiting.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
-        """Stop counting a demand towards its requester's limit; it is answered or proposed now."""
+        """Stop counting a demand towards its requester's limit, once it is answered or proposed."""
         if ticket.proposal is None:
             self._of_requester -= Counter([requester_of(ticket.goal)])
 
@@ -388,7 +403,7 @@ def _may_become(ticket: Ticket, state: State) -> bool:
 
 
 def _change(ticket: Ticket, state: State) -> bool:
-    """Change a demand's state; return False if the new state may not follow the current one."""
+    """Change a demand's state, or return False if ``state`` may not follow the current state."""
     if _may_become(ticket, state):
         ticket.state = state
     return ticket.state == state

@@ -43,10 +43,11 @@ class Evaluator:
         """Decide a demand, commit it on the commit batch and return its result.
 
         Returns:
-            The demand's receipt or error; if it needs approval, the decision, not committed.
+            The demand's receipt or its error. If the demand needs approval, its decision, without
+            a commit.
 
         Raises:
-            Unavailable, PushDenied, Unsound: nothing can be written now.
+            Unavailable, PushDenied, Unsound: if the state repo cannot be written now.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
@@ -78,12 +79,12 @@ class Evaluator:
                 commit = commits.commit(decision, ticket.operation, ticket.received, now)
                 ticket.notify("committed", f"committed {commit}")
             else:
-                waits = decision.outcome == "waiting"  # it waited already
+                waits = decision.outcome == "waiting"  # the demand waited already
                 commits.note_settled(ticket.operation, "waiting" if waits else "unchanged")
                 commit = str(commits.head.commit)
             return receipt_of(ticket, decision, commit, targets)
         except InvalidInput as error:
-            if ticket.has_released:  # it released a proposal, which had no claims yet
+            if ticket.has_released:  # the demand released a proposal, which had no claims yet
                 commits.note_settled(ticket.operation, "released")
                 commit = str(commits.head.commit)
                 return Receipt(ticket.operation, ticket.name, "released", commit)
@@ -99,16 +100,16 @@ class Evaluator:
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of demands that are already published at ``tip``, oldest first.
+        """Return the results of the batch's demands that ``tip`` has already, oldest first.
 
-        These demands were not answered, because the connection or the process ended after the
-        remote accepted the push, or because a sync failed. So the commits since their oldest base
-        are written again, durably.
+        An earlier attempt pushed these demands but did not answer them: the connection or the
+        process ended after the remote accepted the push, or an fsync failed. This method writes
+        and fsyncs the commits since the oldest base of these demands again.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
         found = [(base, operations_since(self._repository.objects, tip, base)) for base in bases]
-        # all bases are ancestors of the tip, so the oldest one's outcomes include the others'
+        # all bases are ancestors of the tip, so the oldest base has the outcomes of all others
         since, recorded = max(found, key=lambda each: len(each[1]), default=("", {}))
         published = [operation for operation in reversed(recorded) if operation in sought]
         if published:

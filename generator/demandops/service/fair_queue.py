@@ -1,10 +1,10 @@
 """The queue of waiting demands: requesters take turns, and related demands keep their order.
 
-A demand counts for its first requester. Demands that share an application, a connection or a demand
-id keep their order. So do goals of the reference's action that share a requester: whether a
-shutdown repeats another depends on what was joined in between. If the next demand must follow
-another demand, the queue returns that demand first. A rollback or a decommission may touch
-anything: nothing overtakes it, and it overtakes nothing.
+A demand takes the turn of its first requester. Demands that share an application, a connection or
+a demand id keep their order. Goals of the reference's action that share a requester also keep their
+order, because a join between two equal shutdowns gives the second one an effect. If the next demand
+must follow another demand, the queue returns the other demand first. A rollback or a decommission
+may touch any subject: no demand overtakes it, and it overtakes no demand.
 """
 
 from __future__ import annotations
@@ -22,7 +22,11 @@ _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
 
 @dataclass(eq=False)
 class _Place:
-    """The place of a demand in the queue; ``subjects`` is None if it may touch anything."""
+    """The place of a demand in the queue.
+
+    ``number`` counts the arrivals. ``subjects`` is None if the demand may touch any subject.
+    ``is_left``: the demand has left the queue.
+    """
 
     number: int
     ticket: Ticket
@@ -31,7 +35,10 @@ class _Place:
 
 
 class FairQueue:
-    """Demands that wait; not thread-safe. With ``in_order`` all keep their order."""
+    """A queue of waiting demands; not thread-safe.
+
+    With ``in_order`` the demands leave in the order of their arrival, without turns.
+    """
 
     def __init__(self, *, in_order: bool = False) -> None:
         self._in_order = in_order
@@ -86,7 +93,7 @@ class FairQueue:
             first = before
 
     def _before(self, place: _Place) -> _Place | None:
-        """Return another demand that must be taken before the one at ``place``, or None."""
+        """Return the place of a demand that must leave the queue before ``place``, or None."""
         barrier = _next_in(self._barriers)
         if barrier is not None and barrier.number < place.number:
             return barrier
@@ -100,7 +107,7 @@ class FairQueue:
         return None
 
     def _forget(self, place: _Place) -> None:
-        """Forget those subjects of a removed demand that no other demand has."""
+        """Forget the subjects of a removed demand, except those that a waiting demand touches."""
         for subject in place.subjects or ():
             if _next_in(self._subjects[subject]) is None:
                 del self._subjects[subject]
@@ -113,7 +120,7 @@ def _next_in(places: deque[_Place]) -> _Place | None:
 
 
 def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
-    """Return the first requester in a goal, which may be invalid, or an empty text."""
+    """Return the first requester of a goal, even of an invalid one; empty if there is none."""
     fields = goal if isinstance(goal, dict) else {}
     own = fields.get("requesters")
     names = own if isinstance(own, list) else _requesters(fields)
@@ -129,7 +136,7 @@ def _requesters(goal: dict[str, Any]) -> Iterator[Any]:
 
 
 def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401 - plain data
-    """Return the subjects that a goal, even an invalid one, touches; None if it may touch any."""
+    """Return the subjects that a goal, even an invalid one, touches; None means any subject."""
     if not isinstance(goal, dict) or _ORDINARY.isdisjoint(goal):
         return None
     headers = (app.get("header") for app in _items(goal, "apps"))

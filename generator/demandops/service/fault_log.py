@@ -32,7 +32,7 @@ class FaultLog:
         self._logged = frozenset(current)
 
     def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        """Warn if people list signing keys and this generator has none."""
+        """Warn once if the state repo lists allowed signing keys and this generator has no key."""
         if self._repository.signer is not None or self._warned_of_signers:
             return
         if allowed_signers.are_listed(self._repository.objects, snapshot.commit):

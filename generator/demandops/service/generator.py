@@ -30,7 +30,10 @@ log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
 _LAST_S = 5.0
-"""How long to wait for the worker to end after the timeout; git and ssh-keygen end sooner."""
+"""The seconds that a stop still waits for the worker after the timeout of the stop.
+
+A running call of git or ssh-keygen ends sooner.
+"""
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
@@ -57,12 +60,12 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many demands of one requester may be queued; None, for a single
-                client: any number, and all demands keep their order.
+            requester_limit: how many demands of one requester may be queued. None is for a single
+                client: there is no limit, and all demands keep their order.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
-            fetch_interval: seconds between two fetches while no demand comes; 0: never, except
-                that a repository on this disk is checked every minute.
+            fetch_interval: seconds between two fetches while no demand arrives. 0 means no fetches
+                at an interval; a repository on this disk is still checked every minute.
             signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
             progress: called with (files read, files in all) while the ledger is loaded.
             runtime: provides the time and the threads.
@@ -146,11 +149,14 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Failed thread → the reason, until it recovers; any thread may read this."""
+        """The reason for each failed thread by its name, until the thread recovers.
+
+        Any thread may read this.
+        """
         return self._runtime.failures
 
     def fetch_now(self) -> None:
-        """Fetch from the state repo now, because a push was reported; any thread may call it."""
+        """Make a fetch due now, because a Git server reported a push; any thread may call this."""
         self._worker.fetch_now()
 
     def submit(
@@ -167,9 +173,9 @@ class Generator:
             listener: called with each stage and its text, in the worker thread.
 
         Returns:
-            A ticket whose future returns the :class:`Receipt`, or raises ``Refused`` with every
-            fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``; ``ShuttingDown`` or
-            ``QueueFull`` if the demand is not accepted at all.
+            A ticket whose future returns the :class:`Receipt` or raises the demand's error:
+            ``Refused`` with every fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``. If
+            the demand is not accepted at all, the future raises ``ShuttingDown`` or ``QueueFull``.
 
         Raises:
             ValueError: for an operation id that a commit trailer cannot carry.
@@ -190,7 +196,7 @@ class Generator:
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or descends from it; any thread may call this."""
+        """Return whether ``commit`` is or descends from ``other``; any thread may call this."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
@@ -198,21 +204,21 @@ class Generator:
         return self._repository.unchanged(commit, other, path)
 
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
-        """Return the newest published commit and the paths that changed since another.
+        """Return the newest published commit, and the paths that changed from ``since`` to it.
 
-        The paths are None if the other commit is unknown. Any thread may call it.
+        The paths are None if the commit ``since`` is unknown. Any thread may call this.
         """
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return False if it is committed or unknown."""
+        """Withdraw a demand; return False if it is unknown, committed or answered."""
         return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
-        """Call ``listener`` in the worker thread after every publication.
+        """Register a listener that the worker thread calls whenever the published state changes.
 
-        The listener gets the configuration in effect and must return at once.
+        The listener gets the configuration in effect, and must return at once.
         """
         self._worker.listeners.append(listener)
 
@@ -224,7 +230,8 @@ class Generator:
                 journal for the next start, and their futures raise ``ShuttingDown``.
 
         Returns:
-            A future that returns, once the worker has ended, whether everything was published.
+            A future that returns whether everything was published. It is ready once the worker has
+            ended, or :data:`_LAST_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:
@@ -239,7 +246,7 @@ class Generator:
         if self._thread.is_alive():
             self._worker.end_soon()
             self._thread.join(_LAST_S)
-        if self._thread.is_alive():  # it may hold every lock
+        if self._thread.is_alive():  # the worker may still hold locks
             log.error("the generator did not end; its demands stay in the journal")
             finished.set_result(False)
             return

@@ -1,4 +1,4 @@
-"""The socket of a server: bound to an address that an operator wrote."""
+"""Opens the listening socket of a server, at an address that an operator configured."""
 
 from __future__ import annotations
 

@@ -114,7 +114,10 @@ class PushWebhook:
         return any(signed) or token
 
     def _warn(self, sender: str) -> None:
-        """Log a warning at most once a minute, because anyone may send requests."""
+        """Log that a notification is not signed, at most once a minute.
+
+        Anyone may send requests, so each of them must not fill the log.
+        """
         if REAL.monotonic() - self._warned > _WARN_EVERY_S:
             self._warned = REAL.monotonic()
             log.warning(
@@ -125,7 +128,7 @@ class PushWebhook:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is cut off after some seconds, or at once if too many are open."""
+    """A connection that the server cuts off after some seconds, or at once if it has too many."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)

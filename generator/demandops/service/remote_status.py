@@ -15,8 +15,9 @@ log = logging.getLogger("demandops")
 class RemoteStatus:
     """Whether the remote can be reached.
 
-    ``unreachable`` is why the remote cannot be read or written now, or empty; ``push_denied`` is
-    why it rejected the last push, or empty.
+    ``unreachable`` is the reason why the remote cannot be read or written now; it is empty if the
+    remote can be reached. ``push_denied`` is the reason why the remote rejected the last push; it
+    is empty if the remote accepted that push.
     """
 
     unreachable: str = ""

@@ -1,8 +1,8 @@
 """A rollback as a goal: plain data that passes through queue and journal like a demand.
 
 Only the command line makes this goal; actions and request files cannot contain it. The goal is
-evaluated on the newest tip, so a rollback works while others write. Claims booked meanwhile count
-as newer.
+evaluated on the newest tip, so a rollback works while others write. A claim that is booked before
+this evaluation is newer than the commit to roll back to, like any other later claim.
 """
 
 from __future__ import annotations
@@ -20,7 +20,14 @@ _KIND = "Rollback"
 
 
 def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
-    """Return the goal to roll back to a commit; ``who`` is the person's name and e-mail."""
+    """Return the goal to roll back to the commit ``to``.
+
+    Args:
+        to: the commit whose claims are booked again.
+        drop_newer: whether the rollback may undo newer claims; if not, newer claims are a fault.
+        reason: why the person rolls back.
+        who: the person's name and e-mail address.
+    """
     return {
         "apiVersion": API_VERSION,
         "kind": _KIND,
@@ -39,11 +46,11 @@ def is_rollback(goal: object) -> bool:
 def to_restoration(
     goal: dict[str, Any], repository: StateRepository, head: Snapshot
 ) -> Restoration:
-    """Return the request of a rollback goal.
+    """Return the restoration that a rollback goal requests.
 
     Raises:
-        Refused: if its commit is not in the history of the state repo.
-        InvalidInput: if that commit's ledger is not valid.
+        Refused: if the commit to roll back to is not in the history of ``head``.
+        InvalidInput: if the ledger of that commit is not valid.
     """
     to = str(goal["to"])
     if not repository.includes(str(head.commit), to):

@@ -17,9 +17,10 @@ from demandops.render.gitops.paths import domains_in_use
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
-    """Return the releases that a demand needs, and those that it changes or removes.
+    """Return the targets of the releases that a demand needs, changes or removes.
 
-    Releases that only other demands on the same subjects need are left out.
+    A release that only other demands need is left out, even if those demands share a subject with
+    this demand.
     """
     after, request = decision.state, decision.request
     active = without_suspended(after)
@@ -52,13 +53,16 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
 
 
 def domains_of_state(state: State) -> list[ClusterDomain]:
-    """Return every access domain on each cluster, also those without releases."""
+    """Return every access domain of each cluster, including domains without releases."""
     settings = state.config.repo_settings
     return [place_of(cluster, domain, settings) for cluster, domain in domains_in_use(state.config)]
 
 
 def place_of(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
-    """Return an access domain on a cluster, with the object that applies its folder."""
+    """Return an access domain on a cluster.
+
+    With Argo CD, the result names the Application that applies the folder of the domain.
+    """
     application = None
     if repository.gitops == "argocd" and repository.argocd:
         application = ObjectName(repository.argocd.namespace, project_of(domain, repository))
@@ -66,6 +70,6 @@ def place_of(cluster: str, domain: AccessDomain, repository: RepoSettings) -> Cl
 
 
 def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True) -> Target:
-    """Return the target of a release: what its cluster should run, or should no longer run."""
+    """Return the target of a release; ``wanted`` says whether its cluster should run it."""
     place = place_of(release.node.cluster, release.domain, repository)
     return Target(place, release.name, isinstance(release, ServiceRelease), wanted)

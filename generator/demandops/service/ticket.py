@@ -59,12 +59,13 @@ class Receipt:
 class Ticket:
     """A demand under way. ``future`` returns its receipt or raises its error.
 
-    ``journaled`` returns whether the demand is in the journal, so that a crash does not lose it. It
-    returns False if the demand was refused before; then ``future`` raises the reason.
+    ``journaled`` returns True as soon as the journal has the demand; from then on, a crash does not
+    lose the demand. ``journaled`` returns False if the demand is refused before that; ``future``
+    then raises the reason.
 
     ``base`` is the tip that was known when the demand arrived. ``maybe_published``: the remote may
     have accepted a push of the demand although no answer arrived. ``has_released``: the demand
-    released another that awaited approval; then there may be no claims to release.
+    released another demand that awaited approval, so there may be no claims to release.
     """
 
     operation: str
@@ -85,21 +86,21 @@ class Ticket:
 
     @property
     def name(self) -> str:
-        """The id in the goal, even if the goal is not valid."""
+        """The id in the goal, even in an invalid one; empty if the goal has no id."""
         fields = self.goal if isinstance(self.goal, dict) else {}
         keys = ("id", "request", "demand", "name")
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
 
     def refuse(self, error: DemandOpsError) -> None:
-        """Answer a demand with an error before it is journaled."""
+        """Answer the demand with an error; only for a demand that is not in the journal yet."""
         self.state = "done"
         self.future.set_exception(error)
         self.journaled.set_result(False)
 
     def notify(self, stage: Stage, text: str) -> None:
-        """Report each stage once, even if the demand is evaluated again.
+        """Report a stage to the listener, but only once, even if the demand is evaluated again.
 
-        A proposal's text is reported each time it changes.
+        The stage ``proposed`` is reported again whenever its text changes.
         """
         key = text if stage == "proposed" else stage
         if key in self.notified:
@@ -145,7 +146,10 @@ def reason_of(error: DemandOpsError) -> str:
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket for a demand that an earlier run left in the journal; log its stages."""
+    """Return a ticket for a demand that an earlier run left in the journal.
+
+    The listener of the ticket logs the last stages of the demand.
+    """
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
 

@@ -36,7 +36,7 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 log = logging.getLogger("demandops")
 
 _TIDY_EVERY = 50
-"""How many new packs to collect before joining them; each publication or fetch adds one."""
+"""How many new Git packs to collect before git joins them; each publication or fetch adds one."""
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
 _NAME = "writer"
@@ -45,8 +45,8 @@ _NAME = "writer"
 class Worker:
     """Follows the state repo and turns batches of demands into published commits.
 
-    Any thread may read ``snapshot``, the newest published state, and ``remote``. It calls the
-    ``listeners`` with the configuration in effect after every publication.
+    Any thread may read ``snapshot``, the newest published state, and ``remote``. The worker calls
+    the ``listeners`` with the configuration in effect whenever the published state changes.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Worker:
     # ---- the loop ----
 
     def run(self) -> None:
-        """Publish demands until no more are accepted and none waits."""
+        """Publish demands, until no further demand is accepted and no demand waits."""
         # people may have decided proposals before the start; a stop must not skip these answers
         if self._demands.proposed:
             self._work()
@@ -103,7 +103,10 @@ class Worker:
         self._approvals.suspend()
 
     def _work(self) -> None:
-        """Publish waiting demands; if none waits, follow the state repo; then check proposals."""
+        """Publish waiting demands; if no demand waits, follow the state repo.
+
+        Check the proposals afterwards.
+        """
         batch: list[Ticket] = []
         try:
             self._demands.take(batch, self._batch_limit)
@@ -126,10 +129,10 @@ class Worker:
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
-        """Answer a batch with an error; without a batch, do not follow the state repo for a while.
+        """Answer a batch with an error; if the batch is empty, pause following the state repo.
 
         Raises:
-            Unsound: the process must end, and nobody is answered.
+            Unsound: if ``error`` is this error; the process must end, and the journal is kept.
         """
         if isinstance(error, Unsound):
             self._demands.end(error)
@@ -137,7 +140,7 @@ class Worker:
         if isinstance(error, ShuttingDown):
             self._demands.fail(batch, error, keep=True)
             return
-        # the demands' answers contain an expected error, so only others are recorded
+        # an expected error is in the answers to the demands, so only other errors are recorded
         if not batch or not isinstance(error, DemandOpsError):
             self._runtime.failed(_NAME, error)
         if not batch:
@@ -173,9 +176,9 @@ class Worker:
     # ---- publishing demands ----
 
     def _publish(self, batch: list[Ticket]) -> None:
-        """Publish a batch, with the demands that arrive during retries, and end leases.
+        """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        Afterwards the batch is empty.
+        The batch is empty afterwards.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -209,7 +212,7 @@ class Worker:
         """Raise an error if :meth:`end_soon` was called.
 
         Raises:
-            ShuttingDown: says that the demand is resumed.
+            ShuttingDown: the message says that the next start resumes the demand.
         """
         if self._ends_soon.is_set():
             reason = self._demands.blocked or "the generator stops"
@@ -267,20 +270,23 @@ class Worker:
         )
 
     def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
-        """Return the result of a demand; if it frees room, book demands that wait for room."""
+        """Evaluate a demand and return its result; if this frees room, book waiting demands."""
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         self._own_work.follow(commits, before)
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return tickets that end leases; none while a demand waits, because it may renew one."""
+        """Return a ticket for each demand whose lease has ended.
+
+        Return no ticket while a demand waits, because that demand may renew a lease.
+        """
         if self._rest or self._demands.has_waiting:
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
-        """Publish a commit batch and answer; return False if another writer was first.
+        """Publish a commit batch and answer its demands; return False if another writer was first.
 
         If the remote rejects the push for another reason, that is the answer to each demand with a
         commit, and to each demand that was decided on top of such a commit.
@@ -309,7 +315,10 @@ class Worker:
         return True
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Wait; meanwhile report to new demands why they wait."""
+        """Wait for ``seconds``; meanwhile answer withdrawn demands.
+
+        If the remote cannot be reached, report the reason to the batch and to new demands.
+        """
         end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._ends_soon.is_set():
@@ -325,9 +334,9 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out the commits of others, and do what is due.
+        """Fetch if a fetch is due, carry out the commits of others, and do own work that is due.
 
-        The end of an override, a drain, a scale-down or a waiting demand can be due. The worker
+        Own work is the end of an override, a drain, a scale-down or a waiting demand. The worker
         reads a repository on this disk each time, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
@@ -345,7 +354,7 @@ class Worker:
             self._own_work.postpone()
 
     def _check_proposals(self) -> None:
-        """Check the demands that await approval against the newest main, if a check is due."""
+        """Check the demands that await approval on the newest main, if a check is due."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:
@@ -366,9 +375,9 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's fetched changes; return whether there were any.
+        """Publish the effects of people's changes; return whether this published a commit.
 
-        It does not fetch first.
+        The changes are fetched already. Fetch again only if another writer was first.
         """
         for _ in range(_TRIES):
             commits = self._new_commit_batch()
@@ -380,7 +389,10 @@ class Worker:
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:
-        """Return a commit batch on the newest known tip, which carries out people's changes."""
+        """Return a commit batch on the newest known tip.
+
+        The batch starts with the effects of people's changes and with own work that is due.
+        """
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems:

@@ -38,7 +38,8 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         gitops: the GitOps controller, ``flux`` or ``argocd``.
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
-        schemas: name → JSON Schema of a kind of file that people write, for ``schemas/``.
+        schemas: name → JSON Schema of a kind of file that people write; for the folder
+            ``schemas/``.
         signer: signs the first commit.
 
     Raises:

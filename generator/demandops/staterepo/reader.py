@@ -42,13 +42,17 @@ class Reader:
     """An open state repo at its newest commit; a checkout is read at its checked-out commit."""
 
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
-        """Read from ``repository`` at ``tip``; ``slot`` is the slot of a clone."""
+        """Read from ``repository`` at ``tip``; ``slot`` has the clone, if the repo has a URL."""
         self.repository, self._tip, self._slot = repository, tip, slot
         self._objects = repository.objects
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        """Return a reader of the state repo at an address; the clone of a URL is kept."""
+        """Return a reader of the state repo at an address.
+
+        A URL is cloned, and the clone stays on the disk for later readers. ``only_read`` also
+        allows the folder of a checkout.
+        """
         slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         try:
             repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
@@ -59,7 +63,7 @@ class Reader:
             raise
 
     def close(self) -> None:
-        """Release the clone."""
+        """Release the clone of a URL, so that another process may use it."""
         if self._slot is not None:
             self._slot.close()
 
@@ -93,7 +97,10 @@ class Reader:
         last_valid_config.refuse_other_render_version(self._tree())
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the commit of a revision or a time, by default the newest, or raise."""
+        """Return the id of the commit that a revision or a time names, by default the newest.
+
+        Raises StateRepoError if there is no such commit.
+        """
         if not revision:
             return str(self._tip)
         return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
@@ -121,7 +128,10 @@ class Reader:
             return state_in_effect.state_at(self._objects, revision, progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        """Return :meth:`last_valid_snapshot` of the newest commit, read from ``before`` on."""
+        """Return :meth:`last_valid_snapshot` of the newest commit.
+
+        ``before`` is an earlier snapshot. If possible, only what changed since then is read.
+        """
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
@@ -137,14 +147,17 @@ class Reader:
         )
 
     def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
-        """Return the problems reported at a commit, else the problems found by loading it."""
+        """Return the problems that the generator reports at a snapshot's commit.
+
+        If it reports none, return the problems that were found when the snapshot was loaded.
+        """
         return self.problems(str(snapshot.commit)) or snapshot.problems
 
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
         """Return the generated files that a generator has yet to write or remove.
 
-        There can be such files only after a commit by a person. Files that cannot be rendered do
-        not count: they are problems.
+        There can be such files only after a commit by a person. If the state cannot be rendered,
+        the set is empty.
         """
         commit = trees.commit_of(self._objects, snapshot.commit)
         if commit_log.is_by_generator(self._objects, commit):
@@ -163,7 +176,7 @@ class Reader:
         return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        """Return a function that returns the text of a file at a commit."""
+        """Return a function from a path to the file's text at a commit, or None."""
         tree = self._tree(revision)
         return lambda path: trees.read_text(tree, path)
 
@@ -172,9 +185,10 @@ class Reader:
         return last_valid_config.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
-        """Yield commits newest first: all, those up to ``REV``, or those of ``A..B``.
+        """Yield commits, newest first.
 
-        With ``path``, yield only the commits that changed this file or folder.
+        ``spec`` is ``REV`` for the commits up to REV, ``A..B`` for those after A up to B, or None
+        for all. With ``path``, yield only the commits that changed this file or folder.
         """
         since, until = self._sides(spec or "")
         if path is not None:
@@ -183,7 +197,11 @@ class Reader:
         return (entry for _, entry in commit_log.commits(self._objects, until, since))
 
     def revisions(self, spec: str | None) -> list[str]:
-        """Return the commits that ``REV`` or ``A..B`` names, oldest first, or raise."""
+        """Return the ids of the commits that ``spec`` names, oldest first.
+
+        ``spec`` is ``REV`` for one commit, ``A..B`` for the commits after A up to B, or None for
+        the newest commit. Raises StateRepoError if there is no such commit.
+        """
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
@@ -206,9 +224,10 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on each commit, oldest first: on its files and its signature.
+        """Return a verdict on the files and the signature of each of ``commits``.
 
-        With ``whole``, each commit is proven whole, not by its differences from an earlier commit.
+        ``commits`` are listed oldest first. With ``whole``, each commit is verified whole, and none
+        by its differences from an earlier commit.
         """
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
@@ -221,7 +240,7 @@ class Reader:
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release, or of the last stopped release with this name."""
+        """Return the path of the release ``name``, or of the last stopped one, or None."""
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
@@ -252,7 +271,10 @@ class Reader:
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
-        """Return the commits by people that a follow commit renders, newest first."""
+        """Return the newest ``most`` commits by people that a follow commit renders, newest first.
+
+        If ``entry`` is not a follow commit, return an empty list.
+        """
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
             return []
@@ -260,7 +282,7 @@ class Reader:
         return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
     def restoration(self, to: str, **more: object) -> Restoration:
-        """Return the request to roll back to a commit."""
+        """Return the request to roll back to a commit; ``more`` has further fields."""
         return ledger_files.restoration(self._objects, to, **more)
 
     def operator(self) -> Person:
@@ -270,7 +292,10 @@ class Reader:
 
 @contextmanager
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
-    """Yield an open state repo, and close it at the end; ``only_read`` also allows a checkout."""
+    """Yield a reader of the state repo at an address, and close it after the block.
+
+    ``only_read`` also allows the folder of a checkout.
+    """
     try:
         with closing(Reader.of(address, only_read=only_read)) as reader:
             yield reader
@@ -280,7 +305,7 @@ def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
 
 @contextmanager
 def opened_offline(address: str) -> Iterator[Reader | None]:
-    """Yield an open state repo without the network; None if its URL was never fetched."""
+    """Yield a reader that does not use the network, or None if the URL was never cloned."""
     if not is_url(address):
         with opened(address) as found:
             yield found

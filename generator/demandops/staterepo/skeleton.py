@@ -51,13 +51,16 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 
 def files_of_library(folder: str) -> dict[str, str]:
-    """Return path → text of a chart in the skeleton on which other charts depend."""
+    """Return path → text of the library chart in a folder of a new state repo.
+
+    Other charts depend on a library chart.
+    """
     appdefs = _read(data_folder("appdefs"), "appdefs/")
     return {path: text for path, text in appdefs.items() if path.startswith(f"{folder}/")}
 
 
 def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
-    """Return the skeleton with an empty fleet, without the experiment's application."""
+    """Return the skeleton, but with an empty fleet and without the experiment's application."""
     found = {
         path: _ENTRIES.sub(r"\1: []\n", text).replace("charts: []", "charts: {}")
         if path.startswith(("inventory/", "registry/charts"))

@@ -1,8 +1,8 @@
 """``demandops upgrade``: one commit that renders everything again with this program's version.
 
-The state repo changes to another render version or GitOps controller at once, so two versions never
-undo each other's files. The commit is published like any other: on top of the current tip, made
-again if the tip moves, and never forced.
+The state repo changes to another render version or GitOps controller in this one commit, so two
+versions never undo each other's files. The commit is published like any other: on top of the
+current tip, made again if the tip moves, and never with a forced push.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ _FOLDER_DEPTH = 3
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """The GitOps controller to change to and its URL; None keeps the current value."""
+    """The GitOps controller to change to, and the URL from which it fetches the state repo.
+
+    None keeps the current value.
+    """
 
     gitops: str | None = None
     url: str | None = None
@@ -58,7 +61,10 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """The files that an upgrade changes; ``commit`` is its commit, or the tip if it made none."""
+    """The files that an upgrade changes, and the configuration before and after it.
+
+    ``commit`` is the commit of the upgrade. If the upgrade made no commit, it is the tip.
+    """
 
     commit: str
     old: Config
@@ -67,7 +73,7 @@ class Upgrade:
 
     @property
     def handover(self) -> SwitchSteps:
-        """The steps on the clusters before and after the upgrade."""
+        """The steps that an administrator takes on the clusters before and after the upgrade."""
         return switch_steps(self.old, self.new, self.files)
 
 
@@ -87,7 +93,7 @@ def plan(
     now: datetime,
     progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return the files that an upgrade would change, without writing.
+    """Return the files that an upgrade would change; write nothing.
 
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
@@ -104,7 +110,7 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again, publish the differences as one commit, and return them.
+    """Render everything again, publish the files that change as one commit, and return the result.
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.
@@ -175,7 +181,7 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return the ledger files that this program writes differently, path → text."""
+    """Return path → new text of the ledger files whose text this program writes differently."""
     written = {}
     for path, text in files.items():
         new = text
@@ -190,7 +196,10 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
 
 
 def _refuse_held(state: State) -> None:
-    """Raise if an override holds a file that is rendered for the other controller."""
+    """Raise InvalidInput if an override holds the file of a release.
+
+    The file would stay as it is, rendered for the old controller.
+    """
     faults = [
         fault(
             "hold",

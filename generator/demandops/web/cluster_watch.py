@@ -1,4 +1,4 @@
-"""Watches the releases on their clusters, and records when a release's state changes."""
+"""Watches the releases on their clusters, and records each change of a release's health."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ _KEPT = 2_000
 
 
 class ClusterWatch:
-    """The watched clusters; all methods but :attr:`changes` belong to one thread."""
+    """Watches the health of releases on clusters.
+
+    One thread calls all methods. Any thread may read :attr:`changes`.
+    """
 
     def __init__(
         self,
@@ -53,7 +56,7 @@ class ClusterWatch:
     def statuses(
         self, targets: Iterable[Target], commit: str, repository: StateRepository
     ) -> dict[str, ReleaseStatus]:
-        """Return the status of each release, by name; also watch releases that are new."""
+        """Return release name → status; also start to watch the places of new releases."""
         wanted = list(targets)
         self._watch(target.domain for target in wanted)
         found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)
@@ -64,7 +67,10 @@ class ClusterWatch:
     def old_bootstraps(
         self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
     ) -> tuple[OldBootstrap, ...]:
-        """Return the clusters without the current bootstrap file; ``read`` reads the state repo."""
+        """Return the clusters whose bootstrap file is not applied as it is now.
+
+        ``read`` returns the text of a file of the state repo.
+        """
         self._watch(domains)
         return tuple(old_bootstraps(domains, self._caches, read))
 

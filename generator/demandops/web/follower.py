@@ -1,6 +1,7 @@
 """Follows the state repo: the newest situation, any earlier one, and the history.
 
-One thread fetches new commits and publishes each new situation; the threads of requests read it.
+One thread fetches new commits and publishes each new situation. The threads that answer requests
+read the published situation.
 """
 
 from __future__ import annotations
@@ -28,17 +29,20 @@ from demandops.web.situation import Commit, HealthChange, Moment, Situation
 log = logging.getLogger("demandops")
 
 MOST_COMMITS = 5_000
-"""How many commits of the history the page knows; older ones are left out."""
+"""How many of the newest commits the page keeps; it leaves older commits out."""
 
 _LOOK_S = 0.2
-"""The pause between checks of a repository on this disk; a check reads one file."""
+"""The pause in seconds between checks of a local repository; each check reads one file."""
 _MOST_OF_TIME = 4
-"""The follower's pause as a multiple of its last work, so that it uses little processor time."""
+"""After a new situation, the follower pauses this many times as long as its computation took.
+
+So the follower uses little processor time. A pause lasts at most one second.
+"""
 _MOST_MOMENTS = 8
 
 
 class Follower:
-    """The newest situation of a state repo, and earlier ones."""
+    """Provides the newest situation of a state repo, and situations at earlier commits."""
 
     def __init__(
         self,
@@ -52,9 +56,9 @@ class Follower:
         """Read the newest state and follow the state repo.
 
         Args:
-            reader: the open state repo; belongs to the follower from now on.
-            clusters: how to reach the clusters; one without a kubeconfig is not watched.
-            interval: seconds between two fetches of a remote; 0: only after :meth:`wake`.
+            reader: the open state repo; :meth:`close` of the follower closes it.
+            clusters: how to reach the clusters; a cluster without a kubeconfig is not watched.
+            interval: seconds between fetches from a remote; 0 fetches only after :meth:`wake`.
             progress: called while the ledger is loaded.
             runtime: provides the time and the threads.
 
@@ -68,31 +72,33 @@ class Follower:
         self._moments: dict[str, Moment] = {}
         self._loading = runtime.lock()
         self.version = 0
-        """Grows with each new situation."""
+        """The number of new situations so far."""
         self.history: tuple[Commit, ...] = ()
-        """The newest commits, newest first."""
+        """The newest commits, at most ``MOST_COMMITS``, newest first."""
         self._newest = self._situation_at(self._first_moment(progress))
         self._thread = runtime.keep_running("page", self._run)
 
     @property
     def newest(self) -> Situation:
-        """The newest situation, as of now."""
+        """The newest situation, with the current time."""
         return replace(self._newest, now=self._runtime.now())
 
     @property
     def health_changes(self) -> tuple[HealthChange, ...]:
-        """The changes of health that were seen, oldest first."""
+        """The changes of health since the follower started, oldest first."""
         return self._watch.changes
 
     def reader(self) -> Reader:
-        """Return a reader for the calling thread."""
+        """Return a reader of the state repo that the calling thread may use."""
         return self._reader.beside()
 
     def at(self, revision: str) -> Situation:
-        """Return the situation at a commit or a time; without a revision the newest.
+        """Return the situation at a revision, which is a commit or a time.
+
+        If ``revision`` is empty, return the newest situation.
 
         Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or it is not valid.
+            InvalidInput, StateRepoError: if there is no such commit, or its state is not valid.
         """
         newest = self.newest
         if not revision:
@@ -101,7 +107,7 @@ class Follower:
         commit = reader.commit(revision)
         if commit == newest.moment.commit:
             return newest
-        with self._loading:  # one commit at a time, because loading may take seconds
+        with self._loading:  # load only one commit at a time, because loading may take seconds
             moment = self._moments.pop(commit, None) or _moment(
                 reader, reader.last_valid_snapshot(commit)
             )
@@ -111,16 +117,16 @@ class Follower:
         return Situation(moment, newest.now, is_newest=False)
 
     def last_change(self, moment: Moment, path: str) -> LogEntry | None:
-        """Return the newest commit up to a moment that changed a file, if there is one."""
+        """Return the newest commit up to a moment that changed a file; None if there is none."""
         if path not in moment.last_changes:
             found = self.reader().log(moment.commit, path) if path else iter(())
             moment.last_changes[path] = next(found, None)
         return moment.last_changes[path]
 
     def not_rendered(self, moment: Moment) -> frozenset[str]:
-        """Return the generated files that a generator has yet to write or remove at a moment.
+        """Return the generated files that at a moment a generator has yet to write or remove.
 
-        Return no files while the state repo cannot be reached.
+        Return an empty set if the state repo cannot be read.
         """
         if moment.not_rendered is None:
             try:
@@ -134,7 +140,7 @@ class Follower:
         self._wake.set()
 
     def close(self) -> None:
-        """Stop following."""
+        """Stop the thread, stop watching the clusters, and close the reader."""
         self.closed.set()
         self._wake.set()
         self._thread.join()
@@ -166,7 +172,7 @@ class Follower:
             found = self._situation_at(moment)
         except DemandOpsError as error:
             found = replace(known, unread=one_line(str(error).replace("\n", "; ")))
-        except Exception as error:  # a fault of the page must not stop the node in its process
+        except Exception as error:  # must not stop the ROS node in the same process
             if not known.unread:
                 log.exception("the page cannot follow the state repo")
             found = replace(known, unread=f"a fault of the program: {one_line(repr(error))}")

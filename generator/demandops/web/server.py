@@ -1,4 +1,4 @@
-"""The page's server, with an address and a thread of its own."""
+"""The web server of the page. It runs in its own thread and binds its own address."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 
 class WebServer:
-    """A running page."""
+    """A running web server."""
 
     def __init__(self, address: str, option: str, follower: Follower) -> None:
         """Start the server.
@@ -32,11 +32,11 @@ class WebServer:
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows; it is closed with the server, and if the server
-                cannot start.
+            follower: provides what the page shows. The server closes the follower at its own end,
+                or if the server cannot start.
 
         Raises:
-            InvalidInput: if it cannot listen on the address.
+            InvalidInput: if the server cannot listen on the address.
         """
         self._follower = follower
         try:
@@ -60,9 +60,9 @@ class WebServer:
             ws="none",
             lifespan="off",
             log_config=None,
-            log_level="error",  # anybody who connects could fill the log with warnings
+            log_level="error",  # otherwise any client could fill the log with warnings
             access_log=False,
-            proxy_headers=False,  # anyone may write them
+            proxy_headers=False,  # any client can send these headers
             server_header=False,
             limit_concurrency=_AT_ONCE,
             timeout_graceful_shutdown=_STOP_TIMEOUT_S,
@@ -79,9 +79,9 @@ class WebServer:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is cut off if its client neither asks nor reads for some seconds.
+    """A connection that is closed if its client sends and reads nothing for ten seconds or more.
 
-    A stream of events is an answer that the client reads, so it stays.
+    An unfinished answer, such as a stream of events, stays open as long as the client reads it.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

@@ -1,7 +1,7 @@
-"""The site: how its views become pages, its events, and the headers that keep other sites out.
+"""The site: it renders views as pages, sends events, and sets headers that keep other sites out.
 
 Every address is read only, and no page loads anything from another host. Templates escape every
-value that they print, and show what is not visible.
+value that they print, including characters that are not visible.
 """
 
 from __future__ import annotations
@@ -55,14 +55,19 @@ _DOCS_HEADERS = _HEADERS | {
         "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     )
 }
-"""The documentation has scripts within its pages, and nothing of any state repo."""
+"""Headers that also allow inline scripts and styles, which the documentation's pages contain.
+
+This is safe because the documentation contains no data of a state repo.
+"""
 _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 _EARLIER_AT_ONCE = 4
-"""How many views of earlier moments are made at once. One may take seconds, and must not
-delay views of the present."""
+"""How many views of earlier moments are rendered at the same time.
+
+Such a view may take seconds. The limit keeps these views from delaying views of the present.
+"""
 
 
 class Site:
@@ -77,10 +82,10 @@ class Site:
         """Make the site.
 
         Args:
-            follower: the state repo.
-            hosts: the host names under which browsers may ask for the page; ``*`` for any. They
-                keep another site from reading the page through its visitors' browsers.
-            documentation: the folder of the documentation's site; None: it was not built.
+            follower: follows the state repo to show.
+            hosts: the host names that requests may name; ``*`` allows any. This keeps another site
+                from reading the page through its visitors' browsers.
+            documentation: the folder of the built documentation; None if it is not built.
         """
         self._follower, self._has_docs = follower, documentation is not None
         self._earlier = anyio.CapacityLimiter(_EARLIER_AT_ONCE)
@@ -129,7 +134,7 @@ class Site:
             return self._page(asked, template, data)
         except DemandOpsError as error:
             return self._message(request, "Nothing to show", str(error), 404)
-        except Exception:  # a fault of the page must not stop the node in its process
+        except Exception:  # must not stop the ROS node in the same process
             log.exception("view %s of the page does not work", request.url.path)
             text = "a fault of the program; see its log"
             return self._message(request, "This view does not work", text, 500)
@@ -162,7 +167,7 @@ class Site:
 
 
 class _Events:
-    """Reports to browsers that there is something new to show, by server-sent events."""
+    """Informs browsers of each new situation by server-sent events."""
 
     def __init__(self, follower: Follower) -> None:
         self._follower, self._listeners = follower, 0
@@ -171,7 +176,7 @@ class _Events:
         if self._listeners >= _MOST_LISTENERS:
             await PlainTextResponse("too many pages are open\n", 503)(scope, receive, send)
             return
-        unbuffered = {"X-Accel-Buffering": "no"}  # a proxy may pass on each event at once
+        unbuffered = {"X-Accel-Buffering": "no"}  # a proxy must pass on each event at once
         answer = StreamingResponse(self._changes(), 200, unbuffered, "text/event-stream")
         self._listeners += 1
         try:
@@ -195,7 +200,7 @@ class _Events:
 
 
 class _ClosedHeaders:
-    """Adds to every answer the headers that keep other sites out of the page."""
+    """Middleware that adds to every answer the headers that keep other sites out of the page."""
 
     def __init__(self, application: ASGIApp) -> None:
         self._application = application
@@ -214,7 +219,7 @@ class _ClosedHeaders:
 
 
 def _visible(value: object) -> object:
-    """Return what a template prints with escapes for what is not visible."""
+    """Return markup unchanged, and other values as text with escapes for invisible characters."""
     return value if isinstance(value, Markup) else lines(str(value))
 
 
@@ -227,6 +232,6 @@ def _when(at: datetime) -> str:
 
 
 def _clock(at: datetime, now: datetime) -> str:
-    """Return a time of today as a time of the day, and any other with its date."""
+    """Return a time as text in UTC; leave out the date if it is the date of ``now``."""
     at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
     return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")

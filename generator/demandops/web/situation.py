@@ -1,4 +1,8 @@
-"""The state at one commit, and the situation: that state with reports of clusters and forge."""
+"""The moment and the situation, which the page shows.
+
+A moment is the state at one commit. A situation is a moment with the reports of the clusters and
+the open proposals.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +41,7 @@ _UNKNOWN = ReleaseStatus(Health("waiting"))
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A release, its place in a cluster, and the claims that need it."""
+    """A planned release, its place in a cluster, and the claims that need the release."""
 
     release: Release
     target: Target
@@ -46,10 +50,10 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class KnownRows:
-    """The rows of a list by their ids, each with the parts from which it was made.
+    """The rows of a list that are already made, to be reused.
 
-    ``made_for`` are the statuses that the rows show, or None if an earlier moment made the
-    rows.
+    ``rows`` maps the id of a row to the parts from which the row was made, and the row.
+    ``made_for`` are the statuses that the rows show; None if the rows are of an earlier moment.
     """
 
     made_for: object
@@ -57,10 +61,10 @@ class KnownRows:
 
 
 class Moment:
-    """What runs at one commit, and for whom. Each part is derived once, when it is asked for.
+    """The state at one commit: what runs, and for whom.
 
-    :meth:`take_over` keeps the parts that are the same at an earlier moment. So a commit costs
-    only what it changes.
+    Most parts are derived when they are first read, and then kept. :meth:`take_over` reuses the
+    parts of an earlier moment that are the same, so only what a new commit changes is derived.
     """
 
     def __init__(
@@ -68,13 +72,13 @@ class Moment:
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
         self.rows: dict[str, KnownRows] = {}
-        """The rows of lists, as far as they were made."""
+        """Name of a list → its rows, for the lists that were shown."""
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
         self.last_changes: dict[str, LogEntry | None] = {}
-        """File → the newest commit that changed it, for files that were asked for."""
+        """File → the newest commit that changed it, or None, for files that were looked up."""
         self.not_rendered: frozenset[str] | None = None
-        """The files that a generator has yet to write or remove, if they were asked for."""
+        """The files that a generator has yet to write or remove; None until they are looked up."""
 
     @property
     def commit(self) -> str:
@@ -97,9 +101,9 @@ class Moment:
         return without_suspended(self.state)
 
     def take_over(self, before: Moment) -> None:
-        """Keep what an earlier moment has derived, and derive only what may differ.
+        """Take the releases and rows of an earlier moment; derive only those that may differ.
 
-        It does nothing if the configuration or the overrides differ, because then all may differ.
+        Do nothing if the configuration or the overrides differ, because then everything may differ.
         """
         old, new = before.state, self.state
         if (old.config, old.overrides) != (new.config, new.overrides):
@@ -108,7 +112,7 @@ class Moment:
         changes = changes_on(old.ledger, new.ledger, subjects)
         keys = {*affected_keys(old, new, changes), *_kept_differently(old.ledger, new.ledger)}
         for one, other in ((change.before, change.after) for change in changes):
-            # who requests a release is often in no file
+            # other requesters rarely change a file, so `affected_keys` omits these releases
             if one and other and (one.requesters, one.partial) != (other.requesters, other.partial):
                 keys.update(keys_of_claims(self.active, [other]))
         known = before.planned | dict(self._for_other_claims(before, subjects))
@@ -123,7 +127,7 @@ class Moment:
     def _for_other_claims(
         self, before: Moment, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield the releases for these subjects, with the claims that need them now."""
+        """Yield the releases of ``before`` that other claims on these subjects need now."""
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
@@ -152,14 +156,14 @@ class Moment:
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
-        """What is planned at each key; None if an override denies it."""
+        """Key of a release → the planned release; None if an override denies the release."""
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}
         return self._planned
 
     @cached_property
     def _sorted(self) -> list[Planned]:
-        """What is planned, sorted by cluster and name."""
+        """All planned releases, sorted by cluster and name."""
         found = filter(None, self.planned.values())
         return sorted(found, key=lambda one: (one.target.domain.cluster, one.target.name))
 
@@ -170,29 +174,33 @@ class Moment:
 
     @cached_property
     def denied(self) -> list[tuple[Release, Override]]:
-        """The releases that claims need and an override denies, with the override."""
+        """Each release that claims need but an override denies, with this override."""
         keys = (key for key, one in self.planned.items() if one is None)
         return [found for key in keys if (found := denied_release(self.state, key))]
 
     @cached_property
     def releases(self) -> dict[str, Release]:
-        """Every release, by name."""
+        """Name → release, for all planned releases."""
         return {release.name: release for release, _ in self.targets}
 
     def override_entries(self, now: datetime) -> list[Entry]:
-        """Return what each override does; the first call's time decides which have expired."""
+        """Return the effect of each override.
+
+        Only the first call computes the result, so its ``now`` decides which overrides have
+        expired.
+        """
         if self._entries is None:
             self._entries = override_report(self.state, now)
         return self._entries
 
     @cached_property
     def behind(self) -> dict[str, list[Claim]]:
-        """The claims that need each release, by its name."""
+        """Name of a release → the claims that need it."""
         return {one.target.name: one.behind for one in self._sorted}
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
-        """The names of the releases that each demand needs, by its id."""
+        """Id of a demand → the names of the releases that it needs."""
         found: dict[str, list[str]] = {}
         for name, claims in self.behind.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -201,7 +209,7 @@ class Moment:
 
     @cached_property
     def claims_of_demands(self) -> dict[str, list[Claim]]:
-        """All claims, by demand; those of a demand are sorted."""
+        """Id of a demand → its claims, sorted by subject."""
         found: dict[str, list[Claim]] = {}
         for claim in self.state.ledger:
             found.setdefault(claim.demand, []).append(claim)
@@ -212,16 +220,17 @@ class Moment:
 
 
 def _held_by(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
-    """Return the applications or connections that a release is for."""
+    """Return the kind and the ids of the applications or connections that a release is for."""
     if isinstance(release, ServiceRelease):
         return SubjectKind.APPLICATION, release.applications
     return SubjectKind.CONNECTION, release.connections
 
 
 def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
-    """Return the subjects whose claims differ.
+    """Return the subjects whose claims differ between two ledgers.
 
-    It compares objects: unchanged claims are the same object, and look-ups would take longer.
+    The function compares the identity of objects, which is fast: an unchanged subject has the same
+    object of claims in both ledgers.
     """
     before = {id(claims): subject for subject, claims in old.claims.items()}
     after = {id(claims): subject for subject, claims in new.claims.items()}
@@ -230,7 +239,7 @@ def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
 
 
 def _kept_differently(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services that keep other replicas than before."""
+    """Yield the services for which ``new`` keeps other replicas than ``old``."""
     before, after = old.kept.steps, new.kept.steps
     for instance in {*before, *after}:
         if before.get(instance) != after.get(instance):
@@ -241,9 +250,9 @@ def _kept_differently(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
 class Situation:
     """The state at a moment, with the health of releases and the open proposals.
 
-    ``statuses`` are those of releases, by name; empty for an earlier moment. ``watched`` are the
-    clusters that are watched. ``old_bootstraps`` are those without the current bootstrap file.
-    ``unread`` is why a newer state cannot be read, or empty.
+    ``statuses`` maps names of releases to their status; it is empty for an earlier moment.
+    ``watched`` names the clusters that are watched. ``old_bootstraps`` lists the clusters without
+    the current bootstrap file. ``unread`` is the reason why a newer state cannot be read, or empty.
     """
 
     moment: Moment
@@ -256,13 +265,16 @@ class Situation:
     old_bootstraps: tuple[OldBootstrap, ...] = ()
 
     def status(self, release: str) -> ReleaseStatus:
-        """Return the status of a release."""
+        """Return the status of a release; unknown if no cluster reports it."""
         return self.statuses.get(release, _UNKNOWN)
 
 
 @dataclass(frozen=True, slots=True)
 class HealthChange:
-    """A change of a release's health; ``lasted_s`` is how long it had been unhealthy."""
+    """A change of a release's health.
+
+    If the release becomes healthy, ``lasted_s`` is how many seconds it was unhealthy, if known.
+    """
 
     time: datetime
     release: str
@@ -274,7 +286,7 @@ class HealthChange:
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """A commit of the history, and the top-level entries that it changed."""
+    """A commit of the history, and the top-level files and folders that it changed."""
 
     entry: LogEntry
     roots: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""The views by their addresses: for each, the template and the data that it shows."""
+"""The views: for each address, the function that returns a template and its data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from demandops.web.views.filtered_table import Filter, Link, Row
 from demandops.web.views.lists import LISTS, rows_of
 
 _KEPT = ("at", "q")
-"""The parameters that links to other views keep."""
+"""The parameters of a request that links to other views keep: the moment and the filter."""
 
 NAVIGATION = (
     ("", "Not ready"),
@@ -37,7 +37,7 @@ NAVIGATION = (
     ("overrides", "Overrides"),
     ("rates", "Rates"),
 )
-"""The views: path and title."""
+"""The path and the title of each view in the navigation bar."""
 
 _MOST_CAUSES = 100
 
@@ -46,7 +46,7 @@ View = Callable[["Asked"], tuple[str, Data]]
 
 
 class Asked:
-    """A request for a view: its parameters, the situation and the filter that they choose."""
+    """A request for a view: its parameters, and the situation and the filter that these choose."""
 
     def __init__(self, follower: Follower, request: Request) -> None:
         self.follower = follower
@@ -56,7 +56,7 @@ class Asked:
         self.filter = Filter(self.get("q"))
 
     def get(self, name: str) -> str:
-        """Return a parameter; empty if it is not given."""
+        """Return the value of a parameter; empty if the request does not give it."""
         return self.params.get(name, "").strip()[:500]
 
     def page(self) -> int:
@@ -67,8 +67,8 @@ class Asked:
     def to(self, path: str | None = None, **changes: str | int) -> str:
         """Return the address of a view that keeps the chosen moment and filter.
 
-        Without ``path`` it is the address of this view with all its parameters. ``changes`` replace
-        parameters; an empty value removes one.
+        Without ``path``, return the address of this view with all its parameters. ``changes`` are
+        new values of parameters; an empty value removes the parameter.
         """
         kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
         params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
@@ -76,7 +76,10 @@ class Asked:
         return f"/{self.path if path is None else path}{query}"
 
     def link(self, link: Link) -> str:
-        """Return the address of a link at the chosen moment, with the link's own filter or none."""
+        """Return the address of a link at the chosen moment.
+
+        The address has the filter of the link, if any, instead of the current filter.
+        """
         return self.to(link.path, **{"q": "", **link.params})
 
 

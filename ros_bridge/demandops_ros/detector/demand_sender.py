@@ -23,7 +23,7 @@ _THREADS = 8
 _LONGEST_WAIT_S = 60.0
 
 Log = Callable[[str, str], None]
-"""Takes a level (info, warning) and a text."""
+"""Logs a text. The first argument is the level, ``info`` or ``warning``; the second, the text."""
 
 
 class DemandSender:
@@ -57,7 +57,12 @@ class DemandSender:
         self._requests.close()
 
     def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
-        """Send what events newly want; ``booked`` has the goals booked before the start."""
+        """Record what events want from now on, and send the goals for it.
+
+        Args:
+            wants: a want for each event that has changed.
+            booked: the goals of events that were booked before the detector started.
+        """
         with self._changed:
             for key, goal in (booked or {}).items():
                 self._wanted.hold(key, goal)
@@ -66,7 +71,12 @@ class DemandSender:
             self._changed.notify_all()
 
     def summary(self) -> tuple[int, int, list[tuple[Key, str]]]:
-        """Return how many events have demands, how many wait for an answer, and the refusals."""
+        """Return the current counts and failures.
+
+        Returns:
+            How many events have a demand, how many of these demands are not yet booked or released
+            as wanted, and the events whose last goal failed, each with the reason.
+        """
         with self._changed:
             return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
 
@@ -84,7 +94,7 @@ class DemandSender:
                 self._log("info", f"rule {rule}: {what}: {outcome.message}")
 
     def _take(self) -> Sending | None:
-        """Wait for a goal to send; return ``None`` when closed."""
+        """Wait for a goal to send, and return it; return ``None`` once the sender is closed."""
         with self._changed:
             while not self._is_closed:
                 now = REAL.monotonic()

@@ -60,7 +60,7 @@ def detect(
 
 
 def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
-    """Print the demands that rules would make for a bag, and draw them."""
+    """Print the demands that the rules would make for a bag; draw them if ``plot`` is given."""
     name, text = read_input(rules)
     file = rule_file.read(text, name)
     try:
@@ -88,7 +88,7 @@ def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
 
 
 def _run(rules: str | None, ros_args: list[str]) -> None:
-    """Run the node until a signal comes."""
+    """Run the node until a signal stops it."""
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
 
     from demandops_ros import ros_process  # noqa: PLC0415

@@ -1,7 +1,8 @@
 """The node of the event detector: topics in, demands out.
 
-The node decides by events alone and does not know what runs. Only when it starts, it reads the
-latched bookkeeping to find the demands of its earlier run, so that a restart does not end them.
+The node's decisions depend on events only, not on which services are deployed. Only at its start,
+the node reads the latched bookkeeping. It finds there the demands of its earlier run, so that a
+restart does not end them.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ _RELOAD_S = 1.0
 _PATIENCE_S = 10.0
 _MOST_OBSERVATIONS = 100_000
 _UNHEARD_CLOCK = 0.0
-"""The time that ROS reports before the first message of a simulated clock."""
+"""The time that ROS reports until the first message of a simulated clock arrives."""
 _SET_CLOCK_S = 1.0
-"""A clock that jumps by more than this was set, or its simulation was restarted."""
+"""If the clock jumps by more seconds than this, someone has set the clock or restarted the
+simulation."""
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -95,7 +97,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._sender.close()
 
     def _log(self, level: str, text: str) -> None:
-        logger = self.get_logger()  # rclpy allows only one level for each line that logs
+        logger = self.get_logger()  # rclpy allows each line of code one level only
         if level == "warning":
             logger.warning(one_line(text))
         else:
@@ -113,7 +115,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         if observation.at != _UNHEARD_CLOCK:
             self._observations.append(observation)
 
-    # ---- the start: which demands are of the earlier run ----
+    # ---- start: find the demands of the earlier run ----
 
     def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
         self._bookkeeping = json.loads(message.bookkeeping_json)
@@ -172,11 +174,14 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._detector.set_clock(jumped)
 
     def _reload_if_changed(self) -> None:
-        """Use changed rules; if they are invalid, log that once and keep the last valid rules."""
+        """Read the file of rules, and use its rules if the text has changed.
+
+        If the file is invalid, log each new problem once and keep the last valid rules.
+        """
         try:
             _, text = read_input(self._path)
         except InvalidInput as error:
-            self._text = ""  # so that the next content counts as changed
+            self._text = ""  # any content that is read next counts as changed
             self._keep_rules(error)
             return
         if text == self._text or not self._is_started:
@@ -210,7 +215,7 @@ def _read_rules(path: Path) -> tuple[RuleFile, str]:
     """Return the rules in a file, and the file's text.
 
     Raises:
-        InvalidInput: with every fault; a message type that is not installed is one.
+        InvalidInput: with every fault, including message types that are not installed.
     """
     name, text = read_input(path)
     file = read(text, name)

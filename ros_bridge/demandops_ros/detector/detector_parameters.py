@@ -36,7 +36,7 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     "answer_timeout": (60.0, "Most seconds that a goal waits for an answer.", (1.0, 86_400.0)),
     "log_level": ("info", "Lowest level of messages in the log: debug, info, warn, error.", None),
 }
-"""Each parameter: its default, its description, and the range of a number."""
+"""Each parameter: its default, its description and, if it is a number, its range."""
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
@@ -46,7 +46,7 @@ def declare(node: Node, rules: str | None) -> dict[str, Any]:
 
     Args:
         node: the node.
-        rules: the file of rules on the command line.
+        rules: the file of rules that the command line names; None if it names none.
 
     Raises:
         click.UsageError: if a value is not valid.

@@ -1,4 +1,4 @@
-"""A recorded bag, MCAP or sqlite3, read without ROS; the only module that knows rosbags."""
+"""Reads a recorded bag, MCAP or sqlite3, without ROS. Only this module imports rosbags."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from rosbags.typesys import Stores, get_typestore
 class RecordedBag:
     """The messages that rules read from a bag.
 
-    ``topics`` are the topics that a source reads. ``unread`` maps topics whose name matches a
-    source, but whose message type differs, to that type. ``left_out`` counts unreadable messages by
-    topic and reason.
+    ``topics`` are the topics that a source reads. ``unread`` has the topics whose name matches a
+    source but whose message type does not, each with its message type. ``left_out`` counts
+    unreadable messages by topic and reason.
     """
 
     def __init__(self, path: Path, file: RuleFile) -> None:
-        """Open a bag: its folder, or an MCAP file.
+        """Open a bag; ``path`` is its folder or an MCAP file.
 
         Raises:
             InvalidInput: if the bag cannot be read, or the rules read none of its topics.
@@ -78,7 +78,7 @@ class RecordedBag:
         for source, entity in self._sources[connection.id]:
             try:
                 message = self._reader.deserialize(data, connection.msgtype)
-            except Exception as error:  # rosbags passes on errors of its parsers
+            except Exception as error:  # rosbags raises errors of many kinds
                 self._leave_out(connection.topic, f"cannot be decoded: {error!r}")
                 continue
             try:

@@ -19,16 +19,17 @@ from demandops.detection.rules.rule_file import RuleFile
 from demandops_ros.detector.recorded_bag import RecordedBag
 
 _TOGETHER = 1_000
-"""How many messages the engine takes at once; the events are the same for any number."""
+"""How many messages one step of the engine takes; the number does not change the events."""
 _TRACK_M = 0.5
-"""The distance in metres between two points of an entity's track in the plot."""
+"""The least distance in metres between two points of an entity's track in the plot."""
 
 
 @dataclass
 class Replay:
     """The events and demands that rules make from a bag.
 
-    ``tracks`` has each entity's path, for a plot.
+    ``span`` has the times of the first and the last message. ``lasting`` has the events that have
+    not stopped at the end. ``tracks`` has each entity's path, for a plot.
     """
 
     bag: str
@@ -42,7 +43,7 @@ class Replay:
     tracks: dict[tuple[str, str], list[tuple[float, float]]] = field(default_factory=dict)
 
     def keep_track(self, one: Observation) -> None:
-        """Add an entity's position to its track."""
+        """Add an entity's position to its track, unless it is too near the last point."""
         if one.position is not None:
             track = self.tracks.setdefault(one.who, [])
             if not track or dist(track[-1], one.position) >= _TRACK_M:
@@ -50,7 +51,11 @@ class Replay:
 
 
 def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
-    """Return the replay of a bag; the detector's clock is the time of recording."""
+    """Return the events and demands that the rules in ``file`` make from a bag.
+
+    The time at which a message was recorded serves as the detector's clock. ``name`` is the bag's
+    name in the output.
+    """
     start, end = bag.span
     detector = Detector(file, start)
     replay = Replay(name, file, (start, end), sorted(bag.topics))
@@ -104,7 +109,10 @@ def show(replay: Replay, output: str) -> None:
 
 
 def as_data(replay: Replay) -> dict[str, Any]:
-    """Return a replay as plain data, the contract of ``--output json``."""
+    """Return a replay as plain data for ``--output json``.
+
+    Programs rely on the form of this data.
+    """
     return {
         "bag": replay.bag,
         "from": _time(replay.span[0]),

@@ -1,4 +1,8 @@
-"""A replay as a picture: the map with tracks and areas, and below it when each event lasted."""
+"""Draws a replay as a picture.
+
+The picture has the map with tracks and areas, and below it a row for each event that shows when the
+event lasted.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +60,10 @@ class _Scale:
 
 
 def _round(metres: float) -> float:
-    """Return a round length for the scale bar, at most a quarter of ``metres``."""
+    """Return a round number of at most a quarter of ``metres``, but at least 0.1.
+
+    It is the length of the scale bar. The time axis uses it too, with seconds.
+    """
     lengths = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
     return max((one for one in lengths if one <= metres / 4), default=lengths[0])
 
@@ -136,7 +143,7 @@ def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) 
 
 
 def _spans(replay: Replay) -> dict[Key, list[Span]]:
-    """Return the start and end of each event; an event that is still active has no end."""
+    """Return each event's spans of time; the end of a span that has not ended is ``inf``."""
     spans: dict[Key, list[Span]] = {}
     for event, _ in replay.events:
         if event.starts:

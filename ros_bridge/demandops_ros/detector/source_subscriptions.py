@@ -1,4 +1,7 @@
-"""Subscriptions to the topics that match sources; topics may appear and vanish."""
+"""Subscriptions to the topics that match the sources of rules.
+
+Topics may appear and vanish at any time.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
-"""Reliable if the publisher is reliable. Deep, because many entities may share a topic."""
+"""A subscription is reliable if its publisher is. The queue is deep, because many entities may
+share a topic."""
 
 
 def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
@@ -43,7 +47,7 @@ def faults_of_types(file: RuleFile) -> list[Fault]:
 
 
 class SourceSubscriptions:
-    """The subscriptions for one file of rules."""
+    """The subscriptions that one file of rules needs."""
 
     def __init__(
         self,

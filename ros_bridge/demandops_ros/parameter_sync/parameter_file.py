@@ -1,4 +1,4 @@
-"""A ROS parameter file: the parameters that it gives a node. Pure."""
+"""Reads the parameters of a node from a ROS parameter file. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SECTION = "ros__parameters"
 
 
 def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
-    """Return a node's parameters by dotted name; the node's section overrides that of all nodes.
+    """Return a node's parameters by dotted name; its section overrides the section for all nodes.
 
     Args:
         node: the node's name, with or without a slash in front.

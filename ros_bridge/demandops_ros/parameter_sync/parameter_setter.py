@@ -20,7 +20,7 @@ _EVENTS = "/parameter_events"
 
 
 class ParameterSetter:
-    """Sets on the node ``target`` the parameters that :meth:`want` got last."""
+    """Sets the parameters of the node ``target`` to those of the last call of :meth:`want`."""
 
     def __init__(self, node: Node, target: str) -> None:
         self._node = node
@@ -37,7 +37,7 @@ class ParameterSetter:
         node.create_timer(_LOOK_S, self._look)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
-        """Replace the parameters that the target must have; any thread may call it.
+        """Replace the parameters that the target must have; any thread may call this method.
 
         Raises:
             TypeError, ValueError: if ROS has no type for a value; the message names the parameter.
@@ -55,7 +55,7 @@ class ParameterSetter:
         if self._call is not None:
             if REAL.monotonic() - self._called_at < _ANSWER_S:
                 return
-            self._client.remove_pending_request(self._call)  # the target ended, so no answer comes
+            self._client.remove_pending_request(self._call)  # the target ended without an answer
             self._call = None
         is_set = self._set == (endpoints, version)
         if version == 0 or not endpoints or is_set or not self._client.service_is_ready():
@@ -81,10 +81,13 @@ class ParameterSetter:
         self._node.get_logger().info(
             f"set {len(names) - len(refused)} parameters of {self._target}"
         )
-        self._changed.trigger()  # the caller may want other parameters by now
+        self._changed.trigger()  # other parameters may be wanted by now
 
     def _endpoints(self) -> frozenset[tuple[int, ...]]:
-        """Return the target's endpoints for parameter events; a killed node's may be among them."""
+        """Return the ids of the target's endpoints that publish parameter events.
+
+        The ROS graph may still list the endpoint of a target that was killed.
+        """
         return frozenset(
             tuple(info.endpoint_gid)
             for info in self._node.get_publishers_info_by_topic(_EVENTS)

@@ -23,7 +23,8 @@ _PARAMETERS = {
     "ros_params_file_name": "params.yml",
     "target_ros_node": "",
 }
-"""The parameters of the reference's k8s_configmap_watcher, without `period`: a watch needs none."""
+"""The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher.
+Its `period` is not among them, because a watch does not poll."""
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})

@@ -1,4 +1,4 @@
-"""One cluster with Argo CD for all tests here, and for each module a state repo that it follows."""
+"""Fixtures: one cluster with Argo CD for all tests, and a state repo for each test module."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 def make_world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[MakeWorld]:
-    """Create a state repo that no cluster follows yet; the end of the module removes it."""
+    """Return a function that creates a state repo, which no cluster follows yet.
+
+    The end of the module removes all these state repos.
+    """
     folder = tmp_path_factory.mktemp
     with worlds(lambda: World(rig, folder("world"), ros_domain, client)) as make:
         yield make

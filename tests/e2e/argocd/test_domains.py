@@ -1,6 +1,6 @@
 """A commit to an access domain's folder changes only the domain's own namespace.
 
-Each case is what a mistake or an attacker might commit there.
+Each case commits to the folder what a mistake or an attacker might commit.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ SlipIn = Callable[[Manifest], None]
 
 @pytest.fixture(scope="module", autouse=True)
 def neighbour(rig: Rig) -> Iterator[None]:
-    """A namespace of no access domain, and a project without limits in Argo CD's namespace.
+    """Make a namespace of no access domain, and Argo CD's project `default`, which has no limits.
 
-    Each installation has such a project, named `default`.
+    Each installation of Argo CD has that project.
     """
     rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
     anywhere = {"server": "*", "namespace": "*"}
@@ -48,7 +48,10 @@ def neighbour(rig: Rig) -> Iterator[None]:
 
 @pytest.fixture
 def slip_in(world: World) -> Iterator[SlipIn]:
-    """Commit a manifest to the domain's folder; the end of the test removes it."""
+    """Return a function that commits a manifest to the domain's folder.
+
+    The end of the test removes the manifest.
+    """
 
     def push(manifest: Manifest) -> None:
         commit = world.push({FILE: json.dumps(manifest)})
@@ -56,7 +59,7 @@ def slip_in(world: World) -> Iterator[SlipIn]:
         world.domain.wait_fetched(commit)
 
     yield push
-    world.tip()  # updates the clone
+    world.tip()  # tip() updates the clone
     if FILE in world.person.git("ls-files").split():
         world.push({FILE: None})
     world.domain.wake()
@@ -64,7 +67,7 @@ def slip_in(world: World) -> Iterator[SlipIn]:
 
 
 def application(world: World, *, project: str, into: str, namespace: str) -> Manifest:
-    """Return a release of the detection's chart in a project, for the namespace `into`."""
+    """Return an Application of a project in `namespace` that installs the detection into `into`."""
     source = {
         "repoURL": world.rig.git_url(world.name),
         "path": "appdefs/object-detection-fusion/charts/object-detection",
@@ -161,7 +164,7 @@ def test_no_application_in_argo_cds_own_namespace(world: World, slip_in: SlipIn)
 def test_a_later_commit_is_applied_once_the_refused_manifest_is_gone(
     world: World, slip_in: SlipIn
 ) -> None:
-    """With the next demand the generator removes the file, and Argo CD applies that commit."""
+    """The generator removes the file with the next demand, and Argo CD applies that commit."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
     slip_in(build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
     world.step(2, expected.after(2))

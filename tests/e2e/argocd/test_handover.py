@@ -1,4 +1,4 @@
-"""A state repo moves from Flux to Argo CD and back as docs/argocd.md says; every pod stays."""
+"""A state repo moves from Flux to Argo CD and back as docs/argocd.md says, and no pod restarts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SUSPENDED = {"spec": {"suspend": True}}
 
 @pytest.fixture(scope="module")
 def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """A cluster with both controllers."""
+    """A cluster with Flux and Argo CD."""
     rig = Rig("both", gitops="flux", beside="argocd", nodes=NODES, report=say)
     with running(rig, request.session):
         yield rig
@@ -70,14 +70,14 @@ def test_every_pod_stays_there_and_back(
 
 
 def from_flux(domain: flux_view.Domain) -> None:
-    """Suspend everything that would remove the releases."""
+    """Suspend the Flux objects that would otherwise remove the releases."""
     for kind in ("Kustomization", "HelmRelease"):
         for item in domain.find(kind):
             domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
 
 
 def upgrade(world: FluxWorld, gitops: str) -> str:
-    """Move to a controller in one commit while the generator runs; return the commit."""
+    """Upgrade the state repo to a controller while the generator runs; return the single commit."""
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
     output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
@@ -88,7 +88,7 @@ def upgrade(world: FluxWorld, gitops: str) -> str:
 
 
 def to_argocd(world: FluxWorld) -> Domain:
-    """Render everything for Argo CD, let it follow, and demand the next step."""
+    """Render the state repo for Argo CD, apply its bootstrap file, and demand step 2."""
     upgraded = upgrade(world, "argocd")
     manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
     world.apply(world.rig.kube, manifests)
@@ -105,7 +105,7 @@ def to_argocd(world: FluxWorld) -> Domain:
 
 
 def forget_flux(domain: flux_view.Domain) -> None:
-    """Delete Flux's objects, which remove nothing while suspended, and Helm's records."""
+    """Delete Helm's records and Flux's objects, which remove no release while suspended."""
     for kind in FLUX_KINDS:
         for item in domain.find(kind):
             name = item["metadata"]["name"]
@@ -117,7 +117,10 @@ def forget_flux(domain: flux_view.Domain) -> None:
 
 
 def forget_argocd(domain: Domain) -> None:
-    """Delete the Applications, not their objects. The folder's is first: it restores others."""
+    """Delete the Applications, but not the objects that they manage.
+
+    The folder's Application goes first, because it would restore those of the releases.
+    """
     apps = [
         (domain.name, CONTROL),
         *((name, domain.namespace) for name in domain.releases()),
@@ -130,7 +133,7 @@ def forget_argocd(domain: Domain) -> None:
 
 
 def to_flux(world: FluxWorld) -> None:
-    """Render everything for Flux, and let it follow while demands continue."""
+    """Render the state repo for Flux, demand step 4, and apply the bootstrap file of Flux."""
     upgrade(world, "flux")
     world.demand(expected.demand(4))
     world.bootstrap(CLUSTER, world.rig)

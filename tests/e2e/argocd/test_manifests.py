@@ -1,4 +1,4 @@
-"""Golden manifests before the judge: the API server's dry run, with Argo CD's own definitions."""
+"""The API server accepts all golden manifests in a dry run with Argo CD's own definitions."""
 
 from tests.e2e.common.steps import (
     test_the_server_does_look,

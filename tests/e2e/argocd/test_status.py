@@ -1,4 +1,4 @@
-"""The requester learns with Argo CD whether its services run."""
+"""With Argo CD the answer to a demand reports whether its services run."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 
 class TestArgoCD(Answers):
-    """The tests with Argo CD."""
+    """The tests of `Answers` with Argo CD."""
 
     def read_repaired_chart(self, world: Any) -> None:
-        """Argo CD reads a chart folder only every few minutes, or on request."""
+        """Refresh the Application, because Argo CD reads a chart folder only every few minutes."""
         world.domain.refresh("od-edge-vehicle00")

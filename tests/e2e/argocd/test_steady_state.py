@@ -1,4 +1,4 @@
-"""Releases do not change without a demand: another requester, and manual changes."""
+"""Another requester or a manual change in the cluster leaves releases as they were."""
 
 from tests.e2e.common.steps import (
     test_another_requester_changes_no_object_of_a_release,

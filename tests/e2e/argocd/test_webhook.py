@@ -24,7 +24,7 @@ OF_CHART = "\n---\napiVersion: v1\nkind: ConfigMap\nmetadata: {name: {{ .Release
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig) -> World:
-    """A state repo whose generator calls the webhook and may only read the cluster."""
+    """A state repo whose generator calls Argo CD's webhook and may only read the cluster."""
     if rig.existing:
         pytest.skip("the tests do not know the webhook secret of an existing Argo CD")
     made = make_world()
@@ -51,7 +51,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 @pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
-    """Return the Applications that the server refreshed since the last call."""
+    """Return a function: the Applications that the webhook refreshed since its last call."""
     log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
 
     def names() -> set[str]:

@@ -17,7 +17,7 @@ _REFRESH = "argocd.argoproj.io/refresh"
 
 
 class Domain(Namespace):
-    """The domain's namespace on one cluster; the Application over its folder is called `name`."""
+    """The domain's namespace on one cluster; the Application `name` applies the folder."""
 
     GITOPS = "argocd"
     RELEASE = "Application"
@@ -25,17 +25,17 @@ class Domain(Namespace):
     # --- reading ----------------------------------------------------------------------------
 
     def fetched(self) -> str:
-        """Return the commit that the folder was last compared with."""
+        """Return the commit that Argo CD compared the folder with last; empty if none."""
         return str(self._sync().get("revision", ""))
 
     def applied(self) -> str:
-        """Return the commit that the folder is in sync with; empty during an operation."""
+        """Return the commit that the folder is in sync with; empty while it is not."""
         found = self._folder()
         under_way = bool(found.get("operation"))
         return self.fetched() if self._sync().get("status") == "Synced" and not under_way else ""
 
     def trouble(self, name: str, namespace: str) -> str:
-        """Return what Argo CD reports against an Application; empty if it reports nothing."""
+        """Return the errors that Argo CD reports for an Application; empty if it reports none."""
         status = (self.kube.get("Application", name, namespace) or {}).get("status") or {}
         messages = [condition["message"] for condition in status.get("conditions") or []]
         operation = status.get("operationState") or {}
@@ -55,7 +55,7 @@ class Domain(Namespace):
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
-        """Refresh the folder now; its changes trigger its releases."""
+        """Refresh the folder's Application now; Argo CD then applies the releases it changes."""
         self.refresh(self.name, NAMESPACE)
 
     def refresh(self, name: str, namespace: str = "") -> None:

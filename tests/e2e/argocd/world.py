@@ -1,6 +1,6 @@
-"""A state repo, its generator, and the cluster whose Argo CD follows it.
+"""A state repo, its generator, and the cluster whose Argo CD follows the state repo.
 
-The cluster gets only the manifests that `demandops init` wrote for it.
+The cluster gets only the bootstrap file that `demandops init` wrote for it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ class World(StateRepo[Domain]):
         self.apply(rig.kube, manifests)
 
         def is_permitted() -> bool:
-            """Look again, else Argo CD goes by a project of the same name for minutes."""
+            """Return whether Argo CD has read the folder.
+
+            Argo CD may apply a former project of this name for minutes. If that forbids the folder,
+            this refreshes the folder.
+            """
             trouble = domain.trouble(domain.name, NAMESPACE)
             if "is not permitted in project" in trouble:
                 domain.wake()
@@ -42,7 +46,7 @@ class World(StateRepo[Domain]):
         self.generator.stop()
         for domain in self.domains.values():
             domain.kube.delete("Application", domain.name, NAMESPACE)
-            # if a test killed the API server, Argo CD hears of the deletion when its watch is back
+            # after a test killed the API server, Argo CD sees the deletion once it watches again
             domain.kube.wait_gone("Application", domain.name, NAMESPACE, timeout=180.0)
             domain.kube.delete("AppProject", domain.name, NAMESPACE)
         self.remove_wide()

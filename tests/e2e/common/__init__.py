@@ -1,1 +1,1 @@
-"""What the tests of both controllers share, from a ROS 2 goal to the pods."""
+"""What the end-to-end tests with Flux and with Argo CD share, from a ROS 2 goal to the pods."""

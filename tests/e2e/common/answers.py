@@ -1,4 +1,4 @@
-"""Tests of when goals are answered, the same with each controller.
+"""Tests of the time at which demands are answered, the same with each controller.
 
 A test module derives its class from :class:`Answers` and defines the fixture `world`.
 """
@@ -23,7 +23,10 @@ from tests.e2e.rig.cluster import Rig
 
 TIMEOUT_S = 60.0
 RECOVERY_S = 110.0
-"""For an answer after an outage of the API server: Argo CD must watch again, then look at all."""
+"""The time-out of an answer after an outage of the API server.
+
+Argo CD must first watch the server again and compare all its objects.
+"""
 SHORT_S = 6.0
 CHARTS = "appdefs/object-detection-fusion/charts"
 CHART = f"{CHARTS}/object-detection/templates/service.yaml"
@@ -35,7 +38,7 @@ _POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 
 
 def ego(vehicle: str) -> dict[str, str]:
-    """Return an input of the fusion."""
+    """Return the ego data of a vehicle as an input of the fusion."""
     return {"topic": f"/vehicles/{vehicle}/ego_data", "source": vehicle}
 
 
@@ -57,7 +60,7 @@ World = StateRepo[Any]
 
 
 def limited_world(world: World, rig: Rig, gitops: str) -> World:
-    """Have a new state repo followed, with a generator that has the rights of docs/status.md."""
+    """Let the cluster follow a new state repo; its generator gets the rights of docs/status.md."""
     world.bootstrap(CLUSTER, rig)
     rights = documented_roles(gitops)
     kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, rights)
@@ -83,7 +86,10 @@ def unavailable(domain: Namespace) -> list[str]:
 
 
 def push_chart(world: World, added: str) -> dict[str, str]:
-    """Push a new version of the detection's chart with added text; return the old files."""
+    """Push a new version of the detection's chart with added text.
+
+    Return the former content of the changed files by path.
+    """
     old = {path: world.file(path) for path in (CHART, *_VERSIONS)}
     new = {
         path: old[path].replace(f"{before}0.1.0", f"{before}0.1.1")
@@ -94,10 +100,10 @@ def push_chart(world: World, added: str) -> dict[str, str]:
 
 
 class Answers:
-    """Goals are answered when they are reconciled or healthy, or with the reason why not."""
+    """A demand is answered when it is reconciled or healthy, or else with the reason."""
 
     def read_repaired_chart(self, world: World) -> None:
-        """Make the controller read a repaired chart, if it does not do so itself."""
+        """Make the controller read a repaired chart if it does not do so itself."""
 
     def test_answered_when_it_is_healthy_and_when_it_is_gone(
         self, world: World, requester: DemandClient
@@ -113,7 +119,7 @@ class Answers:
             assert held.answer is not None and held.answer.reached == "healthy"
             assert stages[-2:] == ["reconciled", "healthy"]
             assert domain.applied() == held.commit
-        domain.wait_applied(world.tip())  # the release was answered when it was pushed
+        domain.wait_applied(world.tip())  # the `with` block ended once its release was pushed
         answer = requester.put("d", [FUSION], answer="healthy")
         assert answer.outcome == "booked"
         file = str(world.folder / "clusters.yaml")
@@ -130,7 +136,7 @@ class Answers:
     def test_a_change_is_healthy_when_the_changed_service_runs(
         self, world: World, requester: DemandClient
     ) -> None:
-        """Health from before the change does not count."""
+        """Only the health of the changed service counts, not its health before the change."""
         domain = world.domain
         requester.put("d", [FUSION], answer="healthy")
         for vehicles in (("vehicle00", "vehicle01"), ("vehicle00",), ("vehicle00", "vehicle02")):
@@ -148,7 +154,7 @@ class Answers:
     def test_not_answered_before_it_is_healthy(
         self, world: World, requester: DemandClient, edge_is_full: Callable[[], None], rig: Rig
     ) -> None:
-        """Reconciled comes at once; healthy comes when the edge accepts pods again."""
+        """The stage reconciled comes at once; healthy comes when the edge accepts pods again."""
         reconciled = threading.Event()
 
         def on_stage(stage: str, text: str) -> None:
@@ -180,7 +186,7 @@ class Answers:
         message = str(caught.value)
         assert "Deployment perception/" in message and "not scheduled: " in message
         assert f"it is booked in {world.tip()}" in message
-        # the demand is still booked, and is healthy once the edge accepts pods
+        # the demand is still booked, and becomes healthy once the edge accepts pods
         edge_is_full()
         restart_generator(world, TIMEOUT_S)
         assert requester.put("d", [FUSION], answer="healthy").outcome == "unchanged"

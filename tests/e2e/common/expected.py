@@ -1,7 +1,7 @@
 """The objects that must exist after each step of the paper's experiment, one per line.
 
-They come from the paper's table, not from the program. The names are literals; a row of
-`examples/experiment/paper.py` with requesters decides which exist.
+They come from the paper's table, not from the program. The names are literals. An object exists
+if its row of `examples/experiment/paper.py` has requesters.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
 
 CLUSTER = "c-its"
 NAMESPACE = "perception"
-"""The skeleton's cluster and access domain."""
+"""The cluster and the access domain of the skeleton."""
 
 STEPS = range(1, len(paper.STEPS) + 1)
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
@@ -34,7 +34,7 @@ _ENDS = {
     "vehicle03": ("f675fa2fc9b2", "b53be9798cf6"),
 }
 
-# From `_domain.yaml`, and from Kubernetes, which adds one to every namespace.
+# One is from `_domain.yaml`; Kubernetes adds the other to every namespace.
 WITHOUT_DEMANDS = frozenset({"ConfigMap demandops-domain", "ConfigMap kube-root-ca.crt"})
 
 
@@ -56,12 +56,12 @@ def source_end(node: str) -> str:
 
 
 def target_end(node: str) -> str:
-    """Return the name of the client at the edge."""
+    """Return the name of the client at the edge of a node's connection to the edge."""
     return f"mqtt-{node}-edge-target-{_ENDS[node][1]}"
 
 
 def after(step: int, nodes: Collection[str] = NODES) -> frozenset[str]:
-    """Return exactly what the namespace must contain on a cluster with these nodes."""
+    """Return the lines of exactly what must exist after a step, on a cluster with these nodes."""
     rows = paper.expected(step) if step else {}
     lines = [line for row in rows for node, line in _of_row(row, rows) if node in nodes]
     return WITHOUT_DEMANDS | frozenset(lines)
@@ -95,5 +95,5 @@ def _deployed(node: str, name: str) -> tuple[str, str]:
 
 
 def unscheduled(lines: frozenset[str]) -> frozenset[str]:
-    """Return the lines with the edge's pods unscheduled."""
+    """Return the same lines, but with all pods of the edge unscheduled and not ready."""
     return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)

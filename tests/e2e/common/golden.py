@@ -1,4 +1,4 @@
-"""The golden cases' manifests that a cluster gets."""
+"""The manifests in the golden cases that a cluster gets."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from tests.e2e.rig.cluster import Gitops
 from tests.e2e.rig.kube import Manifest
 from tests.kit.golden import CASES, whole
 
-ARGOCD = "argocd-"  # what the names of its cases begin with
+ARGOCD = "argocd-"  # the prefix of the cases for Argo CD
 
 
 def golden(gitops: Gitops) -> Iterator[Manifest]:
-    """Every manifest for one controller, each once."""
+    """Yield each different manifest of all golden cases for one controller."""
     seen: set[str] = set()
     cases = sorted(case for case in CASES if case.startswith(ARGOCD) == (gitops == "argocd"))
     for folder in ("bootstrap/", "clusters/"):

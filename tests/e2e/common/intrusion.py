@@ -22,7 +22,7 @@ def _container(**context: Any) -> Manifest:
 
 
 def pod(*containers: Manifest, **more: Any) -> Manifest:
-    """Return the specification of a pod on the edge."""
+    """Return the spec of a pod on the edge; `more` adds or replaces fields."""
     return {"nodeSelector": _EDGE, "containers": [*containers] or [_container()], **more}
 
 
@@ -59,11 +59,11 @@ FORBIDDEN = {
     "any node": (pod(nodeSelector={}), _ELSEWHERE),
     "a node of nobody": (pod(nodeSelector={"kubernetes.io/os": "linux"}), _ELSEWHERE),
 }
-"""Specifications of pods that the skeleton's access domain may not have, and the reasons."""
+"""Pod specs that the skeleton's access domain may not have, each with the refusal's reason."""
 
 
 def makers(spec: Manifest) -> Iterator[Manifest]:
-    """Yield an object of each kind that makes pods of a specification."""
+    """Yield one object of each kind that makes pods, all with this pod spec."""
     labels = {"app": "foreign"}
     template = {"metadata": {"labels": labels}, "spec": spec}
     once = {"template": {**template, "spec": {**spec, "restartPolicy": "Never"}}}
@@ -78,7 +78,7 @@ def makers(spec: Manifest) -> Iterator[Manifest]:
 
 
 def binding(kind: str, namespace: str = "") -> Manifest:
-    """Return a binding that makes the domain's account an administrator."""
+    """Return a binding of this kind that makes the domain's account an administrator."""
     account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
     role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
     return build_manifest(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])

@@ -8,7 +8,7 @@ from .namespace import Namespace
 
 
 def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """Return a goal for the same applications and connections with another requester."""
+    """Return a copy of a goal with another requester."""
     requesters = {"requester_ids": [vehicle, "station00"]}
     apps = [
         app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
@@ -43,7 +43,10 @@ def overwrite(namespace: Namespace, config: str, key: str) -> None:
 def wait_restored(
     namespace: Namespace, template: dict[str, Any], data: dict[str, str], *names: str
 ) -> None:
-    """Wait until a Deployment has its pod template and a ConfigMap its content again."""
+    """Wait until a Deployment has this pod template again, and a ConfigMap this data.
+
+    `names` are the names of the Deployment and the ConfigMap.
+    """
     deployment, config = names
     namespace.kube.wait("the image", lambda: pod_template(namespace, deployment) == template)
     namespace.kube.wait("the content", lambda: namespace.get("ConfigMap", config)["data"] == data)

@@ -1,6 +1,6 @@
-"""An access domain's namespace on a cluster, read by tests: names, pods, versions.
+"""An access domain's namespace on a cluster, as tests read it: names, pods, versions.
 
-Each controller's `view` module adds what is particular to it.
+The `view` module of each controller adds what depends on the controller.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .expected import FUSION
 
 _INSTANCE = "app.kubernetes.io/instance"
 
-# Kinds that our commits can create in a domain's namespace; no events, leases and the like.
+# Kinds that commits of the generator can create in a domain's namespace.
 _OF_RELEASES = (
     "ConfigMap",
     "Deployment",
@@ -34,15 +34,15 @@ _OTHERS = ("Job", "Service")
 
 
 class Namespace:
-    """The namespace; a service's release is an object of the kind `RELEASE`.
+    """An access domain's namespace; each release of a service is an object of the kind `RELEASE`.
 
-    `name` is the controller's object that applies the domain's folder.
+    `name` is the name of the controller's object that applies the domain's folder.
     """
 
     GITOPS: ClassVar[str]
     RELEASE: ClassVar[str]
-    OWN: ClassVar[tuple[str, ...]] = ()  # further kinds that the controller owns
-    STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that an unrelated commit does not change
+    OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's objects
+    STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit for other releases keeps
 
     def __init__(self, kube: Kube, namespace: str, name: str) -> None:
         self.kube, self.namespace, self.name = kube, namespace, name
@@ -62,7 +62,7 @@ class Namespace:
         return self.kube.find(kind, self.namespace, selector)
 
     def lines(self) -> frozenset[str]:
-        """Return what exists, as lines of the form of `expected`."""
+        """Return the existing objects as lines in the form of the module `expected`."""
         found = [f"release {name_of(item)}" for item in self.find(self.RELEASE)]
         found += [f"Deployment {name_of(item)}" for item in self.find("Deployment")]
         for config in self.find("ConfigMap"):
@@ -91,16 +91,20 @@ class Namespace:
         }
 
     def identity(self, name: str) -> tuple[object, ...]:
-        """Return what changes when the pods of a Deployment are restarted, or soon will be."""
+        """Return ids of a Deployment that change if its pods restart or are about to restart.
+
+        These are the UID and generation of the Deployment, and the UIDs of pods and ReplicaSets.
+        """
         metadata = self.get("Deployment", name)["metadata"]
         pods = sorted(pod["metadata"]["uid"] for pod in self.find("Pod", name))
         sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
         return metadata["uid"], metadata["generation"], *pods, *sets
 
     def pods(self) -> dict[str, tuple[object, ...]]:
-        """Return the UIDs of each Deployment and its pods, by the Deployment's name.
+        """Return the UIDs of each Deployment, its pods and ReplicaSets, by the Deployment's name.
 
-        Without its generation: another controller that applies it may write out a default.
+        The generation is left out: it changes when another controller applies the Deployment and
+        writes a default value explicitly.
         """
         found = {}
         for item in self.find("Deployment"):
@@ -111,15 +115,15 @@ class Namespace:
     # --- what the controller does -------------------------------------------------------------
 
     def wake(self) -> None:
-        """Make the controller look at the remote now."""
+        """Make the controller fetch from the remote now."""
         raise NotImplementedError
 
     def wait_fetched(self, commit: str) -> float:
-        """Wait until the controller has fetched a commit; return when that was seen."""
+        """Wait until the controller has fetched a commit; return the monotonic time."""
         raise NotImplementedError
 
     def wait_applied(self, commit: str) -> float:
-        """Wait until the controller has applied a commit; return when that was seen."""
+        """Wait until the controller has applied a commit; return the monotonic time."""
         raise NotImplementedError
 
     def wait_attempted(self, commit: str) -> None:
@@ -127,7 +131,7 @@ class Namespace:
         raise NotImplementedError
 
     def wait_releases(self) -> None:
-        """Wait until the controller has done everything for the releases except await pods."""
+        """Wait until the controller has applied all releases; their pods need not be ready."""
         raise NotImplementedError
 
     def wait_checked(self, commit: str) -> None:
@@ -143,12 +147,15 @@ class Namespace:
         self.kube.delete(kind, name, self.namespace)
 
     def restore(self, *releases: str) -> None:
-        """Make the controller restore releases, or the folder, if it does not so by itself."""
+        """Make the controller restore these releases, or without any the domain's folder.
+
+        Does nothing if the controller restores them by itself.
+        """
 
     # --- waiting ----------------------------------------------------------------------------
 
     def wait_lines(self, wanted: frozenset[str], timeout: float = 60.0) -> float:
-        """Wait until exactly the wanted lines exist; return when that was seen."""
+        """Wait until `lines` returns exactly the wanted lines; return the monotonic time."""
         return self._wait_same(self.lines, wanted, timeout)
 
     def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
@@ -156,9 +163,9 @@ class Namespace:
         self._wait_same(self.inventory, wanted, timeout)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
-        """Wait until no release's object has changed for a while; return the versions.
+        """Wait until no object of a release has changed for so many seconds; return `versions`.
 
-        This includes a Deployment's status, which the controller updates after its pods.
+        The status of a Deployment counts too; Kubernetes updates it after the pods are ready.
         """
         seen, since = self.versions(), time.monotonic()
 
@@ -175,7 +182,7 @@ class Namespace:
     # --- inside -----------------------------------------------------------------------------
 
     def _all_counted(self) -> bool:
-        """Return whether every Deployment and ReplicaSet has counted all its wanted pods."""
+        """Return whether each Deployment and ReplicaSet reports all wanted pods as available."""
         return all(
             status.get("observedGeneration") == item["metadata"]["generation"]
             and status.get(counted, 0) == item["spec"]["replicas"]
@@ -223,7 +230,7 @@ class Namespace:
 
 
 def fusion_inputs(config: Manifest) -> list[str]:
-    """Return the fusion's input topics in its ConfigMap."""
+    """Return the fusion's input topics from its ConfigMap."""
     (parameters,) = yaml.safe_load(config["data"]["params.yml"]).values()
     inputs = parameters["ros__parameters"]["additional_inputs"]
     return [topic for topic in inputs["topics_egodata"] + inputs["topics_objectlist"] if topic]

@@ -1,13 +1,14 @@
 """A pod's container as a process of this machine, started as a kubelet would start it.
 
-It has a root file system of its own, which it cannot write to, the pod's volumes at their places,
-the pod's user, no privileges, and no environment but the container's. Network and process ids are
-the machine's. Unlike in a cluster it has no shared memory: where ROS 2 talks on one machine only,
-as in tests, it would use it whatever the chart says, and a client outside would miss every message.
-This needs root.
+The process has a read-only root file system of its own, the pod's volumes at their mount paths, the
+pod's user, no privileges, and only the container's environment. It uses the network and the process
+ids of the machine. To start it needs root.
 
-The image is made of this machine's programs and this checkout. With ``E2E_IMAGE_ROOT`` it is the
-root file system in that folder (``deploy/fresh-root``).
+Unlike in a cluster, the process has no shared memory. Tests restrict ROS 2 to the loopback, where
+ROS 2 would use shared memory, and a client outside the container would miss every message.
+
+By default the image consists of this machine's programs and this checkout. If ``E2E_IMAGE_ROOT``
+names a folder, the image is the root file system in it (made by ``deploy/fresh-root``).
 """
 
 from __future__ import annotations
@@ -73,10 +74,13 @@ exec chroot "$root" setpriv --reuid "$user" --regid "$group" --groups "$group" \
 
 
 class Pod:
-    """A pod's only container. Its claims and its log stay in ``folder`` when it ends."""
+    """A pod's only container as a process.
+
+    ``folder`` keeps the data of the pod's volume claims and its log after its end.
+    """
 
     def __init__(self, kube: Kube, name: str, namespace: str, server: str, folder: Path) -> None:
-        """Read the pod from the API; ``server`` is the API's host and port."""
+        """Read the pod from the API; ``server`` is the API server's host and port."""
         self._kube, self._namespace, self._folder = kube, namespace, folder
         found = kube.get("Pod", name, namespace)
         assert found is not None
@@ -98,7 +102,7 @@ class Pod:
 
     @property
     def code(self) -> int | None:
-        """The exit code; None while it runs."""
+        """The exit code of the process; None while it runs."""
         assert self._process is not None
         return self._process.poll()
 
@@ -149,23 +153,23 @@ class Pod:
             )
 
     def text(self) -> str:
-        """Return what it has printed since it was started."""
+        """Return what the container has printed since its last start."""
         return self.log.read_bytes()[self._start :].decode(errors="replace")
 
     def kill(self) -> None:
-        """Kill it, as when its cluster node dies."""
+        """Kill the container, as if its cluster node had died."""
         assert self._process is not None
         self._process.kill()
         self._process.wait(10)
 
     def stop(self) -> int:
-        """Ask it to end, and return its exit code."""
+        """Send the container a SIGTERM, wait for its end, and return its exit code."""
         assert self._process is not None
         self._process.send_signal(signal.SIGTERM)
         return self._process.wait(self.manifest["spec"]["terminationGracePeriodSeconds"])
 
     def _volume(self, volume: dict[str, Any], group: int) -> Path:
-        """Return a folder with what a volume holds."""
+        """Return a folder with the content of a volume, readable by the pod's group."""
         if "persistentVolumeClaim" in volume:
             folder = self._folder / volume["persistentVolumeClaim"]["claimName"]
         else:

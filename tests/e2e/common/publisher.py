@@ -1,4 +1,4 @@
-"""Stands in for `ros2 launch` in a pod of detection or fusion: publishes on each of its outputs."""
+"""A stand-in for `ros2 launch` in a pod of detection or fusion; it publishes on each output."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 OUTPUTS = ("object_list_topic", "fused_object_lists_topic", "fused_trajectories_topic")
-"""The arguments of the launch files of the reference's images, so far as they name outputs."""
+"""The launch arguments that name outputs, in the launch files of the reference's images."""
 
 
 def main(launch: str, package: str, file: str, *arguments: str) -> None:

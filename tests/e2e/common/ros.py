@@ -1,6 +1,6 @@
-"""The kit's ROS 2 action client, spinning in its own thread.
+"""The ROS 2 action client of `tests.kit`, with a thread of its own that spins it.
 
-So each stage gets the time of its feedback while a test waits for the cluster.
+The thread records the time of each feedback even while a test waits for the cluster.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Client(ros.Client):
             time.sleep(0.005)
 
     def call(self, sent: Goal) -> Sent:
-        """Send a goal and wait for its result; send it again if no node accepts it.
+        """Send a goal and wait for its result; send it again if no node accepts it in 3 s.
 
-        The client still sees a killed server for a while, and goals to it are lost.
+        For a while the client still sees a killed server, and goals to that server are lost.
         """
         end = time.monotonic() + DEADLINE_S
         under_way, since = self.send(sent), time.monotonic()
@@ -50,6 +50,6 @@ class Client(ros.Client):
 
     def close(self) -> None:
         self._over.set()
-        self.executor.create_task(lambda: None)  # wakes it
+        self.executor.create_task(lambda: None)  # wakes the thread
         self._thread.join(DEADLINE_S)
         super().close()

@@ -1,4 +1,4 @@
-"""A rig, and state repos, for the length of a block."""
+"""Context managers: a rig that runs, and state repos that exist, for the length of a block."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ World = TypeVar("World", bound=StateRepo[Any])
 
 @contextmanager
 def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
-    """Start a rig and stop it at the end; its logs remain if a test failed meanwhile."""
+    """Start a rig and stop it after the block; keep its logs if a test failed meanwhile."""
     failed = session.testsfailed
     rig.start()
     try:
@@ -30,7 +30,10 @@ def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
 
 @contextmanager
 def worlds(make: Callable[[], World]) -> Iterator[Callable[[], World]]:
-    """Create state repos that no cluster follows yet; the end of the block removes them."""
+    """Give a function that creates state repos, which no cluster follows yet.
+
+    The end of the block removes them.
+    """
     made: list[World] = []
 
     def another() -> World:

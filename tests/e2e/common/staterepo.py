@@ -46,7 +46,10 @@ class Generator:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, *arguments: str) -> None:
-        """Start it and wait until it accepts goals. It dies with this process, even if killed."""
+        """Start the generator and wait until it accepts goals.
+
+        The kernel ends the generator when this process ends, even if this process is killed.
+        """
         command = launch.command(sys.executable, *self._command, *arguments)
         with self.log.open("ab") as log:
             start = log.tell()
@@ -67,13 +70,13 @@ class Generator:
             time.sleep(0.05)
 
     def kill(self) -> None:
-        """Kill it, like a crash."""
+        """Kill the generator, which simulates a crash."""
         assert self._process is not None
         self._process.kill()
         self._process.wait(10)
 
     def stop(self) -> None:
-        """Ask it to end, and kill it if it does not."""
+        """Ask the generator to end, and kill it if it still runs after ten seconds."""
         if self._process is not None and self._process.poll() is None:
             self._process.send_signal(signal.SIGTERM)
             try:
@@ -86,9 +89,9 @@ class Generator:
 
 
 class StateRepo(Generic[Domain]):
-    """A state repo in use, written for the controller of its rig.
+    """A state repo with its generator, for the controller of its rig.
 
-    `domains` are its access domain on each cluster that follows it, by cluster name.
+    `domains` has the state repo's access domain on each cluster that follows it, by cluster.
     """
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
@@ -105,11 +108,14 @@ class StateRepo(Generic[Domain]):
         self._wide: list[tuple[Kube, Manifest]] = []
 
     def bootstrap(self, cluster: str, rig: Rig) -> Domain:
-        """Apply `bootstrap/<cluster>.yaml` to a cluster and wait until it follows."""
+        """Apply `bootstrap/<cluster>.yaml` to a cluster, and wait until the cluster follows.
+
+        Return the access domain on that cluster.
+        """
         raise NotImplementedError
 
     def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
-        """Apply a bootstrap file; :meth:`remove_wide` removes what is not in a namespace."""
+        """Apply the manifests of a bootstrap file; note the cluster-wide ones for `remove_wide`."""
         kube.apply(*manifests)
         self._wide += [
             (kube, item)
@@ -118,28 +124,31 @@ class StateRepo(Generic[Domain]):
         ]
 
     def remove_wide(self) -> None:
-        """Remove what :meth:`apply` put into no namespace."""
+        """Remove the cluster-wide objects that :meth:`apply` made."""
         for kube, item in self._wide:
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
         self._wide.clear()
 
     def remove(self) -> None:
-        """Remove the state repo from its clusters. The namespace stays."""
+        """Stop the generator and remove the state repo's objects from its clusters.
+
+        The namespace stays.
+        """
         raise NotImplementedError
 
     @property
     def domain(self) -> Domain:
-        """The access domain, if only one cluster follows."""
+        """The access domain, if exactly one cluster follows the state repo."""
         (only,) = self.domains.values()
         return only
 
     def file(self, path: str) -> str:
-        """Return the content of a file at the remote."""
+        """Return the content of a file on the remote's main."""
         self._pull()
         return (self.person.folder / path).read_text()
 
     def tip(self) -> str:
-        """Return the tip of the remote."""
+        """Return the newest commit on the remote's main."""
         self._pull()
         return self.person.git("rev-parse", "HEAD")
 
@@ -154,7 +163,7 @@ class StateRepo(Generic[Domain]):
         return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
 
     def push(self, files: Mapping[str, str | None], message: str = "by hand") -> str:
-        """Commit and push files as a person would, again if the generator was first."""
+        """Commit and push files as a person would; try again if the generator pushed first."""
         while True:
             self._pull()
             try:
@@ -164,17 +173,20 @@ class StateRepo(Generic[Domain]):
                     raise
 
     def demand(self, goal: dict[str, Any]) -> Sent:
-        """Send a goal that must succeed."""
+        """Send a goal, check that it succeeds, and return it with its answer."""
         sent = self.client.call(goal)
         assert sent.status == "succeeded", sent.message
         return sent
 
     def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Send the goal of a step and follow it to the pods of the only cluster."""
+        """Send the goal of a step, and `follow` it."""
         return self.follow(self.demand(demand(number)), wanted, wake=wake)
 
     def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Follow a goal that succeeded until the cluster is exactly as wanted."""
+        """Wait until the only cluster has exactly the wanted lines after a goal that succeeded.
+
+        Return when the goal reached each stage. With `wake` the test triggers the controller.
+        """
         domain = self.domain
         if wake:
             domain.wake()
@@ -206,7 +218,7 @@ def demandops(folder: Path, *arguments: str) -> str:
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return the environment of our own processes: data and logs in `folder`, loopback only."""
+    """Return the environment for DemandOps: data and logs in `folder`, ROS on loopback."""
     return {
         **os.environ,
         "DEMANDOPS_DATA_HOME": str(folder / "data"),

@@ -1,6 +1,6 @@
 """Tests that are the same with each controller.
 
-A test module imports those that it runs; its `world` fixture decides the controller.
+A test module imports the tests that it runs. Its fixture `world` decides the controller.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def test_eight_steps_and_the_fusion_is_never_restarted(world: World, say: Report
 def test_a_service_that_cannot_start_is_reconfigured_and_removed(
     world: World, edge_is_full: object
 ) -> None:
-    """Demands do not wait for it. Helm itself would wait five minutes."""
+    """Demands do not wait for the service. By default Helm would wait for it for five minutes."""
     domain = world.domain
     for step in (1, 2, 3):
         sent = world.demand(expected.demand(step))
@@ -79,7 +79,7 @@ def test_a_service_that_cannot_start_is_reconfigured_and_removed(
 
 
 def running(world: World) -> Namespace:
-    """Return the domain after step 1, with nothing left to reconcile."""
+    """Demand step 1, and return the domain once everything is reconciled."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
     domain: Namespace = world.domain
     domain.wait_releases()
@@ -132,9 +132,10 @@ def test_plain_manifests_and_releases_are_restored(world: World) -> None:
 
 
 def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
-    """The cluster has no metrics, so its own autoscaler only keeps the bounds, every 15 seconds.
+    """The GitOps controller leaves the number of replicas to an autoscaler, if there is one.
 
-    The fusion's chart is one that names a number in its Deployment, as another's chart may.
+    The cluster has no metrics, so its autoscaler only enforces the bounds, every 15 seconds. The
+    fusion's chart has a fixed number in its Deployment, as a third party's chart may have.
     """
     domain, name = world.domain, DETECTION["vehicle00"]
 
@@ -147,14 +148,14 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         return (found["spec"]["minReplicas"], found["spec"]["maxReplicas"]) if found else None
 
     def merge(files: dict[str, str | None]) -> None:
-        """Merge files, which the next demand has rendered, and wait until they are applied."""
+        """Push files, demand step 1, and wait until the newest commit is applied."""
         world.push(files)
         world.demand(expected.demand(1))
         domain.wake()
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Have replicas set as by an autoscaler, and something set that must be set back."""
+        """Set replicas as an autoscaler does, and an image; wait until the image is restored."""
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)
@@ -164,8 +165,8 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
     original = world.file(APPDEF)
     merge(_autoscaled(world))
-    domain.kube.apply(world.file(f"bootstrap/{CLUSTER}.yaml"))  # the account may have autoscalers
-    domain.restore(*DETECTION.values(), FUSION)  # which failed without this right
+    domain.kube.apply(world.file(f"bootstrap/{CLUSTER}.yaml"))  # allows autoscalers
+    domain.restore(*DETECTION.values(), FUSION)  # they failed without that right
     domain.kube.wait("an autoscaler", lambda: bounds() == (2, 4))
     domain.kube.wait("two replicas", lambda: (replicas(), replicas(FUSION)) == (2, 2))
     domain.wait_releases()
@@ -188,7 +189,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
 
 def _autoscaled(world: World) -> dict[str, str | None]:
-    """Return the application with autoscalers; the fusion's chart names a number all the same."""
+    """Return the files of an application with autoscalers, whose fusion has a fixed number."""
     chart, registry = f"{CHART}/Chart.yaml", "registry/charts.yaml"
     deployment = "appdefs/charts/ros-service/templates/_deployment.yaml"
     named = re.sub(
@@ -210,9 +211,10 @@ def _autoscaled(world: World) -> dict[str, str | None]:
 
 
 def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World) -> None:
-    """The state repo moves to the other controller, but this cluster was not prepared.
+    """The state repo moves to the other controller while the cluster still runs the former one.
 
-    `demandops upgrade` prints what to do before, which is impossible on an unreachable cluster.
+    `demandops upgrade` prints how to retire the former controller first. This is impossible on a
+    cluster that cannot be reached.
     """
     domain = world.domain
     other, foreign = {"flux": ("argocd", "Application"), "argocd": ("flux", "HelmRelease")}[
@@ -227,7 +229,7 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
     demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", other)
     domain.wake()
     domain.wait_attempted(world.tip())
-    domain.kube.wait(  # a retry clears the error for a moment
+    domain.kube.wait(  # each retry clears the error for a moment
         f"the controller to fail on each {foreign}", lambda: foreign in domain.folder_trouble()
     )
     assert domain.pods() == before
@@ -242,13 +244,13 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
 
 
 def _controller(rig: Rig) -> list[str]:
-    """Make the namespace that golden manifests are for; return the controller's kinds."""
+    """Make the namespace of the golden manifests; return the controller's kinds, and Deployment."""
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
     return [*PARTS[rig.gitops].KINDS, "Deployment"]
 
 
 def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
-    """Golden manifests before the judge: the API server's dry run, with the real definitions."""
+    """The API server checks each golden manifest in a dry run, with the controller's CRDs."""
     kinds = _controller(rig)
     manifests = list(golden(rig.gitops))
     assert {*kinds, "Role"} <= {manifest["kind"] for manifest in manifests}
@@ -256,7 +258,7 @@ def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
 
 
 def test_the_server_does_look(rig: Rig) -> None:
-    """The dry run means something: a field that does not exist is not taken."""
+    """The dry run does refuse a manifest with an unknown field."""
     for kind in _controller(rig):
         broken = copy.deepcopy(next(item for item in golden(rig.gitops) if item["kind"] == kind))
         broken["spec"]["interwal"] = "1m"

@@ -1,4 +1,4 @@
-"""A table of the time that each stage takes from a goal to its pods."""
+"""The times of the stages between a goal and its pods, and a table of them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ _STAGES = ("committed", "pushed", "fetched", "applied", "ready", "in all")
 
 @dataclass(frozen=True)
 class Times:
-    """When a demand reached each stage, on one monotonic clock, in seconds.
+    """The monotonic times in seconds at which a demand reached each stage.
 
-    `committed` and `pushed` are from the node's feedback; a poll every 0.1 s sees the others.
+    `committed` and `pushed` come from the node's feedback. The test finds the later ones by a poll
+    every 0.1 s.
     """
 
     goal: float

@@ -1,4 +1,4 @@
-"""What a pod's volumes hold, as a kubelet puts it there."""
+"""The content of a pod's volumes, as a kubelet provides it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.e2e.rig.kube import Kube
 
 
 def files(kube: Kube, namespace: str, account: str, volume: dict[str, Any]) -> dict[str, bytes]:
-    """Return the files of a volume of the namespace, for a pod of a service account.
+    """Return the content of a volume's files by name, for a pod of a service account.
 
     Raises:
         LookupError: if its ConfigMap or Secret does not exist.

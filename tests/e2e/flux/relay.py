@@ -14,7 +14,7 @@ _CHUNK = 64 * 1024
 
 
 class Relay:
-    """Forwards connections to the server of `url`; `pulls` counts the fetches through it."""
+    """Forwards connections to the server of a URL; `pulls` counts the fetches through the relay."""
 
     def __init__(self, url: str) -> None:
         self._to = urlsplit(url)
@@ -27,7 +27,7 @@ class Relay:
 
     @property
     def url(self) -> str:
-        """Return the same URL through this link."""
+        """The server's URL, but with the relay's address."""
         return urlunsplit(self._to._replace(netloc=f"{LOOPBACK}:{self._port}"))
 
     def restore(self) -> None:
@@ -37,10 +37,10 @@ class Relay:
         threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
 
     def cut(self) -> None:
-        """Refuse connections and close the open ones."""
+        """Refuse new connections and close the open ones."""
         if self._listener is not None:
             with contextlib.suppress(OSError):
-                self._listener.shutdown(socket.SHUT_RDWR)  # or its thread would still accept
+                self._listener.shutdown(socket.SHUT_RDWR)  # else the thread would still accept
             self._listener.close()
             self._listener = None
         with self._lock:
@@ -67,7 +67,7 @@ class Relay:
 
     @contextlib.contextmanager
     def _known(self, end: socket.socket) -> Iterator[None]:
-        """Register an open socket for `cut` during the block."""
+        """List a socket as open during the block, so that `cut` closes it."""
         with self._lock:
             self._open.add(end)
         try:

@@ -1,4 +1,4 @@
-"""Charts and golden manifests before the judge: the real helm, and the API server's dry run."""
+"""The real helm and the API server's dry run accept the charts and all golden manifests."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CHARTS = {
 }
 
 
-# Every corner that a person may set and no golden case does.
+# Values that a person may set and that no golden case has.
 _COMMON: dict[str, dict[str, Any]] = {
     "as it comes": {},
     "all set": {
@@ -96,7 +96,7 @@ def namespace(rig: Rig) -> str:
 
 @pytest.fixture(scope="module")
 def charts(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return the charts in a copy of `appdefs/`, where helm may put their library."""
+    """Return the charts' folders by name, in a copy of `appdefs/` that helm may write to."""
     top = tmp_path_factory.mktemp("appdefs")
     for folder in reversed(APPDEFS):
         shutil.copytree(folder, top, dirs_exist_ok=True)
@@ -141,7 +141,7 @@ def test_every_golden_release_gives_what_the_server_takes(
 
 
 def templated(rig: Rig, chart: Path, values: Path, release: str) -> list[Manifest]:
-    """What helm makes of a chart, with the namespace that it would install into."""
+    """Return the manifests that helm renders of a chart, with the namespace of an install."""
     text = rig.helm(
         "template", release, str(chart), f"--namespace={NAMESPACE}", f"--values={values}"
     )
@@ -153,7 +153,10 @@ def templated(rig: Rig, chart: Path, values: Path, release: str) -> list[Manifes
 
 @pytest.mark.parametrize("case", CASES_OF_GOLDEN)
 def test_kustomize_builds_the_folder_of_a_domain(case: str, tmp_path: Path) -> None:
-    """As docs/flux.md says. A folder has no kustomization.yaml, which each release would change."""
+    """The result of `kubectl kustomize` is what the folder contains.
+
+    The folder itself has no kustomization.yaml, because each new release would change that file.
+    """
     files = {
         path: text
         for step in whole(case).values()
@@ -184,7 +187,10 @@ class TestCheck:
     def checked(
         self, rig: Rig, checkout: Path, demandops: Run, monkeypatch: pytest.MonkeyPatch
     ) -> Callable[..., tuple[int, list[str], str]]:
-        """Return a function that changes files and checks: exit code, errors, output."""
+        """Return a function that changes files and runs `demandops check`.
+
+        It returns the exit code, the lines of errors, and the output.
+        """
         monkeypatch.setenv(HELM_BIN, str(rig.helm_program()))
 
         def check(files: Mapping[str, tuple[str, str]]) -> tuple[int, list[str], str]:

@@ -1,4 +1,4 @@
-"""Two clusters on one state repo; the vehicles' cluster may lose its link."""
+"""Two clusters follow one state repo; the link of the vehicles' cluster can be cut."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLUSTERS, INVENTORY = "inventory/clusters.yaml", "inventory/nodes.yaml"
 
 @pytest.fixture(scope="module")
 def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """The vehicles' own cluster; it reads the same Git server."""
+    """The vehicles' own cluster, which reads the same Git server as the first one."""
     cluster = Rig(FLEET, nodes=VEHICLES, git_of=rig, report=say)
     if rig.existing and cluster.existing == rig.existing:
         pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} does not name a second cluster")
@@ -42,7 +42,7 @@ def link(rig: Rig) -> Iterator[Relay]:
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[World]:
-    """A state repo whose inventory has the vehicles in a cluster of their own."""
+    """A state repo that both clusters follow; its inventory has the vehicles in the second one."""
     made = make_world()
     clusters = yaml.safe_load(made.file(CLUSTERS))
     clusters["clusters"].append({"name": FLEET})
@@ -56,7 +56,7 @@ def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[
     url = rig.git_url(made.name)
     made.bootstrap(FLEET, fleet, url=url if rig.existing else link.url + made.name)
     yield made
-    made.remove()  # while both clusters run
+    made.remove()  # both clusters still run
 
 
 def test_each_cluster_gets_the_services_of_its_own_nodes(world: World) -> None:
@@ -126,7 +126,7 @@ def pod_uids(domain: Domain) -> set[str]:
 
 
 def applied_since(domain: Domain, commit: str) -> list[str]:
-    """Return the commits that the Kustomization has applied after a commit, newest first."""
+    """Return the commits that the Kustomization has applied since a commit, newest first."""
     history = domain.get("Kustomization", domain.name)["status"]["history"]
     commits = [entry["metadata"]["revision"].rpartition(":")[2] for entry in history]
     return commits[: commits.index(commit)]

@@ -1,4 +1,4 @@
-"""A part is killed and restarted in each step, and the end state is the same."""
+"""In each step of the experiment a part is killed and restarted; the end state stays the same."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_eight_steps_with_a_kill_in_each(world: World, rig: Rig, say: Report) ->
 
 
 def helm_at_work(world: World, goal: dict[str, Any]) -> None:
-    """Kill helm-controller as soon as a release is stored: pending, or just installed."""
+    """Kill helm-controller as soon as Helm has stored a release, pending or just installed."""
     domain = world.domain
     world.demand(goal)
     domain.wake()
@@ -72,7 +72,7 @@ def send_until_committed(world: World, goal: dict[str, Any]) -> None:
 
 
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
-    """The demand is committed and cannot be pushed; the next run publishes it."""
+    """Kill the generator with a commit that it cannot push; the next generator pushes it."""
     before = world.tip()
     world.rig.stop_component("git")
     try:
@@ -89,10 +89,10 @@ def generator_without_git(world: World, goal: dict[str, Any]) -> None:
 
 
 def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
-    """Its `git push` survives it and may arrive; the next run notices, and the client sends again.
+    """Kill the generator in a `git push`, then start it again and repeat the goal.
 
-    The goal must add demands: a repeated release has nothing to release, so it could never make a
-    second commit.
+    The push survives the generator and may succeed, which the next generator notices. The goal must
+    add demands: if it released some, its repetition could never make a second commit.
     """
     world.rig.pause("git")
     try:

@@ -1,7 +1,7 @@
-"""The generator's chart: what helm and the API server take, and its pods on the real API.
+"""The generator's chart: helm and the API server accept it, and its pods work with the real API.
 
-The cluster's nodes are simulated, so each pod's container is started here as a kubelet would start
-it: the pod as the API has it, its volumes, its user, and a token of its account.
+The cluster's nodes are simulated. So these tests start each pod's container as a kubelet would:
+from the pod's spec in the API, with its volumes, its user, and a token of its account.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def test_the_chart_is_refused_without_what_it_needs(rig: Rig, missing: str) -> N
 
 
 class Deployed:
-    """The chart as an operator installs it; its state repo's Git server wants a token."""
+    """The installed chart, with a state repo on a Git server that requires a user and password."""
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int) -> None:
         self.rig, self.folder, self._port = rig, folder, free_port()
@@ -137,7 +137,7 @@ class Deployed:
         self._git.wait(10)
 
     def start(self, *pods: Pod) -> None:
-        """Start pods and wait until each is the leader or stands by."""
+        """Start the containers of pods; wait until each is the leader or a standby."""
         for pod in pods:
             pod.start()
         for pod in pods:
@@ -157,7 +157,7 @@ class Deployed:
         return dict(found.get("spec") or {})
 
     def subjects(self) -> str:
-        """Return the first lines of the commits."""
+        """Return the subject lines of all commits on main, newest first."""
         return git(self.repository, "log", "--format=%s", "main")
 
     def close(self) -> None:
@@ -191,7 +191,7 @@ def deployed(
 
 @pytest.fixture
 def active(deployed: Deployed) -> Pod:
-    """The pod that answers."""
+    """The pod that is the leader."""
     (pod,) = [pod for pod in deployed.pods if _leads(pod)]
     return pod
 
@@ -299,7 +299,7 @@ def test_a_pod_that_loses_the_lease_ends(deployed: Deployed, active: Pod) -> Non
 
 
 def _leads(pod: Pod) -> bool:
-    """Return whether a pod serves the actions."""
+    """Return whether a pod is the leader, which serves the ROS actions."""
     return pod.code is None and "taking demands on" in pod.text()
 
 

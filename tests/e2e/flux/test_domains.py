@@ -1,6 +1,6 @@
-"""An access domain's service account changes only the domain's own namespace.
+"""An access domain's service account can change only the domain's own namespace.
 
-Each case commits to the domain's folder what a mistake or an attacker might commit there.
+Each case commits to the domain's folder what a mistake or an attacker might commit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BASE = "clusters/c-its/perception/foreign/kustomization.yaml"
 def neighbour(rig: Rig) -> Iterator[Domain]:
     rig.kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NEIGHBOUR}})
     domain = Domain(rig.kube, NEIGHBOUR, "none")
-    # Kubernetes itself creates both
+    # Kubernetes creates the service account and the ConfigMap
     rig.kube.wait("the account", lambda: rig.kube.get("ServiceAccount", "default", NEIGHBOUR))
     rig.kube.wait("the root", lambda: rig.kube.get("ConfigMap", "kube-root-ca.crt", NEIGHBOUR))
     yield domain
@@ -42,7 +42,10 @@ SlipIn = Callable[..., None]
 
 @pytest.fixture
 def slip_in(world: World, neighbour: Domain) -> Iterator[SlipIn]:
-    """Commit manifests to the domain's folder and wait until Flux has tried them."""
+    """Return a function that commits manifests to the domain's folder.
+
+    It waits until Flux has tried to apply them. The end of the test removes them.
+    """
 
     def push(*manifests: dict[str, Any], file: str = FILE) -> None:
         text = "\n---\n".join(json.dumps(manifest) for manifest in manifests)
@@ -55,7 +58,7 @@ def slip_in(world: World, neighbour: Domain) -> Iterator[SlipIn]:
 
 
 def remove_committed(world: World) -> None:
-    """Remove the committed file if it still exists, and wait until Flux applies the commit."""
+    """Remove the committed files that still exist, and wait until Flux has applied that."""
     commit = world.tip()
     if there := {FILE, BASE} & set(world.person.git("ls-files").split()):
         commit = world.push(dict.fromkeys(there))
@@ -66,7 +69,7 @@ def remove_committed(world: World) -> None:
 def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applied(
     world: World, neighbour: Domain, slip_in: SlipIn
 ) -> None:
-    """Services run on. With the next demand the generator removes the file."""
+    """Services run on, and the generator removes the file with the next demand."""
     domain, untouched = world.domain, neighbour.inventory()
     world.step(1, expected.after(1))
     slip_in(config("foreign", NEIGHBOUR), config("own", domain.namespace))
@@ -82,7 +85,7 @@ def config(name: str, namespace: str) -> dict[str, Any]:
 
 
 def release(**spec: Any) -> dict[str, Any]:
-    """Return a release of the detection's chart for the neighbour's namespace."""
+    """Return a HelmRelease of the detection's chart that targets the neighbour's namespace."""
     chart = {"kind": "HelmChart", "name": "object-detection-0.1.0"}
     spec = {"interval": "10m", "chartRef": chart, "targetNamespace": NEIGHBOUR, **spec}
     return build_manifest(
@@ -158,7 +161,7 @@ def test_a_base_is_not_fetched_from_elsewhere(
 
 
 def test_the_cluster_refuses_pods_that_the_domain_may_not_have(world: World) -> None:
-    """Whoever makes them, and whatever object they come from."""
+    """Even an administrator's pods are refused, whatever kind of object makes them."""
     kube = world.domain.kube
     told = {
         (name, maker["kind"]): kube.refusal(maker)
@@ -180,12 +183,12 @@ def test_what_the_cluster_refuses_of_a_commit_is_reported(world: World, slip_in:
 
 
 def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
-    """The policy changes, the generator writes another bootstrap file, and someone applies it."""
+    """The policy no longer allows host-network, and the operator applies the new bootstrap file."""
     domain = world.domain
     nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
     policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")
     world.push({NODES: nodes, POLICY: policy})
-    sent = world.demand(expected.demand(2))  # whether or not it is booked, the generator follows
+    sent = world.demand(expected.demand(2))  # booked or not, it makes the generator fetch
     bootstrap = world.file("bootstrap/c-its.yaml")
     assert "podSecurity: baseline" in bootstrap
     world.apply(domain.kube, list(yaml.safe_load_all(bootstrap)))
@@ -202,7 +205,7 @@ def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
 
 
 def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = None) -> None:
-    """Wait until the Kustomization, or the release that it created, reports a refusal."""
+    """Wait until the Kustomization reports a refusal, or the release of `manifest` if it is one."""
     objects = [("Kustomization", domain.name)]
     if manifest is not None and manifest["kind"] == "HelmRelease":
         objects.append(("HelmRelease", manifest["metadata"]["name"]))

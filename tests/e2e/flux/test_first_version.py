@@ -1,4 +1,4 @@
-"""A state repo that the first version wrote is upgraded while its services run."""
+"""A state repo of DemandOps' first version is upgraded while its services run."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_an_upgrade_from_the_first_version_restarts_the_fusion_alone(
     after = domain.pods()
     assert after.keys() == before.keys()
     assert {name for name in before if after[name] != before[name]} == {expected.FUSION}
-    world.bootstrap(CLUSTER, rig)  # as the upgrade says
+    world.bootstrap(CLUSTER, rig)  # the upgrade requires this
     assert domain.pods() == after
     (fusion,) = domain.find("HelmRelease", expected.FUSION)
     assert fusion["metadata"]["labels"]["app.kubernetes.io/part-of"] == "object-detection-fusion"

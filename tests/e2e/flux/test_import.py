@@ -1,6 +1,6 @@
-"""The move from the reference on a real API: `demandops import`, and all of docs/migration.md.
+"""The move from the reference, with a real API: `demandops import`, and all of docs/migration.md.
 
-The definitions of the reference's custom resources are ours: its names, and any content.
+The tests' CRDs have the names of the reference's custom resources and allow any content.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RBAC = "rbac.authorization.k8s.io/v1"
 
 @pytest.fixture
 def reference(rig: Rig, tmp_path: Path) -> Iterator[Reference]:
-    """The reference after the first steps of the experiment, and its definitions in the cluster."""
+    """The reference after the first steps of the experiment; the cluster has its CRDs."""
     made = Reference()
     for path in EXPERIMENT[:STEPS]:
         made.send(yaml.safe_load(path.read_text()))
@@ -102,7 +102,7 @@ def test_the_resources_of_the_reference_are_read_from_a_cluster(
 
 
 class Shell:
-    """Runs the commands of the page, in a folder whose repositories the cluster can fetch."""
+    """Runs the page's commands in a folder from which the cluster can fetch repositories."""
 
     def __init__(self, rig: Rig, folder: Path, volumes: Path) -> None:
         self.folder = rig.repository("any.git").parent
@@ -116,17 +116,17 @@ class Shell:
         }
         self._here = {
             "https://git.example/fleet.git": rig.git_url("fleet.git"),
-            "/bookkeeping_data/": f"{volumes}/",  # a fake pod has the files of this machine
+            "/bookkeeping_data/": f"{volumes}/",  # a fake pod has no files of its own
         }
 
     def commands(self, title: str) -> list[str]:
-        """Return the commands of a section that end by themselves."""
+        """Return the commands in a section of the page, without those that never end."""
         (section,) = re.findall(rf"^## (?:\d\. )?{title}$(.*?)(?=^## |\Z)", PAGE, re.M | re.S)
         found = re.findall(r"^    (\S.*)$", section, re.MULTILINE)
         return [one for one in found if not one.startswith(("ros2 ", "demandops serve "))]
 
     def run(self, *commands: str) -> str:
-        """Run commands and return what the last one prints."""
+        """Run commands in turn; return what the last one prints."""
         printed = ""
         for command in commands:
             text = command
@@ -146,7 +146,7 @@ class Shell:
 
 
 def left_by_the_reference() -> Iterator[Manifest]:
-    """Yield what its installation makes beside definitions and resources; names are any."""
+    """Yield what an installation of the reference has, besides its CRDs and custom resources."""
     for operator in ("mqtt", "object-detection", "object-fusion"):
         name = f"kopf-operator-{operator}"
         metadata = {"labels": {"app": name}}

@@ -1,4 +1,4 @@
-"""Overrides that a person merges reach the cluster, stay during demands, and can be removed."""
+"""Merged overrides reach the cluster, stay in effect during demands, and can be removed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_overrides_arrive_stay_and_go(world: World) -> None:
             ),
         }
     )
-    for vehicle in ("vehicle02", "vehicle03"):  # the first commit contains them
+    for vehicle in ("vehicle02", "vehicle03"):  # the first demand's commit applies the overrides
         sent = world.demand(requested_by(vehicle, goal))
         domain.wake()
         domain.wait_applied(sent.commit)
@@ -66,7 +66,7 @@ def test_a_denial_stops_a_service_and_a_keep_restores_it(world: World) -> None:
     world.follow(world.demand(goal), expected.after(1))
     fields = yaml.safe_load(override({"nodes": ["*"]}, deny=True))
     world.push({"overrides/closed.yaml": yaml.safe_dump(fields)})
-    sent = world.demand(goal)  # its claims stay booked, and are suspended
+    sent = world.demand(goal)  # the claims stay booked while suspended
     world.follow(sent, expected.WITHOUT_DEMANDS)
     fields["keep"] = fields.pop("deny")
     world.push({"overrides/closed.yaml": yaml.safe_dump(fields)})

@@ -1,7 +1,7 @@
-"""Services that the generator places: they wait for room, leave a drained node, and run apart.
+"""Services that the generator places wait for room, leave a drained node, and run side by side.
 
-Each application has a fusion that needs a GPU, which two nodes have. Whatever moves, the
-connections come with it, and what need not move is not restarted.
+Each application has a fusion that needs a GPU, which two nodes have. The connections of a service
+move together with it. A service that need not move is not restarted.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def test_services_wait_follow_a_drain_and_an_override_and_run_apart(
 
 
 def merge(world: World, requester: DemandClient, files: dict[str, str | None]) -> None:
-    """Merge files as a person; the renewal has the generator fetch them at once."""
+    """Push files as a person; the renewal of a demand makes the generator fetch them at once."""
     world.push(files)
     requester.renew("first")
 
@@ -73,7 +73,7 @@ def application(id: str, vehicle: str) -> dict[str, Any]:
 
 
 def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> set[tuple[str, str]]:
-    """Return the pods of an application, without hashes, each with its node."""
+    """Return the expected pods of an application, without hashes, each with its node."""
     ways = [(vehicle, node), *([(node, vehicle)] if delivered else [])]
     clients = {
         (f"mqtt-derived-{source}-{target}-{side}", end)
@@ -84,7 +84,7 @@ def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> set[t
 
 
 def wait_for(world: World, wanted: set[tuple[str, str]]) -> None:
-    """Wait until exactly these pods run."""
+    """Wait until exactly these pods run, given by name and node."""
 
     def found() -> set[tuple[str, str]]:
         lines = world.domain.lines()
@@ -118,7 +118,7 @@ def definitions(world: World) -> dict[str, str | None]:
 
 
 def gpus(world: World, *, drained: str = "", **count: int) -> dict[str, str | None]:
-    """Return the inventory with so many GPUs of some nodes."""
+    """Return the inventory file with these numbers of GPUs by node, and one node drained."""
     inventory = yaml.safe_load(world.file(NODES))
     for node in inventory["nodes"]:
         if node["id"] in count:

@@ -1,4 +1,4 @@
-"""An autoscaler sets the number of replicas, and nothing sets it back."""
+"""An autoscaler sets the number of replicas, and Flux does not reset it."""
 
 from tests.e2e.common.steps import test_an_autoscaler_owns_the_number_of_replicas
 

@@ -1,7 +1,7 @@
-"""An application whose services run on three nodes: each topic crosses once, while it is read.
+"""An application with services on three nodes; connections carry each topic once while it is read.
 
-A driver at each vehicle, shared by all applications. At the edge a detection for each driver, a
-fusion, and a planner, whose plan is delivered to the vehicles.
+Each vehicle has a driver, which all applications share. At the edge are a detection for each
+driver, a fusion, and a planner. The plan is delivered to the vehicles.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PLANNER = "plan-edge-object-detection-fusion-440d666b5404"
 FUSED = "/edge_object_detection_fusion_global_objectlist"
 PLAN = "/edge_object_detection_fusion_plan"
 SIDES = ("source", "target")
-CLIENTS = {  # of the derived connections, by their nodes
+CLIENTS = {  # digests in the clients' names, by the nodes of their derived connection
     ("vehicle00", "edge"): ("749e95da341a", "62cce3e93c69"),
     ("vehicle01", "edge"): ("a6f86d82e5e2", "94affd7d6964"),
     ("edge", "vehicle00"): ("49db83c4f763", "c327804aa445"),
@@ -39,7 +39,7 @@ def test_four_services_on_three_nodes_serve_two_vehicles(
 ) -> None:
     domain = world.domain
     world.push(definitions(world))
-    at_first = domain.inventory() | {"HelmChart ros-launch-0.2.0"}  # of the next commit
+    at_first = domain.inventory() | {"HelmChart ros-launch-0.2.0"}  # from the next commit on
     put(world, requester, "vehicle00", "vehicle01")
     assert_exact(domain, "vehicle00", "vehicle01")
     before = domain.pods()
@@ -56,7 +56,7 @@ def test_four_services_on_three_nodes_serve_two_vehicles(
 
 
 def definitions(world: World) -> dict[str, str | None]:
-    """Return the example's object detection, which reads the shared driver, with a planner."""
+    """Return the files of an appdef that reads the example's shared driver and has a planner."""
     files = {
         path.relative_to(EXAMPLE).as_posix(): path.read_text()
         for path in (EXAMPLE / "appdefs").rglob("*")
@@ -114,7 +114,7 @@ def ego_data(vehicle: str) -> str:
 
 
 def put(world: World, requester: DemandClient, *vehicles: str) -> None:
-    """Demand the application for these vehicles, and its plan for each of them."""
+    """Demand the application for these vehicles, with its plan delivered to each."""
     application = {
         "id": "edge/object_detection_fusion",
         "type": "object-detection-fusion",
@@ -135,7 +135,7 @@ def follow(world: World) -> None:
 
 
 def assert_exact(domain: Namespace, *vehicles: str) -> None:
-    """Wait until exactly what these vehicles need runs, where it must, with its topics."""
+    """Wait until exactly the pods for these vehicles run on their nodes, then check all topics."""
     wanted = WITHOUT_DEMANDS | set(lines(*vehicles))
     domain.wait_lines(wanted)
     domain.wait_releases()
@@ -158,7 +158,7 @@ def assert_exact(domain: Namespace, *vehicles: str) -> None:
 
 
 def lines(*vehicles: str) -> Iterator[str]:
-    """Yield what must exist, and what the fusion reads."""
+    """Yield the lines of what must exist for these vehicles, and of the fusion's inputs."""
     yield from (f"ConfigMap {FUSION}-{part}" for part in ("params", "watcher"))
     services = [(FUSION, "edge"), (PLANNER, "edge")]
     clients = []
@@ -177,8 +177,8 @@ def lines(*vehicles: str) -> Iterator[str]:
 
 
 def carried(domain: Namespace) -> list[tuple[str, str, str]]:
-    """Return the node that each topic comes from, the topic, and the node that it goes to."""
-    sent, received = [], []  # each with its place at the broker, which both ends must know
+    """Return each carried topic as its source node, its name and its target node, sorted."""
+    sent, received = [], []  # also with broker and MQTT topic, which must be equal at both ends
     for config in domain.find("ConfigMap"):
         if "params.yaml" in config["data"]:
             (found,) = yaml.safe_load(config["data"]["params.yaml"]).values()

@@ -1,7 +1,8 @@
-"""One machine in two access domains: each has its own namespace, account and ROS domain there.
+"""One node in two access domains, each of which has its own namespace, account and ROS domain.
 
-The edge is in the skeleton's domain, and in a second one of a city, whose requesters may not use it
-in the first. Both have an application on it that detects objects in the same topic of a vehicle.
+The edge is in the skeleton's domain and in a second one, of a city. The city's requesters may use
+the edge only in the city's domain. In each domain an application on the edge detects objects in the
+same topic of a vehicle.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ FLEETS = {
     ("mqtt-derived-vehicle00-edge-target", "edge"),
 }
 SENT_TO_THE_CITY = {("mqtt-derived-vehicle00-edge-city-source", "vehicle00")}
-"""The vehicle is in the first domain, so its end of the connection is there too."""
+"""The vehicle's end of the city's connection, which is in the vehicle's domain, the first one."""
 CITYS = {
     ("od-edge-city-vehicle00", "edge"),
     ("of-edge-lights", "edge"),
@@ -44,7 +45,7 @@ CITYS = {
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
-    """A state repo with two access domains, which the cluster follows; no demand."""
+    """A state repo with two access domains and no demand, which the cluster follows."""
     made = make_world()
     made.push(two_domains(made))
     made.generator.start()
@@ -64,7 +65,7 @@ def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
             rig.kube.wait_ready("HelmChart", name_of(chart), domain.namespace)
         domain.wait_lines(WITHOUT_DEMANDS)
     yield made
-    made.remove()  # while its namespaces are there
+    made.remove()  # its namespaces still exist
     rig.kube.delete("Namespace", CITY)
 
 
@@ -99,13 +100,13 @@ def test_two_domains_share_a_machine_and_nothing_else(
 
 
 def application(id: str) -> dict[str, Any]:
-    """Return an application on the edge; in which of its domains, the requester's rules say."""
+    """Return an application on the edge; the requester's policy rules decide its access domain."""
     inputs = {"point_cloud": [{"topic": CLOUD, "source": "vehicle00"}]}
     return {"id": id, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
 
 
 def two_domains(world: World) -> dict[str, str]:
-    """Return the skeleton's policy and inventory, with the edge in a second domain."""
+    """Return the skeleton's policy and inventory files, with the edge in a second domain too."""
     policy, inventory = (yaml.safe_load(world.file(path)) for path in (POLICY, NODES))
     (first,) = policy["domains"]
     second = first | {
@@ -127,7 +128,7 @@ def two_domains(world: World) -> dict[str, str]:
 
 
 def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
-    """Wait until exactly these pods run in each domain."""
+    """Wait until exactly these pods, given by name and node, run in each domain."""
 
     def same() -> bool:
         for domain in wanted:
@@ -140,16 +141,16 @@ def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
 
 
 def running(domain: Domain) -> set[tuple[str, str]]:
-    """Return the pods of a domain without hashes, each with its node; others as '?'."""
+    """Return the name without hash and the node of each ready pod; '?' for each other pod."""
     lines = (line for line in domain.lines() if line.startswith("pod of "))
     matches = map(_POD.fullmatch, lines)
     return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}
 
 
 def granted(where: Domain, *, of: Domain) -> set[str]:
-    """Return the resources that the account of a domain may use in a namespace.
+    """Return the resources that the account of domain `of` may use in the namespace of `where`.
 
-    Every account may ask what it may do.
+    Reviews of its own rights are left out, because every account may ask for them.
     """
     rules = where.kube.rules("demandops", where.namespace, of.namespace)
     asked = {"authorization.k8s.io", "authentication.k8s.io"}

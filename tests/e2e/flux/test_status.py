@@ -1,4 +1,4 @@
-"""The requester learns with Flux whether its services run."""
+"""With Flux the answer to a demand reports whether its services run."""
 
 from __future__ import annotations
 
@@ -16,4 +16,4 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 
 class TestFlux(Answers):
-    """The tests with Flux."""
+    """The tests of `Answers` with Flux."""

@@ -1,4 +1,4 @@
-"""Releases do not change without a demand: another requester, and manual changes."""
+"""Another requester or a manual change in the cluster leaves releases as they were."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who subscribes to the reference's topics hears programs that start as the pods' containers do."""
+"""A subscriber of the reference's topics receives what the programs in the pods publish."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ OF_THE_REFERENCE = {
     "/edge_object_detection_fusion_global_objectlist": FUSION.replace("-", "_"),
     "/edge_object_detection_fusion_global_trajectories": FUSION.replace("-", "_"),
 }
-"""As object_detection_fusion_app.py of application_manager names them, and who sends there."""
+"""Topics as object_detection_fusion_app.py of application_manager names them, with their nodes."""
 
 
 @pytest.fixture
 def programs(world: World, ros_domain: int, tmp_path: Path) -> Iterator[None]:
-    """What the pods of the first step run, in the tests' ROS domain."""
+    """Run the commands of the first step's pods on this machine, in the tests' ROS domain."""
     world.step(1, after(1))
     setup = tmp_path / "install" / "setup.bash"
     setup.parent.mkdir()

@@ -1,4 +1,4 @@
-"""The state repo leaves this cluster's Flux, which was not prepared: all services run on."""
+"""The state repo moves to Argo CD while the cluster still runs Flux: all services run on."""
 
 from tests.e2e.common.steps import test_a_controller_that_was_not_retired_fails_and_changes_no_pod
 

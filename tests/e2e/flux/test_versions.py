@@ -1,4 +1,4 @@
-"""A demand for another version updates what runs, and its end brings the old version back."""
+"""A demand for another version updates the services, and its end restores the old version."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def versions() -> str:
 
 
 def request(world: World, goal: dict[str, object]) -> None:
-    """Send a demand of our own from the command line, beside the running generator."""
+    """Send a `Demand` from the command line, beside the running generator; await Flux."""
     file = world.folder / "demand.yaml"
     file.write_text(json.dumps(goal))
     demandops(world.folder, "request", str(file), "--state-repo", world.push_url)
@@ -75,7 +75,7 @@ def request(world: World, goal: dict[str, object]) -> None:
 
 
 def images(world: World) -> dict[str, str]:
-    """Return the image of each pod of a service that is not on its way out, by its release."""
+    """Return the image of each service's pod by release, without pods that are being deleted."""
     return {
         name: pod["spec"]["containers"][0]["image"]
         for name in (*DETECTION.values(), FUSION)

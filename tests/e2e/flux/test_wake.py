@@ -1,4 +1,4 @@
-"""The gain from triggering Flux: a demand with `--clusters` does not wait for the next fetch."""
+"""With `--clusters` the generator triggers Flux, so a demand does not wait for the next fetch."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WAKER = {
 def test_a_trigger_saves_the_wait_for_the_next_fetch(
     make_world: MakeWorld, rig: Rig, say: Report
 ) -> None:
-    """The next fetch is ten minutes away, so a demand arrives only by the trigger."""
+    """Flux fetches only every ten minutes, so only the trigger can bring the demand in time."""
     world = make_world()
     domain = world.bootstrap(CLUSTER, rig, interval="10m")
     rights = {domain.namespace: [WAKER]}

@@ -17,7 +17,7 @@ SOURCE = "demandops"  # the GitRepository's name
 
 
 class Domain(Namespace):
-    """The domain's namespace on one cluster; its Kustomization is called `name`."""
+    """The domain's namespace on one cluster; the Kustomization `name` applies the folder."""
 
     GITOPS = "flux"
     RELEASE = "HelmRelease"
@@ -27,15 +27,18 @@ class Domain(Namespace):
     # --- reading ----------------------------------------------------------------------------
 
     def applied(self) -> str:
-        """Return the commit that the Kustomization has applied."""
+        """Return the commit that the Kustomization applied last; empty if none."""
         return _commit(self._status("Kustomization", self.name).get("lastAppliedRevision"))
 
     def fetched(self) -> str:
-        """Return the commit that the source has fetched."""
+        """Return the commit that the GitRepository fetched last; empty if none."""
         return _commit(self._status("GitRepository", SOURCE).get("artifact", {}).get("revision"))
 
     def fetched_files(self) -> list[str]:
-        """Return the paths that the source has fetched; its address must be reachable from here."""
+        """Return the paths that the GitRepository has fetched.
+
+        Downloads the artifact, so source-controller must be reachable from this machine.
+        """
         url = self._status("GitRepository", SOURCE)["artifact"]["url"]
         with (
             urllib.request.urlopen(url, timeout=60) as answer,  # noqa: S310 - the source's own
@@ -44,7 +47,7 @@ class Domain(Namespace):
             return [member.name for member in archive if member.isfile()]
 
     def trouble(self, kind: str, name: str) -> str:
-        """Return why an object is not ready; empty if it is or has not reported yet."""
+        """Return why an object is not ready; empty if it is ready or has reported nothing yet."""
         conditions = self._status(kind, name).get("conditions") or []
         messages = [
             c["message"] for c in conditions if c["type"] == "Ready" and c["status"] == "False"
@@ -57,7 +60,7 @@ class Domain(Namespace):
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
-        # its new artifact triggers the Kustomization
+        # the new artifact of the source triggers the Kustomization
         self.kube.reconcile("GitRepository", SOURCE, self.namespace)
 
     def wait_fetched(self, commit: str, timeout: float = 60.0) -> float:
@@ -112,5 +115,5 @@ class Domain(Namespace):
 
 
 def _commit(revision: str | None) -> str:
-    """Return the commit in a Flux revision (`main@sha1:…`)."""
+    """Return the commit in a Flux revision (`main@sha1:…`); empty without a revision."""
     return (revision or "").rpartition(":")[2]

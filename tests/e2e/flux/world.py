@@ -1,6 +1,6 @@
-"""A state repo, its generator, and the clusters whose Flux follows it.
+"""A state repo, its generator, and the clusters whose Flux follows the state repo.
 
-The clusters get only the manifests that `demandops init` wrote for them.
+Each cluster gets only the bootstrap file that `demandops init` wrote for it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ class World(StateRepo[Domain]):
     """A state repo that Flux follows."""
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
-        """Do so; `source` changes fields of the GitRepository, as a person may with an overlay."""
+        """Apply `bootstrap/<cluster>.yaml` to a cluster, and wait until the cluster follows.
+
+        `source` replaces fields of the GitRepository's spec, as an operator may with an overlay.
+        """
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (git,) = [item for item in manifests if item["kind"] == "GitRepository"]
         git["spec"].update(source)
@@ -40,7 +43,7 @@ class World(StateRepo[Domain]):
             for kind, name in (("Kustomization", domain.name), ("GitRepository", SOURCE)):
                 kube.delete(kind, name, namespace)
                 kube.wait_gone(kind, name, namespace)
-            for kind in ("HelmRelease", "HelmChart"):  # a late deletion would hit the next world's
+            for kind in ("HelmRelease", "HelmChart"):  # else the next world loses its own
                 kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
         self.remove_wide()
         self.domains.clear()

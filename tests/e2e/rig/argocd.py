@@ -27,11 +27,11 @@ CONTROLLER = "argocd-application-controller"
 REPO_SERVER = "argocd-repo-server"
 SERVER = "argocd-server"
 WEBHOOK_SECRET = secrets.token_hex(16)
-"""The key that signs calls of the server's webhook."""
+"""The secret that signs calls of Argo CD's webhook."""
 
 
 def settings() -> list[Manifest]:
-    """Return the manifests that must exist before the parts start; docs/argocd.md requires them."""
+    """Return the manifests that Argo CD's parts need before they start, as docs/argocd.md says."""
     labels = {"app.kubernetes.io/part-of": "argocd"}
     return [
         {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}},
@@ -123,7 +123,7 @@ def _part(
     environment: dict[str, str],
     serves: int | None = None,
 ) -> Component:
-    port = free_port()  # for its health; the controller binds all addresses and has no flag for it
+    port = free_port()  # serves health on all addresses: the controller has no flag for one
     return Component(
         name,
         (str(binary), f"--metrics-port={port}", "--loglevel=info", *arguments),

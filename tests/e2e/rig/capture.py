@@ -1,4 +1,4 @@
-"""Output past pytest's capture: a cold build takes twenty minutes and must not look stuck."""
+"""Print progress although pytest captures output: a cold build takes twenty minutes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .tools import Report
 
 
 def uncaptured(config: pytest.Config) -> Report:
-    """Return a `report` for `Rig` that prints at once, even while pytest captures output."""
+    """Return the `report` of a `Rig`: it prints at once, even while pytest captures output."""
     capture: Any = config.pluginmanager.getplugin("capturemanager")
 
     def say(text: str) -> None:

@@ -1,4 +1,4 @@
-"""A work tree of a served repository, for tests that act as a person or the generator."""
+"""A clone with a work tree, for tests that act as a person or as the generator."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.kit.repo import git
 
 
 class Clone:
-    """A clone; its first push creates the repository."""
+    """A clone of a repository on the rig's Git server, which the first push creates."""
 
     def __init__(self, url: str, folder: Path) -> None:
         self.folder = folder

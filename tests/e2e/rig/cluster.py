@@ -3,8 +3,8 @@
     with Rig("edge", nodes=["edge"]) as rig:
         rig.kube.apply(...)
 
-Only this module knows the order of the starts. With the environment of `settings` it starts
-nothing and represents an existing cluster.
+Only this module knows the order in which the parts start. If the environment names an existing
+cluster (see `settings`), the rig starts nothing and represents that cluster.
 """
 
 from __future__ import annotations
@@ -39,11 +39,12 @@ PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
 class Rig:
     """A cluster; several can run at once, each with its own ports and folder.
 
-    `nodes` are node ids, `gitops` is the controller, and `beside` a second one.
-    `git_of` shares another rig's Git server, so that two clusters read one state repo.
-    `credentials` (user, password) makes the Git server require them. `arguments` adds to a
-    controller's command line, by its name. `folder` is where data and logs go (a temporary folder
-    by default, removed at the end unless a test failed or E2E_KEEP is set).
+    `nodes` are the ids of its nodes. `gitops` is its GitOps controller, and `beside` a second one.
+    `git_of` is another rig whose Git server it uses, so that two clusters read one state repo.
+    `credentials` are a user and a password, which the Git server then requires. `arguments` has
+    further arguments for controllers, by the controller's name. `folder` gets data and logs. By
+    default it is a temporary folder, which is removed at the end unless E2E_KEEP is set; after a
+    failure the logs stay.
     """
 
     kube: Kube
@@ -108,7 +109,7 @@ class Rig:
         work, processes, kube = self._work, self._processes, getattr(self, "kube", None)
         try:
             if kube is not None and self.existing:
-                for name in self._nodes:  # our own cluster is removed with its nodes
+                for name in self._nodes:  # the rig's own cluster goes with its nodes
                     kube.delete("Node", name)
             if kube is not None:
                 kube.close()
@@ -136,7 +137,7 @@ class Rig:
         return f"{self._push_url}/{repository.strip('/')}"
 
     def repository(self, repository: str) -> Path:
-        """Return the bare repository on disk (for hooks and damage); create it if missing."""
+        """Return the folder of a bare repository; create the repository if it is missing."""
         path = self._owned("has no repositories on this disk").repositories / repository.strip("/")
         if self._git_of is not None:
             return self._git_of.repository(repository)
@@ -145,7 +146,7 @@ class Rig:
         return path
 
     def add_nodes(self, node_ids: Iterable[str], timeout: float = 60.0) -> list[str]:
-        """Create fake nodes with these `node_id` labels, wait until Ready; return their names."""
+        """Create fake nodes with these `node_id` labels; return their names once all are Ready."""
         manifests = [kwok.manifest(node_id) for node_id in node_ids]
         names = [manifest["metadata"]["name"] for manifest in manifests]
         self._nodes += names
@@ -168,7 +169,7 @@ class Rig:
         return done.stdout
 
     def helm_program(self) -> Path:
-        """Return the helm command; it is built first if need be."""
+        """Return the path of the helm command; build it first if it is missing."""
         found = self._binaries.get("helm") or shutil.which("helm")
         if found is None:
             found = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
@@ -193,11 +194,11 @@ class Rig:
         return self._own().url(component)
 
     def kill(self, component: str) -> None:
-        """Kill a part, like a crash; `start_component` starts it again."""
+        """Kill a part, which simulates a crash; `start_component` starts it again."""
         self._own().kill(component)
 
     def stop_component(self, component: str) -> None:
-        """Ask a part to end."""
+        """Stop a part: ask it to end, and kill it if it does not."""
         self._own().stop(component)
 
     def start_component(self, component: str) -> None:
@@ -311,7 +312,7 @@ class Rig:
 
 
 class _Clock:
-    """The seconds of each stage of a start."""
+    """Measures the seconds of each stage of a start."""
 
     def __init__(self, timings: dict[str, float]) -> None:
         self._timings, self._last = timings, time.monotonic()

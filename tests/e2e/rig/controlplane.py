@@ -1,7 +1,8 @@
 """The components of a control plane without containers: etcd, API server, controllers, scheduler.
 
-It returns `Component`s and starts nothing itself. Everything listens on loopback. Tests need no
-safe disk, so etcd does not flush; each part runs once, so there is no leader election.
+This module returns `Component`s and starts nothing. Everything listens on loopback. etcd does not
+force writes to disk, because tests need no data after a power cut. Each part runs once, so there is
+no leader election.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class ControlPlane:
 
     @staticmethod
     def plan(binaries: dict[str, Path], folder: Path, pki: Pki) -> ControlPlane:
-        """Return a control plane with free ports."""
+        """Return a control plane, and choose free ports for it."""
         return ControlPlane(binaries, folder, pki, free_port(), free_port())
 
     @property
@@ -72,7 +73,7 @@ class ControlPlane:
             f"--service-cluster-ip-range={_SERVICES}",
             "--authorization-mode=RBAC",
             "--allow-privileged=true",
-            "--kubelet-preferred-address-types=InternalIP",  # for `kubectl exec`
+            "--kubelet-preferred-address-types=InternalIP",  # `kubectl exec` needs it
             # A Service's endpoint must not be on loopback: the API server would refuse its own.
             "--endpoint-reconciler-type=none",
         ]

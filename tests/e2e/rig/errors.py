@@ -1,4 +1,4 @@
-"""The exception of the rig; its text says where, what and the remedy."""
+"""The exception of the rig; its text names the place, the fault and the remedy."""
 
 
 class RigError(RuntimeError):

@@ -1,8 +1,9 @@
 """Flux's source-, kustomize- and helm-controller as plain processes.
 
-They read the cluster from `KUBECONFIG` (they have no flag for it) and run as its administrator.
-The service account of a release, which they impersonate, limits what it may do. They are locked
-down as docs/flux.md requires: an object without an account acts as its namespace's `default`.
+The controllers get the cluster from `KUBECONFIG`, because they have no flag for it, and run as its
+administrator. For a release they impersonate its service account, which limits what the release may
+do. They are locked down as docs/flux.md requires: for an object that names no service account they
+impersonate `default` of its namespace.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def components(
             f"--storage-adv-addr={artifacts}",
         ],
         "kustomize-controller": ["--no-remote-bases=true", *LOCKED_DOWN],
-        # By default it waits up to ten minutes for running releases before it ends.
+        # By default helm-controller waits up to ten minutes for running releases before it ends.
         "helm-controller": ["--graceful-shutdown-timeout=5s", *LOCKED_DOWN],
     }
     return [
@@ -57,9 +58,9 @@ def _component(name: str, binary: Path, kubeconfig: Path, extra: list[str]) -> C
         "--enable-leader-election=false",
         "--watch-all-namespaces=true",
         "--log-level=info",
-        # These shorten waits: half a minute between checks of an unready dependency, three quarters
-        # of a second after an object's first reconcile (which only sets the finalizer), up to a
-        # quarter of an hour after repeated errors, and a random part of every interval.
+        # These shorten the default waits: 30 s between checks of a dependency that is not ready;
+        # 0.75 s after an object's first reconcile, which only sets the finalizer; up to 15 minutes
+        # after repeated errors; and a random part of every interval.
         "--requeue-dependency=1s",
         "--min-retry-delay=50ms",
         "--max-retry-delay=5s",

@@ -1,9 +1,9 @@
 """A smart-HTTP Git server over `git http-backend`, for the state repo.
 
-Runs as its own process (`python githttp.py --root DIR --port N`), so that tests can kill or pause
-it like any other part of the rig. It needs only Python and Git. A push to a missing repository
-creates it. With GIT_HTTP_USER and GIT_HTTP_PASSWORD in its environment it requires them by basic
-authentication.
+The server runs as its own process (`python githttp.py --root DIR --port N`), so that tests can kill
+or pause it like any other part of the rig. It needs only Python and Git. A push to a repository
+that does not exist creates the repository. If GIT_HTTP_USER and GIT_HTTP_PASSWORD are set in its
+environment, it requires that user and password by basic authentication.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PASSWORD_VARIABLE = "GIT_HTTP_PASSWORD"  # noqa: S105 - a variable's name
 HEALTH = "/-/healthz"
 _CHUNK = 64 * 1024
 
-# Overrides the host's configuration. A garbage collection in the background would race with the
-# next push.
+# Git's settings, instead of the host's. A garbage collection in the background would race with
+# the next push.
 _CONFIGURATION = {
     "core.fsync": "none",
     "gc.auto": "0",
@@ -89,7 +89,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def serve(self) -> None:
         """Answer one request."""
-        self.close_connection = True  # answers have no length: closing the connection ends them
+        self.close_connection = True  # else the client waits for the answer's end
         path, _, query = self.path.partition("?")
         path = unquote(path)
         if path == HEALTH:
@@ -129,7 +129,7 @@ class Handler(BaseHTTPRequestHandler):
             init_bare(repository, self.server.git)
 
     def run_backend(self, path: str, query: str) -> None:
-        """Have `git http-backend` answer."""
+        """Answer a request with the output of `git http-backend`."""
         backend = subprocess.Popen(
             [self.server.git, "http-backend"],
             env=self.server.environment() | self._request_variables(path, query),
@@ -139,7 +139,7 @@ class Handler(BaseHTTPRequestHandler):
         assert backend.stdin is not None
         assert backend.stdout is not None
         feeder = threading.Thread(target=self._feed, args=(backend.stdin,), daemon=True)
-        feeder.start()  # in parallel: a backend may answer before it has read everything
+        feeder.start()  # in parallel: the backend may answer before it has read all
         try:
             self._relay(backend.stdout)
         except OSError:
@@ -165,7 +165,10 @@ class Handler(BaseHTTPRequestHandler):
         return {name: value for name, value in variables.items() if value}
 
     def _feed(self, stdin: IO[bytes]) -> None:
-        """Forward the request's body; read it to its end even if the backend has closed."""
+        """Forward the request's body to the backend.
+
+        Read the body to its end even if the backend has closed its input.
+        """
         listening = True
         try:
             for chunk in self.body():

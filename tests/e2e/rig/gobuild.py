@@ -1,8 +1,8 @@
-"""Run the Go toolchain on one wrapper module, with progress: the only module that runs `go`.
+"""Run the Go toolchain on one wrapper module, and report progress.
 
-Only `tools` uses it. A build follows the committed `go.mod` and `go.sum`, whatever the caller's Go
-settings are. It uses the installed Go and fetches no toolchain. It runs at the lowest priority,
-because a cold build takes both cores for about twenty minutes.
+Only this module runs `go`, and only `tools` uses it. A build follows the committed `go.mod` and
+`go.sum`, and ignores the caller's Go settings. It uses the installed Go and fetches no toolchain.
+It runs at the lowest priority, because a cold build uses two cores for about twenty minutes.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class Go:
     """An installed Go toolchain."""
 
     program: str
-    version: str  # as in go1.26.8
-    target: str  # as in linux/amd64
+    version: str  # like go1.26.8
+    target: str  # like linux/amd64
 
     @staticmethod
     def find() -> Go:
@@ -68,8 +68,9 @@ class Go:
 class Workspace:
     """A folder for one wrapper's builds, with its sources and compiled packages.
 
-    The modules of all wrappers and their compiled packages would fill some 15 GB. So each wrapper
-    keeps only the sources that it builds, in a vendor folder, and is removed after its last build.
+    The modules of all wrappers and their compiled packages would fill about 15 GB. So a workspace
+    keeps only the sources that its wrapper builds, in a vendor folder, and is removed after the
+    wrapper's last build.
     """
 
     folder: Path
@@ -89,21 +90,24 @@ class Workspace:
         return self.folder / "wrapper"
 
     def vendor(self, go: Go, wrapper: Path, report: Report) -> None:
-        """Copy the sources of all packages that the wrapper builds, checked against `go.sum`."""
+        """Copy the sources of all packages that the wrapper needs into its vendor folder.
+
+        Go checks them against `go.sum`.
+        """
         pins = [
             (folder / name) for folder in (self.module, wrapper) for name in ("go.mod", "go.sum")
         ]
         texts = [path.read_bytes() if path.exists() else b"" for path in pins]
         if (self.module / "vendor").is_dir() and texts[:2] == texts[2:]:
             return
-        self.remove()  # what a killed run left, perhaps with other pins
+        self.remove()  # a killed run may have left a folder with other versions
         shutil.copytree(wrapper, self.module)
         fetched = _Counter(report, "fetched {count} modules")
         _watched([go.program, "mod", "vendor", "-o", "fetched"], self, fetched.line)
         (self.module / "fetched").rename(self.module / "vendor")
 
     def drop_modules(self) -> None:
-        """Remove the modules; the vendor folder has what the build needs."""
+        """Remove the downloaded modules; the vendor folder has what the build needs."""
         shutil.rmtree(self.folder / "modules", ignore_errors=True)
 
     def remove(self) -> None:
@@ -120,8 +124,8 @@ def build(
     text = f"compiled {{count}} of at most {len(packages)} packages"
     compiled = _Counter(report, text, set(packages))
     command = [go.program, "build", "-v", *flags]
-    # Go keeps a second copy of all that one command compiles until the command ends. Dependencies
-    # stand before their users, so steps cost no time.
+    # Go keeps a second copy of what a command compiles until the command ends. So each command
+    # compiles only a part. Dependencies come before their users, so this costs no time.
     others = [each for each in packages if "." in each.partition("/")[0] and each != package]
     for start in range(0, len(others), _PACKAGES_AT_ONCE):
         step = others[start : start + _PACKAGES_AT_ONCE]
@@ -131,7 +135,7 @@ def build(
 
 
 def module_folder(go: Go, workspace: Workspace, module: str) -> str:
-    """Return the folder of a module's unpacked sources; call it before the modules are dropped."""
+    """Return the folder of a module's unpacked sources, which exist until `drop_modules`."""
     argv = [go.program, "list", "-mod=mod", "-m", "-f", "{{.Dir}}", module]
     return _watched(argv, workspace).strip()
 
@@ -145,7 +149,7 @@ class _Counter:
         self._last = self._start
 
     def line(self, line: str) -> bool:
-        """Return whether a line is only progress, which nobody must read."""
+        """Count a line if it is only progress; return whether it is."""
         progress = line.startswith("go: downloading")
         if self._expected is not None:
             progress = progress or line in self._expected
@@ -167,7 +171,11 @@ def _watched(
     line: Callable[[str], bool] = lambda line: False,
     tick: Callable[[], None] = lambda: None,
 ) -> str:
-    """Run a command, pass each line of its standard error to `line`, return its standard output."""
+    """Run a command and return its standard output.
+
+    Each line of its standard error goes to `line`, which returns whether it is only progress.
+    `tick` is called while there is no line.
+    """
     folder = workspace.module
     process = subprocess.Popen(
         launch.command(argv[0], *argv[1:], niceness=19),
@@ -218,7 +226,10 @@ def _pump(stream: IO[str], lines: queue.Queue[str | None]) -> None:
 def _follow(
     lines: queue.Queue[str | None], line: Callable[[str], bool], tick: Callable[[], None]
 ) -> deque[str]:
-    """Return the last lines that are not progress; call `tick` in silence, as while linking."""
+    """Pass each line to `line` until None; return the last lines that are not progress.
+
+    `tick` is called each second without a line, as there are many while Go links.
+    """
     shown: deque[str] = deque(maxlen=_SHOWN_LINES)
     while True:
         try:
@@ -236,10 +247,10 @@ def _environment() -> dict[str, str]:
     jobs = os.environ.get(JOBS_VARIABLE, "")
     if jobs and not jobs.isdigit():
         raise RigError(f"{JOBS_VARIABLE}={jobs!r} is not a number: give the processes Go may use")
-    # The linker strips debug information, so the compiler need not write it: a third less disk.
+    # The linker strips debug information. Without it the compiler needs a third less disk space.
     flags = "-mod=readonly -modcacherw -gcflags=all=-dwarf=false" + (f" -p={jobs}" if jobs else "")
     settings = {"GOTOOLCHAIN": "local", "GOWORK": "off", "CGO_ENABLED": "0", "GOFLAGS": flags}
-    # A cross-compiling caller would get programs that do not run here.
+    # Settings for another system would give programs that do not run on this machine.
     dropped = {"GOOS", "GOARCH", "GOEXPERIMENT", "GO111MODULE"}
     return {k: v for k, v in os.environ.items() if k not in dropped} | settings
 

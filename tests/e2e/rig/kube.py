@@ -1,7 +1,7 @@
 """A cluster's API: apply, read, wait. The rig's only module that imports `kubernetes`.
 
-Objects are plain dictionaries, like their manifests. Each wait has a deadline, polls often, and
-its error contains what it saw last.
+Objects are plain dictionaries, like their manifests. Each wait polls often until its deadline; its
+error contains the last state that it saw.
 """
 
 from __future__ import annotations
@@ -50,13 +50,16 @@ _VERSIONS = {
 
 
 class Kube:
-    """A cluster's API. A kind that is not listed above is of `v1` unless `version` is given."""
+    """A cluster's API.
+
+    A kind has the API version in `_VERSIONS`, or else `v1`, unless `version` is given.
+    """
 
     def __init__(
         self, kubeconfig: Path, cache: Path, check: Callable[[], None] = lambda: None
     ) -> None:
         settings = Configuration()
-        load: Any = load_kube_config  # only some versions of the library annotate it
+        load: Any = load_kube_config  # not annotated in some versions of the library
         load(config_file=str(kubeconfig), client_configuration=settings)
         self.api: Any = ApiClient(settings)
         self._cache, self._check = cache, check
@@ -83,7 +86,7 @@ class Kube:
             )
 
     def refusal(self, manifest: Manifest) -> str:
-        """Return why the server would refuse a manifest, or an empty text if it would take it."""
+        """Return why the server would refuse a manifest; empty if it would accept it."""
         try:
             self.apply(manifest, dry_run=True)
         except ApiException as error:
@@ -101,7 +104,7 @@ class Kube:
     def find(
         self, kind: str, namespace: str = "", selector: str = "", version: str = ""
     ) -> list[Manifest]:
-        """Return the objects of a kind in one namespace or in all, by label selector."""
+        """Return the objects of a kind that match a label selector, in one namespace or in all."""
         found = self._resource(kind, version).get(
             namespace=namespace or None, label_selector=selector or None
         )
@@ -140,7 +143,10 @@ class Kube:
         return str(call(account, namespace, {"spec": {"expirationSeconds": 3607}}).status.token)
 
     def rules(self, account: str, namespace: str, home: str = "") -> list[Manifest]:
-        """Return what a service account of ``home`` may do in a namespace, by default its own."""
+        """Return the resource rules of a service account in a namespace.
+
+        The account is in the namespace `home`, by default in the same namespace.
+        """
         who = f"system:serviceaccount:{home or namespace}:{account}"
         api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)
         call: Any = AuthorizationV1Api(api).create_self_subject_rules_review
@@ -148,7 +154,7 @@ class Kube:
         return list(review["status"]["resourceRules"])
 
     def reconcile(self, kind: str, name: str, namespace: str) -> str:
-        """Trigger a Flux controller; return the token for `handled`."""
+        """Trigger a reconcile of an object by Flux; return the token that `handled` needs."""
         token = f"{time.time():.6f}"
         annotations = {"reconcile.fluxcd.io/requestedAt": token}
         self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
@@ -175,7 +181,7 @@ class Kube:
     def wait_ready(
         self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
     ) -> Manifest:
-        """Wait until an object's Ready condition holds for its newest generation."""
+        """Wait until an object's newest generation is Ready; return the object."""
         last: list[str] = ["does not exist"]
 
         def ready() -> Manifest | None:
@@ -210,7 +216,7 @@ class Kube:
             self.wait(f"CRD {name} to be served", established, timeout)
 
     def _resource(self, kind: str, version: str = "") -> Any:
-        if self._dynamic is None:  # late, because it queries the server
+        if self._dynamic is None:  # not earlier, because it queries the server
             connect: Any = DynamicClient
             self._dynamic = connect(self.api, cache_file=str(self._cache))
         version = version or _VERSIONS.get(kind, "v1")
@@ -220,7 +226,7 @@ class Kube:
 def build_manifest(
     version: str, kind: str, name: str, namespace: str = "", **fields: Any
 ) -> Manifest:
-    """Return an object; one without a namespace belongs to the whole cluster."""
+    """Return a manifest with further `fields`; without a namespace the object is cluster-wide."""
     metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
     return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}
 
@@ -231,7 +237,7 @@ def handled(manifest: Manifest, token: str) -> bool:
 
 
 def _condition(found: Manifest | None) -> str:
-    """Return why an object is not ready; empty if it is."""
+    """Return why an object is not ready, or its newest generation is not; empty if it is."""
     if found is None:
         return "does not exist"
     status = found.get("status", {})

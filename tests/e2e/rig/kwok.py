@@ -1,7 +1,7 @@
 """Fake nodes, and the kwok process that keeps them and their pods alive.
 
-A fake node represents an inventory node: it has the `node_id` label that releases select, and the
-annotation by which the kwok of an existing cluster manages it.
+A fake node represents a node of the inventory. It has the label `node_id`, which releases select,
+and the annotation that makes kwok manage it, also in an existing cluster.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods":
 
 
 def component(binary: Path, kubeconfig: Path, certificates: Pki) -> Component:
-    """Return the kwok process for all nodes that `manifest` returns."""
+    """Return the kwok process, which manages all nodes made by `manifest`."""
     port = free_port()
     argv = [
         str(binary),

@@ -1,12 +1,12 @@
 """A launcher of programs that die with the process that started them.
 
-Run as `python -I -S launch.py PARENT_PID NICENESS PROGRAM ARGUMENT…`: it asks the kernel for a
-SIGKILL on the parent's death and then becomes the program (same pid). Without it a test run ended
-by `kill -9` would leave a cluster behind. It imports little, because each import delays every
-start.
+It runs as `python -I -S launch.py PARENT_PID NICENESS PROGRAM ARGUMENT…`. It asks the kernel for a
+SIGKILL on the parent's death, and then becomes the program with the same pid. Without the launcher
+a test run ended by `kill -9` would leave a cluster behind. The launcher imports little, because
+each import delays every start.
 
-`subprocess`'s `preexec_fn` would do the same, but runs Python between fork and exec, which a
-process with threads must not do.
+The argument `preexec_fn` of `subprocess` would do the same, but it runs Python between fork and
+exec, which is not safe in a process with threads.
 """
 
 import ctypes

@@ -1,7 +1,8 @@
 """Certificates and keys of a rig's control plane, created for each rig.
 
-One authority signs the servers' and the administrator's certificates. The keys are elliptic
-because those are created fast. Only their owner can read the private keys.
+One authority signs the certificates of the servers and of the administrator. The keys are
+elliptic-curve keys, because these are created fast. Only the owner of the files can read the
+private keys.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Pki:
 
 
 def make(folder: Path) -> Pki:
-    """Write the certificates of an authority, a server and an administrator, and the token keys."""
+    """Write the certificates and keys of an authority, a server, an administrator and tokens."""
     folder.mkdir(parents=True, exist_ok=True)
     authority = ec.generate_private_key(ec.SECP256R1())
     root = _builder(_AUTHORITY, authority.public_key(), authority).sign(authority, hashes.SHA256())
@@ -57,7 +58,7 @@ def make(folder: Path) -> Pki:
     request = request.add_extension(addresses, critical=False)
     _write(paths.server_certificate, _pem(request.sign(authority, hashes.SHA256())))
     _write(paths.server_key, _private(server))
-    # Every cluster's first role binding makes this group administrators.
+    # Each cluster binds this group to the role of an administrator from its start.
     admin = ec.generate_private_key(ec.SECP256R1())
     request = _builder(_name("rig-admin", "system:masters"), admin.public_key(), authority)
     _write(paths.admin_certificate, _pem(request.sign(authority, hashes.SHA256())))
@@ -74,7 +75,10 @@ def make(folder: Path) -> Pki:
 
 
 def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
-    """Write an administrator's kubeconfig that refers to no other file; JSON is valid YAML."""
+    """Write an administrator's kubeconfig that contains all certificates; return its path.
+
+    It is written as JSON, which is valid YAML.
+    """
 
     def inline(path: Path) -> str:
         return base64.b64encode(path.read_bytes()).decode()
@@ -107,11 +111,11 @@ def _builder(
         .issuer_name(_AUTHORITY)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(minutes=5))  # clocks may go back
+        .not_valid_before(now - datetime.timedelta(minutes=5))  # a clock may be set back
         .not_valid_after(now + _LIFE)
         .add_extension(x509.BasicConstraints(ca=ca, path_length=None), critical=True)
         .add_extension(_usage(ca=ca), critical=True)
-        # Python 3.13 and later verify strictly and refuse a server without these two.
+        # Python 3.13 and later refuse a server whose certificate lacks these two extensions.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer), critical=False)
     )

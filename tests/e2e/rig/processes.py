@@ -1,8 +1,9 @@
 """The rig's processes: start, watch, stop.
 
-Each process leads its own group, has a log file, and dies with this process. The group makes
-Ctrl-C reach only the tests, which then stop everything in order, and ends the children too. A stop
-asks first and kills after a deadline, last started first.
+Each process leads its own process group, has a log file, and dies with this process. Because of the
+group Ctrl-C reaches only the tests, which then stop everything in order; and a stop ends the
+children of a process too. A stop asks each process to end, and kills it after a deadline. The
+processes that started last stop first.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from .net import Probe
 
 _POLL_SECONDS = 0.05
 _TAIL_LINES = 30
-_GROUP_SECONDS = 3.0  # an init that does not reap orphans must not delay a stop
+_GROUP_SECONDS = 3.0  # some init processes never reap orphans, which must not delay a stop
 
 
 @dataclass(frozen=True)
 class Component:
-    """How to start a process, when it is ready, and where it serves (`url`)."""
+    """A process to start: its command, the probe that reports whether it is ready, and its URL."""
 
     name: str
     argv: tuple[str, ...]
@@ -76,7 +77,10 @@ class Processes:
         self.wait_ready(name)
 
     def wait_ready(self, name: str) -> None:
-        """Wait for the component's probe; raises RigError with its reason and the log's tail."""
+        """Wait until a component's probe reports that it is ready.
+
+        Raises RigError with the probe's reason and the end of the log.
+        """
         component = self._known(name)
         deadline = time.monotonic() + component.ready_seconds
         while (reason := component.probe()) is not None:
@@ -88,7 +92,7 @@ class Processes:
         self.check(name)  # another server may have answered on the port
 
     def check(self, *names: str) -> None:
-        """Raise RigError if a named process (default: any) ended without being stopped."""
+        """Raise RigError if one of these components ended by itself; without names check all."""
         for name in names or list(self._running):
             process = self._running.get(name)
             if process is not None and (code := _exit_code(process)) is not None:
@@ -102,7 +106,7 @@ class Processes:
         self._stop_batch([name])
 
     def kill(self, name: str) -> None:
-        """Kill a component, like a crash."""
+        """Kill a component, which simulates a crash."""
         self._known(name)
         process = self._running.pop(name, None)
         if process is not None:
@@ -169,7 +173,7 @@ class Processes:
     def _stop_batch(self, names: list[str]) -> None:
         going = {name: self._running[name] for name in names if name in self._running}
         for process in going.values():
-            # CONT too: a paused process would never handle the TERM.
+            # SIGCONT too: a paused process would not handle the SIGTERM.
             for number in (signal.SIGTERM, signal.SIGCONT):
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
@@ -191,7 +195,7 @@ class Processes:
 def _exit_code(process: subprocess.Popen[bytes]) -> int | None:
     """Return the exit code of a process without reaping it; None while it runs.
 
-    After reaping, another process could get its pid and the group that `_end` kills.
+    Once it is reaped, a new process could get its pid, and `_end` would kill that one's group.
     """
     if process.returncode is not None:
         return process.returncode
@@ -218,8 +222,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 class _Spawner:
     """Starts every process from one thread that lives as long as this process.
 
-    The kernel kills a child when the *thread* that started it ends. Otherwise a rig started in a
-    worker thread (two clusters at once) would lose its cluster when that thread ends.
+    The kernel kills a child when the *thread* that started it ends. So a rig that a worker thread
+    starts, as with two clusters at once, would lose its processes at the end of that thread.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
-"""The cluster for the tests, from the environment.
+"""An existing cluster for the tests, if the environment names one.
 
 With E2E_KUBECONFIG and E2E_GIT_URL the tests use an existing cluster (kind, k3d) with Flux and
-kwok, and start nothing. A second cluster is named by E2E_KUBECONFIG_<NAME>.
+kwok, and start nothing. E2E_KUBECONFIG_<NAME> names the cluster of the rig with that name.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Existing:
 
 
 def existing(name: str) -> Existing | None:
-    """Return the cluster for the rig of this name; None if the rig must start its own."""
+    """Return the existing cluster for the rig of this name; None if the rig must start its own."""
     own = f"E2E_KUBECONFIG_{name.upper().replace('-', '_')}"
     kubeconfig = os.environ.get(own) or os.environ.get("E2E_KUBECONFIG", "")
     git_url = os.environ.get("E2E_GIT_URL", "")

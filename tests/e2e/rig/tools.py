@@ -1,10 +1,10 @@
-"""Build the rig's programs from their pinned Go modules, once, into a cache outside the checkout.
+"""Build the rig's programs from pinned Go modules, once, into a cache outside the checkout.
 
 This is the first stage of the rig: the others take the paths that `ensure` returns. A wrapper
-module under `tests/e2e/tools/` pins each program, so that `go.sum` covers all of it. A cache entry
-is named after a digest of all that decides its bytes. It appears by one rename, so an entry that
-exists is complete. `python -m tests.e2e.rig.tools` builds all programs and prints how long each
-took. With `--for flux` it builds those of a rig with Flux.
+module under `tests/e2e/tools/` pins each program, so that its `go.sum` covers all dependencies. The
+name of a cache entry is a digest of everything that decides the program's bytes. An entry appears
+by one rename, so each existing entry is complete. `python -m tests.e2e.rig.tools` builds all
+programs and prints how long each took. With `--for flux` it builds the programs of a rig with Flux.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _CRD_FOLDERS = ("config/crd/bases", "manifests/crds")  # Flux's, Argo CD's
 
 @dataclass(frozen=True)
 class Tool:
-    """A program: the wrapper module that pins it, and its main package."""
+    """A program to build: its name, the wrapper module that pins it, and its main package."""
 
     name: str
     wrapper: str
     package: str
     crds_of: str = ""  # the Go module whose CRDs are copied next to the program
-    gitops: str = ""  # the one controller that it is needed with, where it is not for all
+    gitops: str = ""  # the only GitOps controller that needs it; empty if all do
 
 
 def _flux(name: str) -> Tool:
@@ -55,7 +55,7 @@ def _kubernetes(name: str) -> Tool:
     return Tool(name, "kubernetes", f"k8s.io/kubernetes/cmd/{name}")
 
 
-# Cheapest first, so that a fault of the setting shows within a minute.
+# The cheapest builds come first, so that a wrong set-up fails within a minute.
 TOOLS = {
     tool.name: tool
     for tool in (
@@ -74,10 +74,10 @@ TOOLS = {
 
 
 def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
-    """Return the paths of the named programs (all by default); build those that the cache lacks.
+    """Return the paths of the named programs, by default of all; build those that the cache lacks.
 
-    `report` gets lines of progress, by default to standard error. Raises RigError if a name is
-    unknown, Go is missing or too old, or a build fails.
+    `report` gets lines of progress; by default they go to standard error. Raises RigError if a
+    name is unknown, Go is missing or too old, or a build fails.
     """
     wanted = list(TOOLS) if names is None else list(names)
     unknown = sorted(set(wanted) - set(TOOLS))
@@ -99,7 +99,7 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
 
 
 def needed_with(*gitops: str) -> list[str]:
-    """Return the names of the programs of a rig with these GitOps controllers."""
+    """Return the names of the programs that a rig with these GitOps controllers needs."""
     return [tool.name for tool in TOOLS.values() if tool.gitops in ("", *gitops)]
 
 
@@ -111,7 +111,7 @@ def crd_files(binaries: dict[str, Path]) -> list[Path]:
 
 
 def cache_root() -> Path:
-    """Return the folder of the built programs."""
+    """Return the cache folder of the built programs."""
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         return Path(named).expanduser().resolve()
@@ -132,10 +132,10 @@ def _digest(tool: Tool, go: gobuild.Go) -> str:
 
 
 def _flags(tool: Tool) -> list[str]:
-    """Return flags for small binaries whose bytes do not depend on the checkout's place."""
+    """Return build flags for small binaries whose bytes do not depend on the checkout's path."""
     linker = ["-s", "-w"]
     if tool.wrapper == "kubernetes":
-        # Unstamped, the server calls itself v0.0.0-master and clients refuse to work with it.
+        # Without a version stamp the server reports v0.0.0-master, which clients refuse.
         version = _pinned(WRAPPERS / tool.wrapper / "go.mod", "k8s.io/kubernetes")
         major, minor = version.removeprefix("v").split(".")[:2]
         stamps = {"gitVersion": version, "gitMajor": major, "gitMinor": minor}
@@ -156,20 +156,20 @@ def _pinned(go_mod: Path, module: str) -> str:
 
 @contextlib.contextmanager
 def _turn(root: Path, say: Report) -> Iterator[None]:
-    """Wait for the turn to build: two builds of Kubernetes at once would not fit into memory."""
+    """Hold the build lock during the block: two builds of Kubernetes do not fit into memory."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / "build.lock").open("w") as lock:
         waited = False
         while True:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the kernel frees it if we die
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel on death
                 break
             except BlockingIOError:
                 if not waited:
                     say(f"another run is building into {root}, waiting for it")
                 waited = True
                 time.sleep(0.5)
-        for leftover in root.glob(".building-*"):  # of a killed build: we hold the lock
+        for leftover in root.glob(".building-*"):  # of killed builds only: we hold the lock
             shutil.rmtree(leftover, ignore_errors=True)
         yield
 
@@ -192,7 +192,7 @@ def _build(
         seconds = round(time.monotonic() - start, 1)
         (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
         with binary.open("rb") as written:
-            os.fsync(written.fileno())  # or a power cut could leave an empty file behind the name
+            os.fsync(written.fileno())  # else a power cut could leave an empty file
         staging.chmod(0o755)
         staging.rename(entry)
         say(f"built in {seconds:.0f} s")
@@ -207,7 +207,7 @@ def _copy_crds(module: Path, target: Path) -> None:
     if not sources:
         raise RigError(f"{module}: no CRDs in {' or '.join(_CRD_FOLDERS)}; have they moved?")
     for source in sources:
-        (target / source.name).write_bytes(source.read_bytes())  # without the read-only mode
+        (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
 
 
 def _prefixed(say: Report, place: int, total: int, name: str) -> Report:

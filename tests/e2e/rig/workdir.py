@@ -1,7 +1,8 @@
 """The folder of a rig, with its data and logs.
 
-A rig keeps a lock on its folder while it lives. A folder with a free lock belonged to a test run
-that was killed. The next rig removes it, because an etcd alone needs over a hundred megabytes.
+A rig holds a lock on its folder while it lives. A folder whose lock is free belonged to a test run
+that was killed. The next rig removes that folder, because the data of etcd alone takes over a
+hundred megabytes.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from pathlib import Path
 from typing import IO
 
 _PREFIX = "demandops-rig-"
-_YOUNG_SECONDS = 60  # another rig may not have locked its new file yet
+_YOUNG_SECONDS = 60  # a younger lock file may be one that its rig has not locked yet
 
 
 class Workdir:
-    """A rig's folder; only `logs` stays after a failure."""
+    """A rig's folder with data and logs."""
 
     def __init__(self, name: str, path: Path | None = None) -> None:
         if path is None:
@@ -36,21 +37,21 @@ class Workdir:
 
     @property
     def home(self) -> Path:
-        """Return the processes' HOME, without the user's own files."""
+        """The HOME of the rig's processes, which has none of the user's files."""
         return self.path / "home"
 
     @property
     def temporary(self) -> Path:
-        """Return the processes' TMPDIR, so that a killed one leaves no files elsewhere."""
+        """The TMPDIR of the rig's processes, so that a killed process leaves no files elsewhere."""
         return self.path / "tmp"
 
     @property
     def repositories(self) -> Path:
-        """Return the root of the Git server."""
+        """The root folder of the Git server."""
         return self.path / "git"
 
     def environment(self) -> dict[str, str]:
-        """Return the environment of the rig's processes, without the user's other variables."""
+        """Return the environment of the rig's processes, with only PATH from the user's."""
         return {
             "PATH": os.environ.get("PATH", os.defpath),
             "HOME": str(self.home),

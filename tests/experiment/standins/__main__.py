@@ -16,11 +16,11 @@ OURS = ("demandops_ros", "parameter_sync.launch.xml")
 
 
 def main(launch: str, package: str, file: str, *arguments: str) -> None:
-    """Become the program that a launch file starts."""
+    """Run the program that a launch file starts, or its stand-in."""
     assert launch == "launch", launch
     given = dict(argument.split(":=", 1) for argument in arguments)
     if (package, file) == OURS:
-        # what the launch file says; ROS's launch has no wheels
+        # the launch file's command; ROS's launch has no Python wheels
         ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params"]]
         command = [sys.executable, "-m", "demandops.cli.main", "parameter-sync", "--ros-args"]
         os.execv(sys.executable, [*command, *ros_args])  # noqa: S606 - no shell on purpose

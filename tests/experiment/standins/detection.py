@@ -17,7 +17,7 @@ _FEWEST_POINTS = 5
 
 
 def cluster(points: Iterable[Point]) -> list[tuple[float, float]]:
-    """Return the centres of the groups of points."""
+    """Return the centres of groups of nearby points; groups of few points are left out."""
     groups: list[tuple[float, float, int]] = []  # sums of x and y, and how many
     for x, y, _ in points:
         for index, (sum_x, sum_y, count) in enumerate(groups):
@@ -37,7 +37,7 @@ def pose_at(x: float, y: float) -> Pose:
 
 
 def main(given: dict[str, str]) -> None:
-    """Detect in each cloud of a topic."""
+    """Detect objects in each cloud of a topic until the program is asked to end."""
     start()
     node = Node(given["node_name"])
     sender = node.create_publisher(PoseArray, given["object_list_topic"], 10)

@@ -22,10 +22,10 @@ _INPUTS = {
 
 
 class Fusion(Node):
-    """Keeps the newest message of each input and publishes what they show together.
+    """Fuses the newest message of each input, and publishes all objects and the vehicles' tracks.
 
-    It takes its times from the messages: the chart sets `use_sim_time` by default, and there is no
-    simulated clock here.
+    The times come from the messages and a steady clock. The chart sets `use_sim_time` by default,
+    and there is no simulated clock here.
     """
 
     def __init__(self, given: dict[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""What stands for every container's image."""
+"""The folder that stands for the image of every container."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _PROGRAMS = {"ros2": __package__, "zenoh-bridge-ros2dds": f"{__package__}.zenoh_
 
 
 def image(folder: Path) -> Path:
-    """Fill a folder: the working directory of the containers, with their programs."""
+    """Fill the containers' working directory with the stand-in programs; return it."""
     setup = folder / "install" / "setup.bash"
     setup.parent.mkdir(exist_ok=True)
     setup.write_text(f'PATH="{folder}:$PATH"\n')

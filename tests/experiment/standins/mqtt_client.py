@@ -1,6 +1,7 @@
-"""The MQTT client: carries ROS messages, unread, by the real parameter file over a real broker.
+"""A stand-in for mqtt_client: it carries serialized ROS messages over a real broker.
 
-Like mqtt_client it tells the other end a topic's type under a topic of its own, which is retained.
+It reads the real parameter file. Like mqtt_client, it publishes the type of each topic in a
+further, retained MQTT topic for the other end.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class MqttClient(Node):
         self._senders: dict[str, Any] = {}
         self._unknown = set(self._value("bridge.ros2mqtt.ros_topics", []))
         if not (self._taken_in or self._unknown):
-            raise SystemExit("no valid bridge")  # as the real one
+            raise SystemExit("no valid bridge")  # as the real mqtt_client does
         self._broker.on_connect = self._connected
         self._broker.on_message = self._take
         self._broker.connect(self._value("broker.host", ""), self._value("broker.port", 1883))
@@ -43,7 +44,7 @@ class MqttClient(Node):
         return self.get_parameter_or(name, rclpy.Parameter(name, value=default)).value
 
     def _find_types(self) -> None:
-        """Subscribe to the topics whose type the ROS graph knows by now."""
+        """Subscribe to the topics whose types the ROS graph has by now."""
         known = dict(self.get_topic_names_and_types())
         for topic in sorted(self._unknown & known.keys()):
             (name,) = known[topic]
@@ -80,13 +81,13 @@ class MqttClient(Node):
             self._senders[source].publish(message.payload)
 
     def close(self) -> None:
-        """Leave the broker."""
+        """Disconnect from the broker."""
         self._broker.disconnect()
         self._broker.loop_stop()
 
 
 def main(given: dict[str, str]) -> None:
-    """Carry until the program is asked to end."""
+    """Carry messages until the program is asked to end."""
     ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params_file"]]
     start(["mqtt_client", "--ros-args", *ros_args])
     client = MqttClient()

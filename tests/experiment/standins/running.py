@@ -1,4 +1,4 @@
-"""How a stand-in runs: one ROS node until SIGTERM, and the types that it learns by name."""
+"""Helpers of all stand-ins: find a message type by its name, and spin a ROS node until SIGTERM."""
 
 from __future__ import annotations
 

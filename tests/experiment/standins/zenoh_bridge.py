@@ -1,7 +1,7 @@
-"""The Zenoh bridge: carries ROS messages, unread, by the real configuration over the real Zenoh.
+"""A stand-in for zenoh-bridge-ros2dds: it carries serialized ROS messages over the real Zenoh.
 
-It stands in for zenoh-bridge-ros2dds, whose plugin is not among Zenoh's Python wheels. It tells a
-topic's type with each message.
+It reads the real configuration. The real bridge is a plugin that Zenoh's Python wheels lack. The
+stand-in sends a topic's type with each message.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Bridge(Node):
         self.create_timer(_LOOK_S, self._find)
 
     def _find(self) -> None:
-        """Subscribe to the topics that may be given out, once the ROS graph knows them."""
+        """Subscribe to the topics that the configuration lets out, once the ROS graph has them."""
         for topic, (kind, *_) in self.get_topic_names_and_types():
             if topic not in self._readers and self._given.search(topic):
                 self._readers[topic] = self.create_subscription(
@@ -58,7 +58,7 @@ class Bridge(Node):
 
 
 def main() -> None:
-    """Carry until the program is asked to end."""
+    """Carry messages until the program is asked to end."""
     parser = argparse.ArgumentParser()
     parser.add_argument("-c", dest="config", type=Path, required=True)
     config = json.loads(parser.parse_args().config.read_text())

@@ -1,4 +1,4 @@
-"""A real mosquitto on a loopback port, and pods' configuration as the containers would see it."""
+"""Fixtures: a real mosquitto on loopback, and pods' configuration as their containers see it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.e2e.rig import pki
 
 USER = "fleet 007"
 PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test
-"""What would break where it is pasted into YAML, a shell or a command line."""
+"""A password with characters that break YAML, a shell or a command line if they are not quoted."""
 
 DEADLINE_S = 60.0
 
@@ -35,13 +35,13 @@ def _program(name: str) -> str:
 
 @dataclass(frozen=True)
 class Broker:
-    """A broker that takes TLS connections with a password only."""
+    """A broker that accepts only TLS connections with user and password."""
 
     port: int
     authority: Path
 
     def inventory(self) -> str:
-        """Return it as ``inventory/brokers.yaml``."""
+        """Return the text of an ``inventory/brokers.yaml`` with this broker."""
         entry = {
             "node": "edge",
             "host": "127.0.0.1",
@@ -96,10 +96,13 @@ def _wait_until_it_listens(process: subprocess.Popen[bytes], port: int, log: Pat
 
 
 class Pod:
-    """One end's pod without its cluster: volumes as folders, the init container run for real."""
+    """The pod of a connection's end without a cluster: folders are its volumes.
+
+    Its init containers run as processes.
+    """
 
     def __init__(self, manifest: str, secrets: dict[str, dict[str, str]], folder: Path) -> None:
-        """Lay out the volumes and run what comes before the client."""
+        """Write the files of the volumes and run the init containers."""
         config, self.deployment = yaml.safe_load_all(manifest)
         self._spec = self.deployment["spec"]["template"]["spec"]
         self.folder = folder
@@ -119,7 +122,7 @@ class Pod:
             self._run(container, [sys.executable, *container["command"][1:]])
 
     def path(self, container: dict[str, Any], text: str) -> str:
-        """Return ``text`` with the container's mount points made this pod's folders."""
+        """Return ``text`` with the container's mount paths replaced by this pod's folders."""
         for mount in container["volumeMounts"]:
             text = text.replace(f"{mount['mountPath']}", str(self.folder / mount["name"]))
         return text
@@ -137,7 +140,7 @@ class Pod:
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
-        """Return the client's parameters as the real rcl reads them, started by its launch file."""
+        """The client's parameters, as the real rcl reads them from the launch arguments."""
         (container,) = self._spec["containers"]
         arguments = container["args"]
         assert arguments[:4] == ["ros2", "launch", "mqtt_client", "standalone.launch.ros2.xml"]
@@ -154,10 +157,10 @@ class Pod:
 
 
 class Client:
-    """What mqtt_client does with its parameters on the broker's side, and nothing of its own."""
+    """A stand-in for mqtt_client that does only what its parameters require at the broker."""
 
     def __init__(self, parameters: dict[str, Any]) -> None:
-        """Connect, subscribe to what the end takes in, and keep what arrives."""
+        """Connect, subscribe to the MQTT topics of this end, and collect the messages."""
         self.parameters = parameters
         self.arrived: list[tuple[str, bytes, int, bool]] = []
         self.acknowledged: list[int] = []
@@ -186,7 +189,7 @@ class Client:
         self.arrived.append((message.topic, message.payload, message.qos, message.retain))
 
     def publish(self, ros_topic: str, payload: bytes) -> None:
-        """Send what a ROS topic gave, as the end's parameters say."""
+        """Publish a message of a ROS topic at the broker as the parameters require."""
         prefix = f"bridge.ros2mqtt.{ros_topic}"
         sent = self._client.publish(
             self.parameters[f"{prefix}.mqtt_topic"],
@@ -203,13 +206,13 @@ class Client:
         self.wait(lambda: len(self.acknowledged) == len(topics))
 
     def wait(self, done: Any) -> None:
-        """Wait until something holds, or fail."""
+        """Wait until `done` returns a true value; fail at the deadline."""
         until = time.monotonic() + DEADLINE_S
         while not done():
             assert time.monotonic() < until, (self.reason, self.arrived)
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Leave the broker."""
+        """Disconnect from the broker."""
         self._client.disconnect()
         self._client.loop_stop()

@@ -1,4 +1,4 @@
-"""Prints the parameters that a ROS node gets from its arguments, read by the real rcl, as JSON."""
+"""Print as JSON which parameters a ROS node gets from its arguments, as the real rcl reads them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rclpy.node import Node
 
 
 def main() -> None:
-    """Start a node with the arguments given and print what it was given as parameters."""
+    """Start a node with the process's arguments; print its name and its parameters."""
     rclpy.init(args=sys.argv)
     node = Node("replaced_by_remapping", automatically_declare_parameters_from_overrides=True)
     known = {name: found.value for name, found in node.get_parameters_by_prefix("").items()}

@@ -1,7 +1,7 @@
-"""A message from one end's MQTT topic to the other's, through a real broker with TLS and password.
+"""Messages go from one end of a connection to the other, by a real broker with TLS and password.
 
-The clients know what the rendered manifests say and nothing else: the init container is run, the
-parameters are read by the real rcl, and paho stands in for mqtt_client on the broker's side.
+The clients use only the rendered manifests: the tests run the init containers, and the real rcl
+reads the parameters. paho stands in for mqtt_client.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Ends = dict[str, Pod]
 
 @pytest.fixture(scope="module")
 def manifests(broker: Broker) -> dict[str, str]:
-    """Return the manifests of both ends by side."""
+    """Return the manifests of both ends of a connection, by side."""
     repo = MemoryRepo({"inventory/brokers.yaml": broker.inventory()})
     made = repo.decide(routes(DEMAND))
     return {
@@ -53,7 +53,7 @@ def manifests(broker: Broker) -> dict[str, str]:
 def pods(
     manifests: dict[str, str], broker: Broker, tmp_path_factory: pytest.TempPathFactory
 ) -> Ends:
-    """Return both pods, their init containers done."""
+    """Return the pods of both ends, after their init containers."""
     secrets = {
         "broker-ca": {"ca.crt": broker.authority.read_text()},
         "broker-login": {"username": USER + "\n", "password": PASSWORD},
@@ -64,7 +64,7 @@ def pods(
 
 @pytest.fixture
 def connect(pods: Ends) -> Iterator[Callable[..., Client]]:
-    """Return a function that connects one end's client, some parameters changed."""
+    """Return a function that connects the client of one end, with some parameters replaced."""
     opened: list[Client] = []
 
     def client(side: str, **changed: Any) -> Client:

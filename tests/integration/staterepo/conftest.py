@@ -1,4 +1,4 @@
-"""Every test here uses git as Petra, and ends within its limit."""
+"""Fixtures: a clock, a Git server with faults, and the person Petra, as whom every test commits."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,31 +13,31 @@ from tests.kit.repo import Person
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """Commit as Petra in every test."""
+    """Make Petra the author of the commits in every test."""
 
 
 @pytest.fixture
 def clock() -> Clock:
-    """The clock of the generators that are given it; it runs, and a test may set it forward."""
+    """A running clock for generators, which a test can also move."""
     return Clock()
 
 
 @pytest.fixture
 def server(bare: Path) -> Iterator[Server]:
-    """A server of the state repo, with faults to order."""
+    """A Git server of the state repo, whose faults a test can set."""
     with serving(bare.parent) as running:
         yield running
 
 
 @pytest.fixture
 def http(server: Server) -> str:
-    """The state repo behind that server."""
+    """The URL of the state repo at `server`."""
     return f"{server.url}/state.git"
 
 
 @pytest.fixture
 def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
-    """A person who approves demands, at a generator that looks often."""
+    """A person who approves demands; all demands need approval, and generators check often."""
     monkeypatch.setattr(check_timer, "CHECK_EMBEDDED_S", 0.05)
     monkeypatch.setattr(check_timer, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")

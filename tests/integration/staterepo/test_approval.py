@@ -1,6 +1,6 @@
-"""Demands that need approval wait on a branch; what a person does with it decides.
+"""Demands that need approval wait on a branch, which a person merges or deletes.
 
-The person's part is played by git itself: merges, squashes, rebases, deleted branches.
+The tests run git for the person: merges, squashes, rebases, deleted branches.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
 
 
 def assert_rendered(bare: Path) -> None:
-    """What stands below clusters/ is what the books and the configuration give."""
+    """Check that the files below clusters/ are those that ledger and configuration render."""
     import pygit2
     from demandops.decision import rendered_files
     from demandops.staterepo.git import tree as trees
@@ -174,7 +174,7 @@ def test_a_proposal_outlives_the_generator(url: str, bare: Path, petra: Person) 
     with pytest.raises(ShuttingDown):
         rig.receipt(proposed.ticket)
     with rig.running(url) as generator:
-        again = Proposed(generator, goal(2), "op-2")  # behind it: the first was looked at
+        again = Proposed(generator, goal(2), "op-2")  # it comes after op-1, so op-1 was handled
         other = again.branch
         assert sorted(branches(bare)) == sorted([branch, other])
         assert git(bare, "rev-parse", branch) == stands, "no second push"
@@ -201,7 +201,7 @@ def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
 def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
     bare: Path, petra: Person, how: str
 ) -> None:
-    """Both change the same fusion, so the second does not fit once the first is merged."""
+    """Both proposals change the same fusion, so the second conflicts once the first is merged."""
     one, two = goal(0, vehicle=0), goal(5, vehicle=1)
     with rig.running(bare) as generator:
         first, second = Proposed(generator, one, "op-1"), Proposed(generator, two, "op-2")
@@ -479,7 +479,7 @@ def test_demands_that_need_none_go_on_meanwhile(bare: Path, petra: Person) -> No
 
 @pytest.fixture
 def hooked(bare: Path) -> Iterator[Path]:
-    """Where a server's hook writes the push options that reach it."""
+    """The file in which the server's hook lists refs and push options."""
     git(bare, "config", "receive.advertisePushOptions", "true")
     log = bare / "options"
     rig.hook(
@@ -630,7 +630,7 @@ def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Person) -> None
 
 
 def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Person) -> None:
-    """The reference's demands add up, so both are on the branch, one commit each."""
+    """Joins of one request add up, so the branch gets one commit for each of the two."""
     more = goal(1, vehicle=2) | {"connections": []}
     with rig.running(bare) as generator:
         first = Proposed(generator, goal(1), "op-1")
@@ -649,7 +649,7 @@ def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petr
 
 
 def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Person) -> None:
-    """The latched bookkeeping and the clusters' wake-up hang on it; nothing else is published."""
+    """The latched bookkeeping and the trigger of the clusters need this call after a merge."""
     heard = threading.Event()
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
@@ -675,7 +675,7 @@ def test_a_proposal_passes_the_check_of_pull_requests(
 def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
     http: str, server: Server, bare: Path, petra: Person
 ) -> None:
-    """The withdrawal is on the disk before anything else; its branch is not to be merged."""
+    """The withdrawal is written to disk first, so a restart deletes the branch."""
     with rig.running(http) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)

@@ -1,6 +1,6 @@
-"""A forge is asked for a pull request, and what a person does there decides as well.
+"""The generator opens pull requests at a forge, where a person's merge or refusal decides too.
 
-The forge is a small one on the loopback that keeps pull requests as GitHub's API does.
+The forge is a small server on the loopback that handles pull requests as GitHub's API does.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
 
 @dataclass
 class Hub:
-    """A forge's pull requests."""
+    """A forge with pull requests."""
 
     url: str = ""
     pulls: list[dict[str, Any]] = field(default_factory=list)

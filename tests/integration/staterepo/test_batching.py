@@ -1,4 +1,4 @@
-"""Demands that come together are one commit each and one push; a lone one is pushed at once."""
+"""Demands that come together are one commit each, but one push; a single one is pushed at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.kit.rig import Gate, goal, leave
 
 @pytest.fixture
 def pushes(bare: Path) -> Path:
-    """A file with a line for each push that the remote took."""
+    """A file with a line for each push that the remote has accepted."""
     log = bare / "pushes"
     log.touch()
     rig.hook(bare, "post-receive", f"cat >> {log}")

@@ -1,7 +1,7 @@
-"""What is in force while something of people's is not valid: the rest of what they merge.
+"""While a file of people is not valid, the other files that people merge take effect.
 
-A broken file holds back itself and what came in the same commit, not what others merge. A restart
-finds the same, and every commit verifies by what its trailers say.
+A broken file is held back together with the other files of its commit. Other commits are not held
+back. After a restart the same files are in effect, and every commit verifies with its trailers.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def tag(bare: Path) -> Any:
 
 
 def tagged(bare: Path, new: str) -> str:
-    """The registry with another tag of the detection's image."""
+    """Return the text of registry/images.yaml with another tag of the detection's image."""
     images = yaml.safe_load(text(bare, IMAGES))
     images["kind"] = "Images"
     images["images"]["object-detection"]["tag"] = new
@@ -68,7 +68,10 @@ def test_another_file_is_taken_in_while_one_is_broken(bare: Path, person: Person
 def test_a_broken_file_of_a_folder_holds_back_none_of_the_others(
     bare: Path, person: Person
 ) -> None:
-    """Two vehicles of two pull requests; the first takes the id of the second, later also."""
+    """Two pull requests each add a vehicle in a file of its own.
+
+    The first file is broken at first, and later has the id of the second vehicle.
+    """
 
     def joining(id: str, **more: str) -> str:
         node = {"id": id, "type": "vehicle", "cluster": "c-its", **more}
@@ -111,7 +114,7 @@ def test_what_came_with_a_broken_file_waits_with_it(bare: Path, person: Person) 
 
 
 def test_of_a_file_that_breaks_later_the_version_before_stays(bare: Path, person: Person) -> None:
-    """Not the one from before the first break: what was in force meanwhile was merged."""
+    """A valid version that was merged while another file was broken is the one that stays."""
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
         person.change({"overrides/broken.yaml": BROKEN})
@@ -154,7 +157,7 @@ def test_a_broken_claim_holds_back_no_configuration(
 def test_a_node_in_use_that_is_taken_away_stays_while_something_is_broken(
     bare: Path, person: Person
 ) -> None:
-    """What cannot be planned is held back as a whole; the broken file's stand-in stays."""
+    """The removal of the node is held back as a whole; the broken file stays replaced."""
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
         person.change({"overrides/broken.yaml": BROKEN})
@@ -164,7 +167,7 @@ def test_a_node_in_use_that_is_taken_away_stays_while_something_is_broken(
         rig.book(generator, goal(3))
         assert replicas(bare) == 2
     with rig.running(bare) as generator:
-        rig.book(generator, goal(6))  # still at vehicle02
+        rig.book(generator, goal(6))  # with topics of vehicle02, which is still there
         assert replicas(bare) == 2
         rig.book(generator, leave(1), goal(7))
     assert "vehicle01" in text(bare, ".demandops/reports/problems.yaml") or not rig.claims(
@@ -190,7 +193,7 @@ def test_half_of_an_application_definition_is_not_taken_in(bare: Path, person: P
 
 
 def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
-    """A change by a person, which may be valid, break a file, or break what others need."""
+    """Return a random change: it is valid, or breaks a file, or removes what demands need."""
     start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
     claim = random.choice([path for path in rig.claims(bare) if "applications" in path])
     changes: list[dict[str, str | None]] = [
@@ -223,7 +226,7 @@ def includes(generator: Generator, commit: str) -> bool:
 def test_a_start_at_any_commit_finds_what_the_running_generator_has(
     bare: Path, person: Person, seed: int
 ) -> None:
-    """What is in effect follows from history alone, whoever asks and whenever."""
+    """The history alone decides what is in effect, for any reader at any time."""
     random, nodes = Random(seed), text(bare, NODES) + "\n"
     with rig.running(bare) as generator:
         rig.book(generator, *(goal(number) for number in range(6)))
@@ -259,7 +262,7 @@ FOREIGN = [
     '100644 "inventory/\\377/\\377.yaml"',
     "100644 policy/" + "deep/" * 3000 + "evil.yaml",
 ]
-"""Modes and paths of entries, as ``git fast-import`` takes them."""
+"""Modes and paths of tree entries in the form of ``git fast-import``."""
 
 
 def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_called(

@@ -1,4 +1,4 @@
-"""`demandops decommission`: all that a node or a requester holds goes in one commit."""
+"""`demandops decommission` releases everything of a node or a requester in one commit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.kit.rig import Person, goal, leave
 
 
 def of(generator: Generator, subject: str) -> list[str]:
-    """Who holds a subject, one text for each claim."""
+    """Return the requesters of each claim on a subject, as one text for each claim."""
     claims = [c for c in generator.snapshot.state.ledger if c.subject.id == subject]
     return sorted(" ".join(claim.requesters) for claim in claims)
 
@@ -23,7 +23,7 @@ def of(generator: Generator, subject: str) -> list[str]:
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     url: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
-    """With a generator running, whose look takes both in."""
+    """A generator runs meanwhile, and its polls find both commits."""
     person = Person(bare, tmp_path / "person")
     with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))
@@ -128,7 +128,7 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(bare: Path, deman
     with rig.running(bare) as generator:
         assert of(generator, "edge/fusion-1") == []
         assert of(generator, "edge/fusion-2") == []
-        rig.book(generator, goal(1))  # it is back
+        rig.book(generator, goal(1))  # it may demand again
         assert of(generator, "edge/fusion-1") == ["station00 user1"]
         rig.book(generator, leave(1))
     rig.assert_sound(bare)
@@ -187,7 +187,7 @@ def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Run)
 def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Run
 ) -> None:
-    """As for any demand: it is in the outbox, and the next start carries it out."""
+    """Like any demand, a decommission waits in the journal, and the next start carries it out."""
     from demandops.demand.demand_request import Decommission
 
     generator = Generator(url)

@@ -1,4 +1,4 @@
-"""A person drains a node: what the generators placed there moves once, and the commit says why."""
+"""After a person drains a node, one commit moves what was placed there, and gives the reason."""
 
 from __future__ import annotations
 

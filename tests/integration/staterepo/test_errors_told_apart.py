@@ -1,4 +1,4 @@
-"""What goes wrong at publishing: who is told what, and when it is tried again."""
+"""Errors while a demand is published: who gets which message, and when it is tried again."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_full_disk_keeps_demands_waiting_until_there_is_room(
         rig.book(generator, goal(1))
         stages = Stages()
         journal = generator._slot.folder / "outbox.jsonl"
-        with files_end_at(journal.stat().st_size + 1500):  # more than an entry, less than a pack
+        with files_end_at(journal.stat().st_size + 1500):  # room for an entry, not a pack
             ticket = generator.submit(goal(2), listener=stages)
             rig.wait_until(lambda: ticket.future.done() or "away" in stages.names, "it is told")
             told = dict(stages.told).get("away", "")
@@ -103,7 +103,7 @@ def test_an_io_error_ends_the_process_and_the_next_start_goes_by_the_journal(bar
 
 
 class _Broken:
-    """A repository on a disk whose references cannot be read."""
+    """A repository whose references cannot be read, because of an error of the disk."""
 
     def __init__(self, repo: pygit2.Repository, error: OSError) -> None:
         self._repo, self._error = repo, error
@@ -127,7 +127,7 @@ def test_a_demand_on_main_is_not_refused_because_its_folder_could_not_be_synced(
 
 
 class _Moved:
-    """A repository whose branch moves once, and the sync of its folder is not allowed then."""
+    """A repository that moves its branch once, and then fails to sync the branch's folder."""
 
     def __init__(self, repository: StateRepository) -> None:
         self._repository, self._objects = repository, repository.objects
@@ -168,7 +168,7 @@ def _commit_by_hand(
     more: str = "",
     people: str = "",
 ) -> None:
-    """Commit what no library would write."""
+    """Write a commit with content that no Git library would write, and set main to it."""
     repo, parent = pygit2.Repository(str(bare)), tip(bare)
     people = people or f"Petra <petra@example.org> {time} +0000"
     text = (
@@ -210,14 +210,14 @@ def test_a_commit_that_cannot_be_read_is_told_and_refused_at_a_push(
     bare: Path, tmp_path: Path
 ) -> None:
     git(tmp_path, "clone", "--quiet", "--bare", str(bare), "clone.git")
-    _commit_by_hand(tmp_path / "clone.git", people="Petra 1770000000 +0000")  # without an address
+    _commit_by_hand(tmp_path / "clone.git", people="Petra 1770000000 +0000")  # no e-mail
     push = ("push", "--quiet", str(bare), "main:main")
     made = tip(tmp_path / "clone.git")
     with pytest.raises(AssertionError, match=f"object {made}: missingEmail"):
         git(tmp_path / "clone.git", *push)
     with rig.running(bare) as generator:
         good = tip(bare)
-        git(bare, "config", "receive.fsckObjects", "false")  # as most servers have it
+        git(bare, "config", "receive.fsckObjects", "false")  # Git's default
         git(tmp_path / "clone.git", *push)
         with pytest.raises(StateRepoError) as error:
             rig.receipt(generator.submit(goal(1)))
@@ -304,7 +304,7 @@ def test_a_damaged_clone_is_made_anew(
 def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    """Without the clone's configuration, git says that ``origin`` is no repository."""
+    """If the clone's configuration is missing, git reports that ``origin`` is no repository."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         file = generator._slot.folder / "clone.git" / name

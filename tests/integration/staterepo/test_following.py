@@ -1,7 +1,7 @@
-"""What people merge is honoured while the generator runs, without any demand coming.
+"""A running generator follows what people merge, even if no demand comes.
 
-Embedded, over a file URL and over smart HTTP; nothing is measured, all waits are for what has to
-come. Every break is mended again, and every commit verifies.
+It uses the state repo in place, by a file URL or by smart HTTP. No test measures time: each wait
+ends with the expected event. Tests repair every file that they break, and every commit verifies.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SOON_S = 0.1
 
 @pytest.fixture
 def place(request: pytest.FixtureRequest, bare: Path) -> str:
-    """The same state repo by all three ways."""
+    """The address of the state repo: its path, its file URL or its URL at the Git server."""
     if request.param == "embedded":
         return str(bare)
     return bare.as_uri() if request.param == "file-url" else request.getfixturevalue("http")
@@ -49,7 +49,7 @@ def newest(bare: Path) -> rig.Commit:
 
 
 def followed(bare: Path, made: str) -> rig.Commit:
-    """Wait until a person's commit has been followed; return the commit that does."""
+    """Wait until the generator has followed a person's commit; return the generator's commit."""
     rig.wait_until(lambda: newest(bare).id != made, "the generator follows")
     (commit,) = [c for c in rig.commits(bare, f"{made}..main") if c.one("Operation") == "follow"]
     assert commit.one("Follows") == made
@@ -104,11 +104,14 @@ CHANGES = {
     "moved-node": ("http", _move_node, lambda text: "garage" in text),
     "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
-"""Each by one of the three ways, because what a change leads to does not depend on them."""
+"""By name: a kind of address, the change, and a check of the result.
+
+One address each is enough, because the result does not depend on it.
+"""
 
 
 def _everything(bare: Path) -> str:
-    """All that is generated or booked, as one text: paths and contents."""
+    """Return all files below clusters/ and ledger/ as one text, each line with its path."""
     return rig.git(bare, "grep", "", "main", "--", "clusters", "ledger")
 
 
@@ -203,7 +206,7 @@ def test_a_problem_that_stands_at_a_restart_is_reported_no_second_time(
     with rig.running(url, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1), goal(2))
         followed(bare, person.change(_claim_on_no_node(bare), "Nowhere"))
-        rig.book(generator, goal(6))  # of the same application as goal 1
+        rig.book(generator, goal(6))  # for the application of goal 1
     tip = rig.tip(bare)
     with rig.running(url, fetch_interval=SOON_S) as generator:
         rig.wait_until(lambda: generator.snapshot.problems, "it is seen again")
@@ -267,7 +270,7 @@ def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> 
         commit = followed(bare, person.change(_move_broker(bare)))
         rig.wait_until(lambda: str(on.snapshot.commit) == commit.id, "the other follows")
         assert str(off.snapshot.commit) == known
-        off.fetch_now()  # as a webhook would
+        off.fetch_now()  # as after a webhook's call
         rig.wait_until(lambda: str(off.snapshot.commit) == commit.id, "it follows now")
 
 
@@ -364,9 +367,9 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, ba
 def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     url: str, bare: Path, drivers: rig.Drivers
 ) -> None:
-    """More than go into one push: those behind it are on the disk as well."""
+    """There are more demands than one push takes; the others are on disk too."""
     many = 250
-    rig.restart(url)  # makes the clone
+    rig.restart(url)  # creates the clone
     with rig.away(bare):
         lanes = [[rig.demand(f"{n}", goal(n % 3))] for n in range(many)]
         run = drivers.start(url, lanes)
@@ -412,7 +415,7 @@ def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
     rig.assert_sound(bare)
 
 
-# ---- what the command line tells ----
+# # ---- what the command line reports ----
 
 
 def test_views_go_on_while_something_is_not_valid_and_say_so(

@@ -1,4 +1,4 @@
-"""What the readers of clusters ask of commits: which is later, and what differs; with real Git."""
+"""Questions of the code that reads clusters, with real Git: which commit is later, what differs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 
 @pytest.fixture
 def line(bare: Path, tmp_path: Path) -> list[str]:
-    """The first commit, then a change of a text, then one of a chart."""
+    """Three commits: the first one, a change of a text file, and a change of a chart."""
     person = Person(bare, tmp_path / "person")
     first = rig.tip(bare)
     other = person.change({"notes.txt": "one\n"})
@@ -38,7 +38,7 @@ def test_a_folder_is_unchanged_where_its_content_is(bare: Path, line: list[str])
         assert repo.unchanged(first, other, CHART)
         assert not repo.unchanged(first, chart, CHART)
         assert not repo.unchanged(first, other, ".")
-        # what is not there is not the same as anything
+        # a folder or commit that does not exist equals nothing
         assert not repo.unchanged(first, other, "no/such/folder")
         assert not repo.unchanged(first, "f" * 40, CHART)
         assert not repo.unchanged("", first, CHART)

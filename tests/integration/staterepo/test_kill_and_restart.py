@@ -1,4 +1,4 @@
-"""kill -9 at any moment, start again: nothing acknowledged is missing, nothing counts twice."""
+"""After a kill at any moment and a restart, no acknowledged demand is missing or counts twice."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LANES = 4
 
 
 def _client(lane: int) -> list[tuple[str, rig.Goal]]:
-    """A client's demands in its order: of every three that joined, two leave again."""
+    """Return a client's demands in order: of every three joins, two are followed by a leave."""
     made = []
     for turn in range(60):
         number = lane + turn * LANES
@@ -48,9 +48,9 @@ def test_killed_at_random_moments_loses_and_doubles_nothing(
         lanes = []
         for client in clients:
             open_ = [(name, made) for name, made in client if name not in acknowledged]
-            if last:  # bring to an end what was begun, and a little more
+            if last:  # finish the begun demands, and a few more
                 open_ = open_[:2]
-            # the same goal id again, or a new one as a client that starts anew makes it
+            # the operation id again, or a new one as from a restarted client
             again = "" if random.random() < 0.5 else f"-try{turn}"
             lanes.append([demand(name, made, f"op-{name}{again}") for name, made in open_])
         run = drivers.start(address, lanes)
@@ -78,7 +78,7 @@ def test_killed_at_random_moments_loses_and_doubles_nothing(
 
 def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
     for name, answer in told.answers.items():
-        # a release sent again may find that its first hand-in was carried out after all
+        # a repeated release may find that its first sending was carried out
         again = name in sent and "nothing that the shutdown lists is held" in answer["text"]
         assert answer["outcome"] in ("booked", "released", "unchanged") or again, answer
         acknowledged[name] = answer["commit"]
@@ -101,7 +101,7 @@ def test_killed_at_a_point_each_demand_is_committed_once(
         address, lanes, opening=demand("join-0", goal(0)), die_at=f"{point}:2"
     ).listen()
     assert told.finished is None
-    # the opening demand was a batch of its own, except where a commit was counted, not a batch
+    # the opening demand was the first batch or commit; the kill comes at the second
     assert set(told.answers) == {"join-0"}, reason
     assert len(rig.operations(bare)) == (4 if published else 1), reason
 
@@ -187,7 +187,7 @@ def test_a_release_in_the_same_batch_as_its_join_stays_when_both_are_replayed(
 def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_replay(
     drivers: Drivers, url: str, bare: Path
 ) -> None:
-    """The repeated join has no commit that shows it was dealt with; the release behind it does."""
+    """The repeated join has no commit; the commit of the later release shows it was handled."""
     opening = demand("join-1", goal(1))
     lanes = [[demand("join-1-again", goal(1))], [demand("leave-1", leave(1))]]
     drivers.start(url, lanes, opening=opening, die_at="published:2").listen()
@@ -202,7 +202,7 @@ def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_repla
 def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
     drivers: Drivers, bare: Path
 ) -> None:
-    """Judged again behind the release, nothing stands in its way any more; in order, it had."""
+    """After the release nothing contradicts the join any more, but in its order it was refused."""
     elsewhere = goal(1)
     elsewhere["apps"][0]["header"]["node_id"] = "cloud"
     lanes = [[demand("join-elsewhere", elsewhere)], [demand("leave-1", leave(1))]]
@@ -218,7 +218,7 @@ def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
 def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
     bare: Path, data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, node: str
 ) -> None:
-    """It was unchanged or refused; the release behind it would let it be booked."""
+    """The repeated join was unchanged or refused; after the later release it could be booked."""
     synced, again = {}, goal(1)
     again["apps"][0]["header"]["node_id"] = node
 
@@ -248,12 +248,12 @@ def test_a_branch_lock_left_by_a_killed_generator_does_not_stop_the_next_one(
     drivers: Drivers,
     bare: Path,
 ) -> None:
-    """libgit2 holds main.lock while it fsyncs it; the driver dies with one as libgit2 writes it."""
+    """libgit2 holds main.lock while it syncs the branch; the generator is killed in that moment."""
     lock = bare / "refs" / "heads" / "main.lock"
     told = drivers.start(bare, [[demand("join-1", goal(1))]], die_at="locked").listen()
     assert told.answers == {}
     an_hour_ago = lock.stat().st_mtime - 3600
-    os.utime(lock, (an_hour_ago, an_hour_ago))  # else the next one waits until it is stale
+    os.utime(lock, (an_hour_ago, an_hour_ago))  # makes the lock stale
 
     with rig.running(bare) as generator:
         rig.book(generator, goal(2))
@@ -267,7 +267,7 @@ def test_a_lock_left_in_the_clone_by_a_killed_generator_does_not_stop_the_next_o
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
     tracking = next(data_home.glob("*/slot-0/clone.git/refs/remotes/origin"))
-    (tracking / "main.lock").touch()  # the slot is locked by its owner, so nobody else holds this
+    (tracking / "main.lock").touch()  # no living process: the slot itself is locked
 
     with rig.running(url) as generator:
         rig.book(generator, goal(2))
@@ -288,11 +288,11 @@ def test_a_clone_cut_off_half_way_is_made_anew(url: str, bare: Path, data_home: 
     rig.assert_sound(bare)
 
 
-# ---- outboxes of the dead ----
+# # ---- journals of dead processes ----
 
 
 def _leave_pending(url: str, bare: Path, numbers: list[int]) -> None:
-    """Have a generator accept demands that it cannot publish, and end."""
+    """Make a generator accept demands that it cannot publish, and close it."""
     generator = Generator(url)
     with rig.away(bare):
         for number in numbers:
@@ -309,7 +309,10 @@ def _of_the_first_version(text: bytes) -> bytes:
 
 
 def _leave_journal(url: str, bare: Path, data_home: Path, whose: str) -> Path:
-    """Leave the journal of demands 1 and 2 to the next process, or to that of another slot."""
+    """Leave a journal with the demands 1 and 2 behind; return its path.
+
+    With `whose` "own" it is in the slot that the next process takes, else in another slot.
+    """
     _leave_pending(url, bare, [1, 2])
     journal = next(data_home.glob("*/slot-0/outbox.jsonl"))
     if whose == "own":
@@ -389,7 +392,7 @@ def test_two_processes_have_slots_of_their_own_and_a_dead_ones_outbox_is_adopted
     drivers: Drivers, bare: Path, url: str, data_home: Path
 ) -> None:
     with rig.running(url) as first:
-        # a second process, beside the first, dies with a demand in its journal
+        # a second process is killed beside the first, with a demand in its journal
         told = drivers.start(url, [[demand("join-1", goal(1))]], die_at="journaled").listen()
         assert told.finished is None
         slots = sorted(path.name for path in next(data_home.iterdir()).iterdir())
@@ -408,7 +411,7 @@ def test_the_outbox_of_one_state_repo_is_never_played_into_another(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Two state repos that are called the same, each from a folder of its own."""
+    """Two state repos have the same relative path, each in a folder of its own."""
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
         new_repo(f"{folder}/state.git")

@@ -1,6 +1,6 @@
-"""Leases on a real repository: what ends is released by a commit, what is renewed in time is not.
+"""Leases on a real repository: a commit releases a demand whose lease ends, unless it is renewed.
 
-Leases of a second and no slack; nothing here is measured, all waits are for what has to come.
+The leases have no slack. No test measures time: each wait ends with the expected event.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 def put(demand: str, lease: Any = 60, who: str = "vehicle00", **more: Any) -> rig.Goal:
-    """An application and, derived, a connection that goes with it."""
+    """Return a demand for an application, from which a connection is derived."""
     return goals.put(demand, who, "station00", **({} if lease is None else {"lease": lease}) | more)
 
 
@@ -73,7 +73,7 @@ def ends(generator: Generator, demand: str) -> datetime:
 
 
 def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
-    """Have a demand wait that a generator took in and could not settle before it was killed."""
+    """Write a demand into the journal, as a generator that was killed leaves it."""
     slot = Slot(settings.data_home(str(repo)))
     slot.journal.append([JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
     slot.close()
@@ -144,7 +144,7 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
 ) -> None:
     with rig.running(bare, runtime=clock) as generator:
         rig.book(generator, put("d", 60))
-    # the record says that it ended 40 s ago; the renewal came before, and no one could take it up
+    # by the record the lease ended 40 s ago; the renewal came before, but no generator ran
     leave_in_outbox(bare, "op-renew", renew("d"), clock.now() + timedelta(seconds=50))
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:
@@ -188,7 +188,7 @@ def test_what_another_generator_renewed_is_kept(
 
 
 def test_an_idle_generator_releases_what_another_process_booked(clock: Clock, bare: Path) -> None:
-    """As ``demandops request`` beside ``demandops serve``."""
+    """For example, ``demandops request`` has booked it beside ``demandops serve``."""
     with rig.running(bare, runtime=clock) as idle:
         with rig.running(bare, runtime=clock) as other:
             rig.book(other, put("d"))
@@ -204,7 +204,7 @@ def test_two_generators_release_once(
     caplog.set_level(logging.INFO, logger="demandops")
     with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
         rig.book(first, put("d"))
-        rig.book(second, put("other", None))  # so that it knows of the first one
+        rig.book(second, put("other", None))  # now it knows 'd'
         assert held(second, "d")
         clock.pass_(60)
         wait_until_gone(first, "d")
@@ -236,7 +236,7 @@ def test_a_hand_in_counts_once_though_the_remote_moved(
 def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Through the outbox and a real commit, for what could break there."""
+    """The goals go through the journal and real commits, because odd text could break either."""
     hostile = [
         put("d", lease=True),
         put("d", lease=1.5),

@@ -1,4 +1,4 @@
-"""What killed processes and failed syncs leave in a state repo, and repos that are refused."""
+"""Leftovers of killed processes and failed syncs in state repos, and repos that are refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.kit.repo import git, tip
 
 
 def _leave(bare: Path) -> list[Path]:
-    """Leave what a process leaves that is killed while it places a pack."""
+    """Make the leftovers of a process that was killed while it wrote a pack; return their paths."""
     folder = bare / "demandops-pack-killed"
     folder.mkdir()
     (folder / "pack_git2_1").write_text("half of a pack")
@@ -56,7 +56,7 @@ def test_a_published_demand_without_an_answer_is_written_to_new_files(bare: Path
     branch, packs = bare / "refs/heads/main", bare / "objects" / "pack"
     inodes = {path.name: path.stat().st_ino for path in (branch, *packs.iterdir())}
     at = tip(bare)
-    again = Journal(journal)  # as if the answer had been lost
+    again = Journal(journal)  # a journal as before the answer
     again.append([JournalEntry("op-1", rig.goal(1), "2026-03-01T00:00:00+00:00", before)])
     again.close()
     assert rig.restart(bare) is True

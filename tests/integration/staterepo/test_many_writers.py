@@ -1,6 +1,7 @@
-"""Four generators and a person write to one state repo at once, and connections are cut at random.
+"""Four generators and a person write to one state repo at once, with random cuts of connections.
 
-A small load in `make test`; `make load` runs it with 2,000 demands and prints what each writer saw.
+The load is small in `make test`; `make load` sends 2,000 demands and prints the figures of each
+writer.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ GENERATORS = 4
 DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "16"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
 LANES = 4
-"""Requesters that wait for an answer before they send again, at each generator."""
+"""The number of requesters at each generator; each waits for an answer before it sends again."""
 CUTS = 0.01
-"""The share of requests whose connection is cut, once before and once after they are done."""
+"""The share of HTTP requests that are cut before they are handled; as many are cut afterwards."""
 PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
 
 def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
-    """Return what one generator is asked for: of every three that join, one leaves again."""
+    """Return one generator's demands by lane: of every three joins, one is followed by a leave."""
     lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(LANES)]
     left = DEMANDS // GENERATORS
     turn = 0
@@ -49,7 +50,7 @@ def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
 
 @dataclass
 class _Person:
-    """Keeps changing the state repo as people do: fetch, commit, push, and again when refused."""
+    """A person who keeps changing the state repo: fetch, commit, push, again after a refusal."""
 
     person: rig.Person
     pushed: list[str] = field(default_factory=list)
@@ -60,7 +61,7 @@ class _Person:
         while not over.wait(dice.uniform(*PERSONS_PAUSE_S)):
             number += 1
             files = {f"notes/{number}.md": f"{number}\n"}
-            if number % 5 == 0:  # one that everything has to be rendered anew for
+            if number % 5 == 0:  # a change after which all is rendered again
                 files["registry/images.yaml"] = _images(number)
             for attempt in range(1, 200):
                 try:

@@ -1,4 +1,4 @@
-"""People push between demands: their change stays, the demand goes on top, history is one line."""
+"""People push between demands: their commits stay, demands go on top, and history is linear."""
 
 from __future__ import annotations
 
@@ -55,7 +55,10 @@ def _break_claim(bare: Path) -> Callable[[Person], str]:
 EITHER = pytest.mark.parametrize(
     ("address", "running"), [("file-url", True), ("embedded", False)], indirect=["address"]
 )
-"""Running at a remote or stopped in place: two of the four, where the two are independent."""
+"""The generator runs and uses a remote, or it is stopped meanwhile and uses the repo in place.
+
+The other two combinations are left out, because address and run do not depend on each other.
+"""
 
 
 def _around(
@@ -65,7 +68,10 @@ def _around(
     change: Callable[[], str],
     after: list[rig.Goal],
 ) -> str:
-    """Book demands before and after a person's change, which the generator sees live or not."""
+    """Book demands before and after a person's change; return the person's commit.
+
+    The generator runs during the change, or it is stopped before and started after it.
+    """
     if running:
         with rig.running(address) as generator:
             rig.book(generator, *before)
@@ -81,7 +87,7 @@ def _around(
 
 
 def _kinds(bare: Path) -> list[str]:
-    """What each commit is, oldest first: the trailer, or whose it is."""
+    """Return the kind of each commit, oldest first: its operation, or ``person``."""
     return [commit.one("Operation") or "person" for commit in rig.commits(bare)]
 
 
@@ -89,7 +95,7 @@ def _kinds(bare: Path) -> list[str]:
 def test_what_people_undo_of_another_generators_work_is_undone_in_its_files(
     address: str, bare: Path, person: Person, tmp_path: Path, deletes: bool
 ) -> None:
-    """For the first, nothing differs between what it saw last and what people made of it."""
+    """The first generator sees no difference between its last commit and the person's result."""
     with rig.running(address) as first, rig.running(address, data=tmp_path / "other") as second:
         rig.book(first, goal(3))
         rig.book(second, goal(3))
@@ -182,7 +188,7 @@ def test_a_node_taken_away_is_gone_for_new_demands_once_it_is_released(
 def test_what_an_inventory_changed_is_carried_out_once_nothing_stands_in_its_way(
     address: str, bare: Path, person: Person, running: bool
 ) -> None:
-    """A broker moves in the same push that takes away a node in use, which is released later."""
+    """One push moves a broker and removes a node in use; a later demand releases the node."""
     brokers = rig.git(bare, "show", f"main:{BROKERS}") + "\n"
     moved = brokers.replace("service-mqtt-broker-edge", "broker-of-the-edge")
     both = rig.without_vehicle01(bare) | {BROKERS: moved}
@@ -203,7 +209,7 @@ def test_what_an_inventory_changed_is_carried_out_once_nothing_stands_in_its_way
 def test_a_generated_file_that_a_person_edited_is_put_right_with_the_next_commit(
     url: str, bare: Path, person: Person
 ) -> None:
-    """`demandops check` says that such an edit is lost, and verify holds at every commit."""
+    """`demandops check` warns that such an edit is lost; every commit verifies."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         paths = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/").splitlines()
@@ -236,7 +242,7 @@ def test_the_remote_is_never_force_pushed_and_nothing_is_merged(
 
 
 def test_a_person_who_takes_commits_back_has_the_last_word(address: str, bare: Path) -> None:
-    """Reset to an older commit, and a demand that was judged on the newer one goes on top of it."""
+    """A person resets main to an older commit, and the next demand goes on top of that."""
     with rig.running(address) as generator:
         rig.book(generator, goal(1))
         older = rig.tip(bare)
@@ -332,7 +338,7 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
 def test_a_verdict_on_a_stale_clone_is_not_given_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Both seem settled without a push; the clone is behind, and nobody can be asked."""
+    """On the stale clone neither demand would need a push, but the remote has changed since."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)

@@ -1,6 +1,6 @@
-"""A person merges overrides while a generator runs: each is honoured, kept, and taken back.
+"""A person merges overrides while a generator runs: each takes effect, lasts, and is taken back.
 
-Merged is what the next demand finds. After every story each commit of it verifies.
+The next demand finds what was merged before it. At the end of each test every commit verifies.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def body(bare: Path, path: str) -> str:
 
 
 def next_demand(generator: Generator, number: int = 100) -> Receipt:
-    """A demand that has nothing to do with the matter."""
+    """Book a demand that is unrelated to the overrides, and return its receipt."""
     (receipt,) = rig.book(generator, rig.goal(number))
     return receipt
 
@@ -162,7 +162,7 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     held = file(bare, path)
     assert held.startswith("# override overrides/frozen.yaml: hold; priority 0; owner petra")
     assert body(bare, path) == before
-    (late,) = rig.book(generator, rig.goal(6))  # one more input for this fusion
+    (late,) = rig.book(generator, rig.goal(6))  # it adds an input
     assert late.warnings[-1] == (
         f"{fusion} is held by overrides/frozen.yaml; its changes wait until the hold ends"
     )

@@ -1,6 +1,6 @@
-"""A person merges overrides, broken ones among them, deletes claims and takes all back, at random.
+"""A person merges and removes overrides, some of them broken, and deletes claims, at random.
 
-Demands go on meanwhile. In the end nothing of the overrides is left, and every commit verifies.
+Demands go on meanwhile. In the end no trace of the overrides is left, and every commit verifies.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def override(select: dict[str, object], **effects: object) -> Write:
 
 
 def soon(chance: random.Random) -> str:
-    """A time that has just passed, or comes while the test runs."""
+    """Return a random time, at most a second ago or two seconds ahead."""
     moment = datetime.now(timezone.utc) + timedelta(seconds=chance.uniform(-1, 2))
     return moment.isoformat()
 
@@ -71,7 +71,7 @@ def test_whatever_people_merge_history_verifies(address: str, bare: Path, tmp_pa
             if dice < 0.35:
                 name = chance.choice([*POOL])
                 merged.add(name)
-                with suppress(AssertionError):  # it stands like this already
+                with suppress(AssertionError):  # nothing to commit
                     person.change({f"overrides/{name}.yaml": POOL[name](chance)})
             elif dice < 0.5 and merged:
                 name = chance.choice(sorted(merged))

@@ -1,7 +1,8 @@
-"""The platform engineer against a running generator: an override, a broken one, a hand edit, a
-deleted claim, a moved node. Each is honoured while no demand comes, and still after many more.
+"""A platform engineer changes the state repo while a generator runs.
 
-`make load` runs it with a thousand further demands and prints how long each took.
+The changes are an override, a broken override, a manual edit, a deleted claim and a moved node.
+Each takes effect although no demand comes, and stays in effect after many demands. `make load` runs
+the test with a thousand further demands and prints how long each change took.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from tests.kit.rig import Person
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "24"))
 INTERVAL_S = 0.5
-"""The generator's fetch interval; nothing is asserted of it, `make load` prints what it gave."""
+"""The generator's fetch interval; no times are checked, but `make load` prints them."""
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 FUSION = f"{EDGE}/of-edge-fusion-1-118f66a66700.yaml"
@@ -38,7 +39,7 @@ def values(bare: Path, path: str) -> Any:
 
 
 class Engineer:
-    """Merges one change after the other, and sees what comes of it."""
+    """Merges one change after the other, and waits for the effect of each."""
 
     def __init__(self, bare: Path, folder: Path) -> None:
         self.person = Person(bare, folder)
@@ -47,7 +48,7 @@ class Engineer:
         self.kept: dict[str, Callable[[], bool]] = {}
 
     def sees(self, what: str, files: dict[str, str | None], honoured: Callable[[], bool]) -> None:
-        """Merge a change and wait until it is honoured, with nobody demanding anything."""
+        """Merge a change and wait, without any demand, until `honoured` returns true."""
         assert not honoured(), f"{what}: it is so already"
         made = self.person.change(files, what)
         began = time.monotonic()
@@ -58,7 +59,7 @@ class Engineer:
 
 
 def story(bare: Path, engineer: Engineer) -> str:
-    """Play the platform engineer; return what the hand-edited file has to be."""
+    """Make all changes; return the text that the manually edited file must have again."""
     engineer.sees(
         "an override",
         {"overrides/two.yaml": OVERRIDE},
@@ -128,7 +129,7 @@ def test_what_the_platform_engineer_merges_is_honoured_and_stays_so(
 
 
 def _demand_on(generator: Generator) -> None:
-    """Further demands of others, some of which end again."""
+    """Book further demands of other requesters, and release some of them."""
     tickets = []
     for number in range(100, 100 + FURTHER * 2 // 3):
         tickets.append(generator.submit(rig.goal(number)))

@@ -1,4 +1,4 @@
-"""While the remote is away goals stay open; what a remote denies is told and forgotten."""
+"""Goals stay open while the remote is away; what a remote denies is reported and dropped."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
 def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
     url: str, bare: Path, tmp_path: Path
 ) -> None:
-    """A join waits; meanwhile another generator books the same, and somebody takes a claim away."""
+    """While two joins wait in the journal, another generator books one of them, and a third."""
     generator = Generator(url)
     with rig.away(bare):
         generator.submit(goal(1), "op-1")
@@ -86,7 +86,7 @@ def test_a_demand_that_the_new_tip_makes_impossible_is_refused_with_the_reason(
     with rig.running(url) as generator:
         with rig.running(url, data=tmp_path / "another-machine") as other:
             rig.book(other, elsewhere)
-        ticket = generator.submit(goal(6))  # the same application, on the edge
+        ticket = generator.submit(goal(6))  # the application of goal 1, but on the edge
         with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(ticket)
         assert rig.book(generator, goal(2))[0].outcome == "booked"
@@ -152,7 +152,7 @@ def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_it
 def test_a_remote_that_cannot_take_the_push_is_told_or_warned_of(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Its disk is full, say, or a rule stands against it: no hook speaks, and nothing has moved."""
+    """The remote refuses the push without a hook, for example if its disk is full."""
     with rig.running(url) as generator:
         rig.git(bare, "config", "receive.maxInputSize", "1")
         ticket = generator.submit(goal(1))
@@ -177,7 +177,7 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
         objects.rename(aside)
         (objects / "info").mkdir(parents=True)
         (objects / "info" / "alternates").write_text(f"{aside}\n")
-        for number in range(256):  # a disk that fails when the server stores what it received
+        for number in range(256):  # the server fails to store objects
             (objects / f"{number:02x}").touch()
         ticket = generator.submit(goal(1))
         rig.wait_until(lambda: "cannot be pushed to: un" in caplog.text, "the log says why")
@@ -191,7 +191,7 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
 def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Git ends with lines that fit every reason, and they are not what is told."""
+    """The message leaves out git's last lines, which are the same for every reason."""
     ssh = tmp_path / "ssh"
     ssh.write_text("#!/bin/sh\necho 'git@edge: Permission denied (publickey).' >&2\nexit 255\n")
     ssh.chmod(0o755)
@@ -218,7 +218,7 @@ def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
 def test_a_stale_lock_at_the_remote_is_told_in_the_log_and_survived(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A receive-pack was killed there. Somebody has to see it, and the demand outlives it."""
+    """The lock is left by a killed receive-pack; a warning reports it, and the demand waits."""
     lock = bare / "refs" / "heads" / "main.lock"
     with rig.running(url) as generator:
         lock.touch()

@@ -1,4 +1,4 @@
-"""A rollback while other generators write, behind a URL as well, and one that a crash cut off."""
+"""Rollbacks while other generators write, in place and by URL, and one that a crash interrupts."""
 
 from __future__ import annotations
 

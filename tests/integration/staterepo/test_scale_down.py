@@ -1,4 +1,4 @@
-"""Replicas that come down later, on a real repository: by commits of whichever generator."""
+"""Replicas are removed later by a commit, on a real repository, by whichever generator runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RELEASE = "of-edge-fusion"
 
 @pytest.fixture(scope="session")
 def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bare state repo whose fusion has a replica for each source, and keeps them."""
+    """A bare state repo whose fusion has a replica for each source and loses replicas late."""
     folder = tmp_path_factory.mktemp("kept") / "state.git"
     bare = Path(shutil.copytree(bare_template, folder))
     text = skeleton()[APPDEF].replace("prefix: of\n", f"prefix: of\n    scaling: {SCALING}\n")

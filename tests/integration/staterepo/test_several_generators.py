@@ -1,4 +1,4 @@
-"""Several generators write to one state repo at once: nothing is lost, nothing counts twice."""
+"""Several generators write to one state repo at once: no demand is lost or counts twice."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EACH = 16
 
 
 def _demands(who: int) -> list[tuple[str, rig.Goal]]:
-    """What one generator is asked for: of every three that join, one leaves again."""
+    """Return the demands for one generator: of every three joins, one is followed by a leave."""
     made = []
     for turn in range(EACH * 3 // 4):
         number = 2 * turn + who
@@ -46,7 +46,7 @@ def test_two_generators_in_one_process_lose_and_double_nothing(
         tickets: list[tuple[str, Ticket]] = []
         for name, made in demands:
             tickets.append((name, generator.submit(made, f"op-{name}")))
-            if len(tickets) > 3:  # some are always under way
+            if len(tickets) > 3:  # some demands are always open
                 _note(*tickets.pop(0))
         for name, ticket in tickets:
             _note(name, ticket)
@@ -81,7 +81,7 @@ def test_two_processes_on_one_machine_lose_and_double_nothing(
     runs = []
     for who in (0, 1):
         demands = [demand(name, made) for name, made in _demands(who)]
-        # a leave stays in its join's lane, behind it
+        # a leave is in the lane of its join, after it
         lanes: list[list[dict[str, object]]] = [[], [], []]
         for item in demands:
             lanes[int(item["name"].rpartition("-")[2]) // 2 % 3].append(item)
@@ -109,7 +109,7 @@ def test_the_same_demand_at_two_generators_at_once_is_booked_once(
 
 
 def test_a_branch_that_another_writer_holds_for_a_moment_is_tried_again(bare: Path) -> None:
-    """As `git push` does, and as a second generator does while it fsyncs the branch."""
+    """For example, `git push` or a second generator holds the branch's lock while it writes."""
     lock = bare / "refs" / "heads" / "main.lock"
     with rig.running(bare) as generator:
         lock.touch()

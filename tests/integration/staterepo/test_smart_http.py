@@ -1,4 +1,4 @@
-"""The state repo behind smart HTTP: a real server, answers lost on the way, and a server away."""
+"""The state repo on a real smart-HTTP server: answers are lost, and the server is away."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
 def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """Nobody can be asked whether the push was taken, and other demands come meanwhile."""
+    """The generator cannot ask whether the push was accepted, and other demands come meanwhile."""
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
         rig.book(generator, goal(0))
@@ -45,7 +45,7 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
         rig.wait_until(lambda: server.faults.away, "the server has taken the push and is away")
         tickets.append(generator.submit(goal(3), "op-3"))
         rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
-        clock.pass_(5)  # a commit that is made anew has another time, so another id
+        clock.pass_(5)  # a repeated commit would get another time and id
         assert not tickets[0].future.done()
         server.faults.away = server.faults.away_after_cut = False
         outcomes = [rig.receipt(ticket).outcome for ticket in tickets]
@@ -60,7 +60,10 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
 def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """The push was taken: [join again: nothing to commit, leave]. Asked again, the join is new."""
+    """The server accepts a push with the release; the repeated join before it made no commit.
+
+    If both were decided again, the join would be booked.
+    """
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
         rig.book(generator, goal(1))
@@ -73,7 +76,7 @@ def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
         gate.open.set()
         rig.wait_until(lambda: server.taken == taken + 2, "both pushes were taken")
         rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
-        clock.pass_(5)  # a commit that is made anew has another time, so another id
+        clock.pass_(5)  # a repeated commit would get another time and id
         server.faults.away = server.faults.away_after_cut = False
         assert rig.receipt(again).outcome in ("unchanged", "booked")
         assert rig.receipt(released).outcome == "released"
@@ -85,7 +88,7 @@ def _cut(server: Server) -> None:
 
 
 def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path) -> None:
-    """Words in an address, a port or a commit's id say nothing about rights."""
+    """An address with the words `403`, `denied` and `rejected` is not taken for a refusal."""
     prefix = "/403/denied-and-rejected"
     with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
         server.faults.no_pushes, server.faults.status = 3, 503

@@ -1,6 +1,6 @@
-"""Text from outside stays a value: no message is forged, and no commit passes for the generator's.
+"""Text from outside stays a value: it forges no message, and no commit passes as the generator's.
 
-A claim that a person writes by hand is judged like a demand.
+A claim that a person writes is checked like a demand.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
     assert made in [value.split()[0] for c in rig.commits(bare) for value in c.all("Caused-By")]
 
 
-# ---- claims by hand ----
+# # ---- manual claims ----
 
 
 def with_rules(bare: Path, **quotas: int) -> str:
@@ -112,7 +112,7 @@ def with_rules(bare: Path, **quotas: int) -> str:
 def by_hand(
     bare: Path, requester: str, app: str = "edge/d1", demand: str = "by-hand"
 ) -> dict[str, str | None]:
-    """A claim like the one of user1, for another requester."""
+    """Return the file of a claim like the one of user1, but for another requester."""
     path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
     data = yaml.safe_load(read(bare, path))
     data |= {"application": app, "demand": demand, "requesters": [requester]}
@@ -121,7 +121,7 @@ def by_hand(
 
 
 def held(bare: Path) -> set[tuple[str, ...]]:
-    """The requesters of the claims in effect."""
+    """Return the requesters of each claim in effect."""
     with reader.opened(str(bare)) as repo:
         return {claim.requesters for claim in repo.snapshot().state.ledger}
 
@@ -156,7 +156,7 @@ def test_a_claim_by_hand_that_a_demand_could_not_book_is_held_back(
         assert problem["file"] == next(iter(claim))
         assert why in problem["message"]
     assert all(holds for holds, _ in verdicts(bare))
-    with rig.running(bare) as generator:  # a restart finds the same
+    with rig.running(bare) as generator:  # the same after a restart
         rig.book(generator, demands[1])
         assert held(bare) == {("user1",), ("user2",)}
         person.change(dict.fromkeys(claim))

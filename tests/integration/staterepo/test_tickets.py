@@ -1,4 +1,4 @@
-"""What the generator promises to whoever hands in a demand, whatever they do."""
+"""What the generator promises a caller that submits demands, whatever the caller does."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.kit import rig
 from tests.kit.limits import files_end_at
 from tests.kit.rig import Drivers, Gate, Stages, demand, goal
 
-# ---- taking back ----
+# # ---- withdrawals ----
 
 
 def test_a_demand_that_waits_can_be_taken_back_and_leaves_no_trace(
@@ -238,7 +238,7 @@ def test_demands_are_counted_while_others_come_and_go(bare: Path) -> None:
 
 
 def test_a_caller_that_cancels_its_future_stops_nobody_else(bare: Path) -> None:
-    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` does just this."""
+    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` cancels it at its time-out."""
     gate = Gate()
     with rig.running(bare) as generator:
         first = generator.submit(goal(1), listener=gate)
@@ -292,7 +292,7 @@ def test_goals_that_are_no_plain_data_fail_alone(bare: Path) -> None:
         assert gate.reached.wait(rig.PATIENCE_S)
         before, odd = generator.submit(goal(1)), []
         for made in NOT_PLAIN:
-            with suppress(DemandOpsError):  # told at once, or by the ticket
+            with suppress(DemandOpsError):  # raised now or by the ticket
                 odd.append(generator.submit(made))
         after = generator.submit(goal(2))
         gate.open.set()
@@ -370,7 +370,7 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
 def test_what_was_taken_back_stays_so_after_a_crash(
     drivers: Drivers, address: str, bare: Path
 ) -> None:
-    """Both are in the journal when the second is taken back and the process is killed."""
+    """Both demands are in the journal when the second is withdrawn and the process is killed."""
     lanes = [[demand("first", goal(1))], [demand("second", goal(2)) | {"withdraw": True}]]
     told = drivers.start(
         address, lanes, opening=demand("opening", goal(0)), die_at="withdrawn"

@@ -1,4 +1,4 @@
-"""A generator in one thread: everything that it does follows from a seed."""
+"""A generator whose threads take turns: a seed decides everything that it does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.kit.turns import Turns
 
 
 def history(seed: int, template: Path, folder: Path) -> list[str]:
-    """Return the commits of random demands, sent while the generator works and while it rests."""
+    """Return the ids of the commits of random demands, sent to a busy or idle generator."""
     bare = Path(shutil.copytree(template, folder / "state.git"))
     turns = Turns(seed)
     threads = threading.active_count()
@@ -39,7 +39,7 @@ def test_resumed_demands_are_answered_in_the_order_of_their_commits(
     base = rig.tip(bare)
     with rig.running(bare) as generator:
         rig.receipt(generator.submit(rig.goal(2), "op-2"))
-    # as if its answer had been lost with the process, and op-1 had not been published
+    # a journal as if the process had died before op-2's answer and op-1's publication
     slot, turns, answered = Slot(tmp_path), Turns(1), []
     slot.journal.append(
         JournalEntry(f"op-{number}", rig.goal(number), turns.now().isoformat(), base)

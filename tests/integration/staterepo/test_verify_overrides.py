@@ -1,4 +1,4 @@
-"""`verify` under overrides: it goes from commit to commit, and finds what a whole look finds."""
+"""`verify` under overrides: going from commit to commit, it finds the same as with `--whole`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EDGE = "clusters/c-its/perception/edge"
 
 
 def verdicts(bare: Path) -> dict[str, Verdict]:
-    """What is said of all of history, the same in both ways."""
+    """Return the verdict on each commit; check that both ways of `verify` give the same."""
     with reader.opened(str(bare)) as repo:
         commits = repo.revisions(f"{rig.root(bare)}..")
         found = repo.verify(commits)
@@ -29,7 +29,7 @@ def verdicts(bare: Path) -> dict[str, Verdict]:
 
 
 def forged(bare: Path, person: Person, generator: Generator, change: Callable[[], str]) -> Verdict:
-    """Have a commit that is not the generator's among others; return what is said of it."""
+    """Make a commit that is not the generator's between demands; return the verdict on it."""
     rig.book(generator, rig.goal(2))
     made = change()
     found = verdicts(bare)[made]

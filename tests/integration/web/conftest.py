@@ -1,4 +1,4 @@
-"""The site of a real state repo, called without a network."""
+"""Fixtures: the web site of a real state repo, called without a network."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Shown:
     client: TestClient
 
     def look(self, path: str, status: int = 200, **params: str) -> Page:
-        """Return a view of the newest commit."""
+        """Wait until the site has the newest commit, and return the page at a path."""
         wait_until(
             lambda: self.follower.newest.moment.commit == str(self.generator.snapshot.commit),
             "the page has the newest commit",
@@ -78,7 +78,7 @@ def shown(bare: Path) -> Iterator[Shown]:
 
 @pytest.fixture(scope="session")
 def still(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
-    """One for all tests that change nothing in it."""
+    """One state repo with its site, for all tests that change nothing in it."""
     bare = tmp_path_factory.mktemp("still") / "state.git"
     with showing(Path(shutil.copytree(bare_template, bare))) as made:
         yield made

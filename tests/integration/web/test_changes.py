@@ -1,4 +1,4 @@
-"""What the page tells when the state repo changes: by demands, by people, and when it is away."""
+"""What the page shows after changes by demands or people, or if the state repo is away."""
 
 from __future__ import annotations
 

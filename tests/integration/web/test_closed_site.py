@@ -1,4 +1,4 @@
-"""The site shows and does nothing else: what it refuses, and what it never lets through."""
+"""The site is read-only: which requests it refuses, and what its pages may never contain."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.kit.html import Page
 
 @pytest.fixture
 def shown(still: Shown) -> Shown:
-    """Nothing changes here."""
+    """These tests change nothing, so they share one site."""
     return still
 
 
@@ -69,7 +69,7 @@ def test_the_documentation_comes_with_the_page_where_it_was_built(
 
 
 def test_another_name_of_this_machine_is_refused(client: TestClient) -> None:
-    """So no other site can have its visitors' browsers read the page (DNS rebinding)."""
+    """Otherwise another site could make its visitors' browsers read the page (DNS rebinding)."""
     refused = client.get("/", headers={"Host": "attacker.example"})
     assert refused.status_code == 400
     assert client.get("/", headers={"Host": "localhost:8080"}).status_code == 200

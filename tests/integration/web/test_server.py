@@ -1,4 +1,4 @@
-"""The server with clients that do not behave: many, silent, and slow ones."""
+"""The server with many, silent or slow clients."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def served(follower: Follower) -> Iterator[WebServer]:
 
 @contextmanager
 def asking(page: WebServer, text: str) -> Iterator[socket.socket]:
-    """A client that has sent this, and reads nothing."""
+    """Connect a client that sends this text and reads nothing."""
     place = urlsplit(page.url)
     with socket.create_connection((place.hostname, place.port), PATIENCE_S) as made:
         made.sendall(text.replace("\n", "\r\n").encode())
@@ -108,7 +108,7 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
 def test_views_of_earlier_moments_keep_no_other_waiting(
     served: WebServer, follower: Follower
 ) -> None:
-    """More than there are threads for views; none ends while another moment is read."""
+    """There are more such requests than threads for views, and all wait for the loading lock."""
     with ExitStack() as stack:
         stack.enter_context(follower._loading)
         for _ in range(60):

@@ -1,7 +1,7 @@
-"""The charts and their library, as far as they can be judged without Helm.
+"""Checks of the charts and their library that need no Helm.
 
-Schemas, default values and READMEs are checked here against each other. tests/golden holds the
-values that the generator gives; what the charts render is checked with the real Helm in tests/e2e.
+These tests compare schemas, default values and READMEs with each other. tests/golden has the values
+that the generator writes. tests/e2e renders the charts with the real Helm.
 """
 
 from __future__ import annotations
@@ -104,7 +104,10 @@ def test_a_schema_has_what_the_library_has(chart: Path) -> None:
 
 
 def undescribed(schema: dict[str, Any], path: str = "") -> Iterator[str]:
-    """Yield each property of a schema that has no description, and no parts that have."""
+    """Yield the path of each property without a description.
+
+    A property that has properties itself needs none, but these do.
+    """
     for name, one in schema["properties"].items():
         if "description" not in one and "properties" in one:
             yield from undescribed(one, f"{path}{name}.")
@@ -247,4 +250,4 @@ def test_nothing_is_glued_into_a_shell_script(chart: str) -> None:
         scripts = re.findall(r'"-c",? (.+)', text) + re.findall(r'\$check := "(.*)" -', text)
         assert all("{{" not in script for script in scripts), name
     shells = sum(text.count("/bin/bash") for text in templates(chart).values())
-    assert shells == (2 if chart == "ros-service" else 0)  # the start of a container and the probe
+    assert shells == (2 if chart == "ros-service" else 0)  # a container's start and its probe

@@ -1,4 +1,4 @@
-"""What helm prints becomes faults with file and line. Its own words are as helm 4 prints them."""
+"""Helm's output becomes faults with file and line. The texts here are those of helm 4."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes what follows from other files of the charts: their schemas, and tables in READMEs.
+"""Write the generated files of the charts: their schemas, and the tables in their READMEs.
 
 Run ``python -m tests.unit.charts.write`` and review the diff.
 """
@@ -23,7 +23,7 @@ CHARTS = [
 
 
 def schema(chart: Path) -> str:
-    """Return the text that the schema of a chart should have, by its own part of it."""
+    """Return the schema that a chart should have, of its own properties and the library's."""
     known = json.loads((chart / "values.schema.json").read_text())
     library = json.loads((LIBRARY / "values.schema.json").read_text())
     own = chart_schema.own_properties(known, library)
@@ -33,7 +33,7 @@ def schema(chart: Path) -> str:
 
 
 def readme(chart: Path) -> str:
-    """Return the text that the README of a chart should have, with its table of values."""
+    """Return the text that a chart's README should have, with a table of its current values."""
     text = (chart / "README.md").read_text()
     values = (chart / "values.yaml").read_text()
     root = f"exports.{chart_schema.EXPORT}" if chart == LIBRARY else ""

@@ -1,4 +1,4 @@
-"""What Argo CD's objects say about releases, told from objects as the API gives them."""
+"""The state of releases is read from Argo CD's objects, in the form in which the API gives them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def application(
     health: str = "Healthy",
     resources: tuple[dict[str, str], ...] = (),
 ) -> dict[str, Any]:
-    """An Application; it was compared with what is wanted where nothing else is said."""
+    """Return an Application; by default it was compared with its current source `wanted`."""
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}
     if sync:
@@ -58,7 +58,7 @@ def application(
 
 
 def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """The state of a sync."""
+    """Return the state of a sync operation."""
     result = {"revision": revision, "source": more.pop("of", FOLDER)}
     result["resources"] = more.pop("resources", [])
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
@@ -82,24 +82,24 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
         (over(sync="Synced", at="a"), "waiting", "has not applied the commit yet", False),
         (over(sync="Synced", at="b"), "reconciled", "", False),
         (over(sync="Synced", at="c"), "reconciled", "", False),
-        # compared with, and not applied
+        # the commit was compared, but not applied
         (over(sync="OutOfSync", at="b"), "waiting", "has not applied the commit yet", False),
-        # Synced, before bootstrap/ was applied with another path
+        # Synced, but with the path that it had before another bootstrap file was applied
         (over(sync="Synced", at="b", compared={**FOLDER, "path": "clusters/x"}), "waiting",
          "has not applied the commit yet", False),
-        # a newer commit is compared with already
+        # Argo CD already compares a newer commit
         (over(sync="OutOfSync", at="c", operation=synced("Succeeded", "b")), "reconciled", "",
          False),
         (over(sync="OutOfSync", at="b", operation=synced("Succeeded", "a")), "waiting",
          "has not applied the commit yet", False),
         (over(sync="OutOfSync", at="b", operation=synced("Running", "b")), "waiting",
          "has not applied the commit yet", False),
-        # a sync of one object only, by a person's hand
+        # a person has synced a single object
         (over(sync="OutOfSync", at="b", operation=synced("Succeeded", "b", only=[{"name": "x"}])),
          "waiting", "has not applied the commit yet", False),
         (over(sync="OutOfSync", at="b", operation=synced("Failed", "b", "one failed")), "waiting",
          "one failed", True),
-        # tried again without end, it is called Running
+        # Argo CD retries the sync without end, and reports it as Running
         (over(sync="OutOfSync", at="b", operation=synced("Running", "b", "one failed. Retrying",
               finishedAt=AT, resources=[FAILED])),
          "waiting", "one failed. Retrying; Application od-edge: forbidden", True),
@@ -131,7 +131,7 @@ BAD = condition("Progressing", "False", "timed out")
         (None, None, "reconciled", "does not exist yet", False),
         (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
-        # Healthy as it was before the change
+        # its health is from before the change
         (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
          "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
@@ -143,7 +143,7 @@ BAD = condition("Progressing", "False", "timed out")
          "its health is Degraded", True),
         (application(NEW, sync="Synced", at="b", health="Missing"), None, "reconciled",
          "its health is Missing", False),
-        # what it is made of says more, and sooner
+        # the health of its objects is more exact and comes sooner
         (application(NEW, sync="Synced", at="b", resources=MADE), None, "reconciled",
          "does not exist yet", False),
         (application(NEW, sync="Synced", at="b", resources=MADE), deployment("x"), "healthy", "",
@@ -156,7 +156,7 @@ BAD = condition("Progressing", "False", "timed out")
                      ), None, "reconciled", "ComparisonError: no chart", True),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=NEW)), None, "reconciled", "denied", True),
-        # a failure of its previous spec counts only while it is still retried
+        # a failure of its previous spec counts only while Argo CD still retries that spec
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=OLD)), None, "reconciled", "denied", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "denied",
@@ -199,7 +199,7 @@ def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
 def test_a_chart_that_changed_in_its_folder_is_waited_for(
     at: str, changing: list[tuple[str, str]], state: str
 ) -> None:
-    """The Application does not change with it, only the commit that it is Synced at."""
+    """The Application's source stays the same; only its synced commit shows the new chart."""
     objects = {
         OVER: over(sync="Synced", at="b"),
         CHILD: application(NEW, sync="Synced", at=at),
@@ -265,7 +265,7 @@ def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
 
 
 def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
-    """An operator may keep the rest from the generator."""
+    """An operator may deny the generator access to the other objects."""
     assert ARGOCD.objects_to_watch(PLACE)[0] == ObjectSelector(
         "Application", "argocd", "demandops-perception"
     )

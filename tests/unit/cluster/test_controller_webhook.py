@@ -1,4 +1,4 @@
-"""Signed calls of webhooks, over real HTTP; the signatures are verified by openssl."""
+"""Signed calls of webhooks over real HTTP; openssl verifies the signatures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def by_openssl(body: bytes) -> str:
 
 
 def test_the_signature_is_the_one_that_github_documents() -> None:
-    """Both controllers verify by GitHub's scheme; this is its own example."""
+    """Both controllers use GitHub's scheme; the values come from GitHub's documentation."""
     documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
     assert controller_webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
 
@@ -67,7 +67,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
     event = json.loads(body)
     assert event["ref"] == "refs/heads/main" and event["after"] == "b" * 40
     (commit,) = event["commits"]
-    # the domain's folder is always looked at; books and other clusters are not Argo CD's to know
+    # the domain's folder is always refreshed; the ledger and other clusters are left out
     assert commit["modified"] == [
         *changed[:1],
         "clusters/c-its/perception/_domain.yaml",

@@ -1,4 +1,4 @@
-"""What Flux's objects say about releases, told from objects as the API gives them."""
+"""The state of releases is read from Flux's objects, in the form in which the API gives them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Who leads: processes compete for a Lease over real HTTP, in time that tests move.
+"""Processes compete for a Lease over real HTTP, with a clock that the tests move.
 
-That a real API server takes what is written here is shown in tests/e2e/flux/test_deployment.py.
+tests/e2e/flux/test_deployment.py shows that a real API server accepts the Lease.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from tests.kit.turns import Turns
 
 PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
 TAKES_OVER_S = 15 + 2
-"""A Lease that nobody renews ends after 15 s, and the others look every 2 s."""
+"""A Lease that its leader does not renew ends after 15 s; the standbys poll it every 2 s."""
 
 
 @dataclass
 class Server:
     """An API server with one Lease.
 
-    ``trouble`` says whether a call fails, before or after its effect. ``takes`` says for how many
-    seconds the caller then waits. ``ages`` are the ages of the Lease, each while a process led.
+    ``trouble`` returns for a call whether it fails, ``before`` or ``after`` its effect, or not.
+    ``takes`` returns how many seconds the caller then waits. ``ages`` lists the age of the Lease
+    after each call, once for each process that leads then.
     """
 
     turns: Turns
@@ -79,7 +80,7 @@ class Server:
 
 
 class Process(Runtime):
-    """A process that competes for the Lease, and may be killed."""
+    """A process that competes for the Lease, and that a test can kill."""
 
     def __init__(self, server: Server, may_lead: Callable[[], bool] = lambda: True) -> None:
         super().__init__()
@@ -215,7 +216,7 @@ def test_a_lease_that_cannot_be_read_is_told_once(
 def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
     server: Server, first_s: float, next_s: float
 ) -> None:
-    """The last renewal has a slow answer; then reading works, and writing fails."""
+    """The answer to the last renewal is slow; after that, reads succeed and writes fail."""
     one, calls = Process(server), count()
     server.turns.sleep(0.5)
     server.trouble = lambda: "before" if (number := next(calls)) > 1 and number % 2 else ""
@@ -227,7 +228,7 @@ def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_never_do_two_lead(tmp_path: Path, seed: int) -> None:
-    """Calls fail before or after their effect, take time, and processes are killed."""
+    """Calls fail before or after their effect or take long, and processes are killed, at random."""
     chance = random.Random(seed)
     with new_server(tmp_path, seed) as server:
         turns, away_until = server.turns, [0.0]

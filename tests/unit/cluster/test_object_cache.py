@@ -1,4 +1,4 @@
-"""Reading a cluster's objects over real HTTP: what is asked for, and what is told of faults."""
+"""A cluster's objects are read over real HTTP: which calls are made, and which faults reported."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEPLOYMENTS = ObjectSelector("Deployment", "perception")
 
 @dataclass
 class Api:
-    """An API server with one Application in each namespace, and what it was asked."""
+    """An API server with one Application in each namespace; it records the paths of calls."""
 
     reached: ClusterAccess
     asked: list[str] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""The file that says which clusters are woken, and waking by webhook; the API's way is in e2e."""
+"""The clusters file, and how a trigger calls the API or a webhook of a cluster."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 def trigger(
     case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
 ) -> None:
-    """Trigger the cluster of a golden case once; ``changed`` are the paths since the last time."""
+    """Trigger the cluster of a golden case once; ``changed`` are the paths that have changed."""
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)
@@ -83,7 +83,7 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
 
 @pytest.fixture
 def api(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, bytes]]]]:
-    """A server that takes every patch, and a kubeconfig for it."""
+    """A kubeconfig of a server that accepts every patch, and the list of the patches."""
     heard: list[tuple[str, bytes]] = []
 
     def answer(call: Call) -> Answer:

@@ -1,4 +1,4 @@
-"""Following what no cluster can tell: a cluster that is away, one without access."""
+"""A rollout is followed on a cluster that cannot be reached, or to which there is no access."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: P
         assert time.monotonic() - start >= 0.5
         assert (health.state, health.object) == ("waiting", "cluster away")
         assert health.reason.startswith("cannot be read: ")
-        # what asks nothing of that cluster does not wait for it
+        # a demand without a target on that cluster does not wait for the cluster
         assert status.follow("a" * 40, [], "healthy", timeout=60).result(30).state == "healthy"
     finally:
         status.close()

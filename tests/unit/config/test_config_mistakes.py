@@ -1,7 +1,7 @@
-"""What people mistype in a state repo.
+"""Mistakes of people in the configuration of a state repo.
 
-``tests/unit/messages`` holds what is said of each case of ``MISTAKES``.
-``test_mistakes_anywhere`` tries every mistake that a JSON schema knows.
+``tests/unit/messages`` has the message for each case of ``MISTAKES``.
+``test_mistakes_anywhere`` tries every mistake that a JSON schema can find.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def refused(changed: Mapping[str, str | None]) -> tuple[Fault, ...]:
 
 
 def argocd(**section: object) -> dict[str, str]:
-    """Return a ``demandops.yaml`` for Argo CD with this section."""
+    """Return a ``demandops.yaml`` for Argo CD whose section ``argocd`` has these fields."""
     text = skeleton("argocd")[ROOT]
     url = "  url: https://git.example/fleet/state-repo.git\n"
     assert url in text
@@ -72,7 +72,7 @@ TWICE = second_definition(
     ("prefix: of", "prefix: cp"),
     ("object-fusion:\n", "copy-fusion:\n"),
 )
-"""A second application that defines the detection of the first again."""
+"""A second application definition, which defines the first one's detection service again."""
 SERVICE = "appdefs/driver/service.yaml"
 
 
@@ -81,7 +81,10 @@ def shared(
     uses: str = "{cloud: point_cloud}",
     more: Mapping[str, str] | None = None,
 ) -> dict[str, str]:
-    """Return a shared service that the application uses, with texts of its definition replaced."""
+    """Return the files of a shared service that the application uses.
+
+    ``edits`` replace texts in the definition of the service.
+    """
     definition = """
 apiVersion: demandops/v1
 kind: ServiceDefinition
@@ -107,7 +110,7 @@ values: values/driver.yaml.j2
 
 
 _EDITS: dict[str, tuple[str, str, str]] = {
-    # what any file can get wrong
+    # mistakes in any file
     "a colon too many": (ROOT, "kind: StateRepository", "kind: State: Repository"),
     "a tab": (CLUSTERS, "  - name: c-its", "\t- name: c-its"),
     "a key twice": (NODES, "    type: vehicle\n", "    type: vehicle\n    type: edge\n"),
@@ -273,11 +276,11 @@ _SCALING: dict[str, str] = {
     "replicas that publish twice": "{min: 2, max: 2}",
     "an autoscaler of a service that publishes": "{max: 4, autoscaler: {cpu: 70}}",
 }
-"""Scalings that a service which publishes cannot have."""
+"""Values of ``scaling`` that are refused for a service that publishes a topic."""
 
 
 def scaled(scaling: str) -> Mapping[str, str | None]:
-    """Return the application definition with two parameters, and this scaling of the fusion."""
+    """Return the application definition with two parameters and this ``scaling`` of the fusion."""
     parameters = "parameters: {size: {default: s}, rate: {default: s, merge: max}}\nservices:\n"
     text = edited(APPDEF, "services:\n", parameters)[APPDEF]
     return {APPDEF: text.replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")}
@@ -405,7 +408,7 @@ uses:
         },
     ),
 }
-"""What a configuration is refused for, as the files that are other than the skeleton's."""
+"""Configurations that are refused, each as the files that differ from the skeleton's."""
 
 
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
@@ -417,7 +420,7 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
 
 @pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
 def test_an_id_that_is_no_label_needs_a_selector(id: str) -> None:
-    """Without one, ``node_id: <id>`` would be written, which the API server refuses."""
+    """Without a selector the release would have ``node_id: <id>``, which the API server refuses."""
     (found,) = refused(edited(NODES, V1, f'- id: "{id}"\n'))
     assert found.file == NODES
     assert "selector" in str(found)

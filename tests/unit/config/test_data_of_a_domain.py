@@ -1,4 +1,4 @@
-"""What keeps the data of access domains apart: ROS domains, credentials of brokers, warnings."""
+"""ROS domains and credentials of brokers keep the data of access domains apart."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CONNECTION = {
 
 
 def domains(fleet: str = "", city: str = "") -> dict[str, str]:
-    """Return a policy of two domains, each with further fields."""
+    """Return a policy with the access domains `fleet` and `city`; each text has further fields."""
     return {
         DOMAINS: f"""
 apiVersion: demandops/v1
@@ -45,7 +45,7 @@ domains:
 
 
 def clients(files: dict[str, str]) -> dict[str, Any]:
-    """Return the pod of each end of a connection between the two, by node."""
+    """Return the pod spec of each end of a connection between both domains, by node."""
     books = MemoryRepo(files)
     books.send(CONNECTION)
     pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]

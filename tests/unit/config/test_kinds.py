@@ -1,4 +1,4 @@
-"""The kinds that an access domain's charts may have: one list for Role, AppProject and `check`."""
+"""The Role, the AppProject and `check` permit the same kinds for an access domain's charts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
 
 
 def domain(**fields: Any) -> dict[str, str]:
-    """Return the policy with fields of the access domain added."""
+    """Return the policy, with these fields added to its access domain."""
     text = "".join(f"\n    {name}: {value}" for name, value in fields.items())
     return edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]{text}')
 
@@ -46,7 +46,7 @@ def bootstrap(files: Mapping[str, str]) -> list[dict[str, Any]]:
 
 
 def written(files: Mapping[str, str]) -> dict[str, set[str]]:
-    """Return API group → the resources that the domain's account may write."""
+    """Return the resources that the domain's account may write, by API group."""
     (role,) = (item for item in bootstrap(files) if item["kind"] == "Role")
     found: dict[str, set[str]] = {}
     for rule in role["rules"]:
@@ -56,7 +56,7 @@ def written(files: Mapping[str, str]) -> dict[str, set[str]]:
 
 
 def permitted(files: Mapping[str, str]) -> set[tuple[str, str]]:
-    """Return (group, kind) of what the domain's AppProject permits."""
+    """Return the (group, kind) pairs that the domain's AppProject permits."""
     argocd = {"demandops.yaml": skeleton("argocd")["demandops.yaml"]}
     (project,) = (item for item in bootstrap(argocd | dict(files)) if item["kind"] == "AppProject")
     return {

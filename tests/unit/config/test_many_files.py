@@ -1,6 +1,6 @@
-"""A kind of configuration in one file or in many: the entries are the same, and so are faults.
+"""A collection may be one file or many: its entries and their faults are the same.
 
-The examples are those of docs/inventory.md.
+The examples come from docs/inventory.md.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def faults(changed: Mapping[str, str | None]) -> str:
 
 
 def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
-    """Move entries of each collection to files of its folder, by chance."""
+    """Move entries of each collection at random to two files in the collection's folder."""
     result = dict(files)
     for path in {*COLLECTIONS} & {*files}:
         data, parts = plain_yaml.load(result.pop(path)), dict[str, dict[str, Any]]()
@@ -52,7 +52,7 @@ def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
         head = {name: data.pop(name) for name in heads if name in data}
         for name, entries in data.items():
             for key in entries if isinstance(entries, dict) else range(len(entries)):
-                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type is one entry
+                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type stays whole
                     place = path.replace(".yaml", random.choice([".yaml", "/a.yaml", "/b.yaml"]))
                 part = parts.setdefault(place, dict(head))
                 if isinstance(entries, dict):

@@ -1,4 +1,4 @@
-"""No person has to read a pattern: every field says in words what it takes."""
+"""Each field that has a pattern also describes in words which values it accepts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node in several access domains: each is a policy, a namespace and a ROS domain of its own."""
+"""A node in several access domains, each with a policy, a namespace and a ROS domain of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an appdef's values template can get wrong: the message names the template and the line."""
+"""Mistakes in an appdef's values template: the message names the template and the line."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
 TOPIC = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 LAST = skeleton()[TEMPLATE].count("\n") + 1
-"""The line that a text appended to the template stands on."""
+"""The number of the line that a text appended to the template gets."""
 
 
 def faults(template: str) -> list[str]:
-    """Return the faults that a demand gets which needs the template."""
+    """Send a demand that needs this template; return the faults of its refusal."""
     books = MemoryRepo({TEMPLATE: template})
     before = dict(books.files)
     with pytest.raises(InvalidInput) as invalid:
@@ -74,7 +74,7 @@ APPENDED: dict[str, tuple[str, str]] = {
         "a template may write text, numbers, lists and mappings, not <class 'builtin_function",
     ),
 }
-"""A line of a template, and a word of the message; the sentence is Jinja's own."""
+"""By mistake: a line of a template, and a word of Jinja's message."""
 TOO_LARGE = [
     *("'a' * 1000000000", "[1] * 1000000000", "10 ** 1000", "'%1000000000d' % 1"),
     *("'%*d' % (1000000000, 1)", "'%1000000000d' | format(1)", "'{:>1000000000}'.format(1)"),
@@ -83,7 +83,7 @@ TOO_LARGE = [
     *("'a' | center(1000000000)", "'a' | indent(1000000000, true)"),
     *("[1] | batch(1000000000, 'x') | list", "[1] | slice(1000000000) | list"),
 ]
-"""What would eat the memory is refused before it is made."""
+"""Expressions whose values would fill the memory; they are refused before they are evaluated."""
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
 
 
 class TestValues:
-    """What a template gives is parsed and held against the chart's schema."""
+    """The result of a template is parsed, and checked against the chart's schema."""
 
     def test_every_value_that_does_not_fit(self) -> None:
         text = skeleton()[TEMPLATE].replace("replicas: {{ replicas }}", "replicas: many")
@@ -214,7 +214,7 @@ class TestValues:
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
-        """Everything is written as JSON, so the quotes show, and the schema finds them."""
+        """Values are rendered as JSON, so the quotes become part of the text, which is refused."""
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(
@@ -244,7 +244,7 @@ class TestValues:
 
 
 def doubling(times: int) -> dict[str, object]:
-    """Return a schema that applies the last of its definitions ``2 ** times`` times."""
+    """Return a schema whose validation applies its last definition ``2 ** times`` times."""
     steps: dict[str, object] = {
         f"d{i}": {"allOf": [{"$ref": f"#/$defs/d{i + 1}"}] * 2} for i in range(times)
     }
@@ -252,7 +252,7 @@ def doubling(times: int) -> dict[str, object]:
 
 
 class TestSchema:
-    """A chart's schema reads nothing else, and ends."""
+    """Validation by a chart's schema reads no other file, and always ends."""
 
     def faults(self, schema: object) -> list[str]:
         text = schema if isinstance(schema, str) else json.dumps(schema)
@@ -303,7 +303,7 @@ class TestSchema:
 
 
 class TestBeforeTheFirstDemand:
-    """``demandops check`` renders every service once, for nobody."""
+    """``demandops check`` renders every service once, although nobody demands it."""
 
     def rehearsal(self, changed: dict[str, str | None]) -> list[str]:
         with pytest.raises(InvalidInput) as invalid:

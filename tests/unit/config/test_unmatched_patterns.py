@@ -1,4 +1,4 @@
-"""A pattern of the policy that matches nothing is told: it is misspelled, or out of date."""
+"""A warning names each pattern of the policy that matches nothing."""
 
 from __future__ import annotations
 

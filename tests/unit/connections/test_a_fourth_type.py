@@ -1,7 +1,8 @@
 """A fourth connection type: one module, its templates, and one more entry in the list of types.
 
-The module is this one. A relay runs at the target and fetches the topics of all sources. Nothing
-else in the program knows it, and a demand for it is booked, planned, rendered and explained.
+This test module is that module. Its client is a relay, which runs at the target and fetches the
+topics of all sources. Nothing else in the program knows the type, but a demand for it is booked,
+planned, rendered and explained.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ spec:
 
 
 class RelayType(ConnectionType):
-    """A client at the target fetches all topics of its connections."""
+    """A connection type with one client at the target, which fetches all connections' topics."""
 
     name = "RELAY"
     number = 7
@@ -103,7 +104,7 @@ class RelayType(ConnectionType):
 
 @dataclass(frozen=True, slots=True)
 class Relay(Client):
-    """A node's relay."""
+    """The relay of a node, with the topics that it fetches and the names that it gives them."""
 
     fetch: dict[str, str]
 

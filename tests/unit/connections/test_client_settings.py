@@ -1,4 +1,4 @@
-"""How clients run: `registry/clients.yaml`, one image registry, prefixes, and overrides."""
+"""`registry/clients.yaml`, an image registry, prefixes and overrides decide how clients run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def clients(**mqtt: Any) -> dict[str, str]:
 
 
 def pod(changed: dict[str, str | None] | dict[str, str], **more: Any) -> dict[str, Any]:
-    """Return the pod of a connection's source."""
+    """Return the pod spec of the client at a connection's source."""
     repo = MemoryRepo({**changed})
     repo.send(goal([], [connection(**more)]))
     found = repo.objects("Deployment")

@@ -1,4 +1,4 @@
-"""Zenoh bridges, DDS routers and MQTT clients with options: what they are told, and when."""
+"""The configuration of Zenoh bridges, DDS routers and MQTT clients follows routes and options."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class World(MemoryRepo):
-    """A state repo in memory that demands with options are sent to."""
+    """A state repo in memory; demands to it may have options for routes."""
 
     def __init__(self, before: State) -> None:
         super().__init__(state=before)
@@ -44,7 +44,7 @@ class World(MemoryRepo):
         return {name: documents[0]["data"] for name, documents in self._pods().items()}
 
     def checksums(self) -> dict[str, str]:
-        """Return what restarts each client where it changes."""
+        """Return each client's checksum by name; a new checksum restarts the client."""
         return {
             name: pod["spec"]["template"]["metadata"]["annotations"]["demandops/config-checksum"]
             for name, (_, pod) in self._pods().items()
@@ -68,7 +68,7 @@ def zenoh_world() -> World:
 
 
 class TestZenoh:
-    """One bridge on a node, for all that it carries."""
+    """One Zenoh bridge runs on a node, for all topics that the node sends and receives."""
 
     def test_both_nodes_of_a_connection_are_affected_and_no_other(self) -> None:
         world = zenoh_world()
@@ -132,13 +132,13 @@ class TestZenoh:
             try:
                 world.send(asked)
             except InvalidInput:
-                continue  # a shutdown of what this requester does not hold
+                continue  # the requester does not hold the connection
             kept = {path: text for path, text in world.files.items() if "ledger/" not in path}
             assert kept == rendered_files(world.state)
 
 
 class TestRos:
-    """A DDS router at each end."""
+    """A DDS router runs at each end of a connection."""
 
     def world(self, **more: Any) -> World:
         types = {"/a": "std_msgs/msg/String", "/b": "sensor_msgs/msg/PointCloud2"}
@@ -190,7 +190,7 @@ class TestRos:
 
 
 class TestMqtt:
-    """What is set at which end; tests/golden has the options."""
+    """Which end of a connection gets which setting; tests/golden has the options."""
 
     def test_a_connection_that_only_brings_back_has_its_ends_turned(self) -> None:
         world = World(state())
@@ -227,7 +227,7 @@ BRIDGED: dict[str, Any] = {"bridged": {"edge": ["/a"]}}
 
 
 class TestBridgedAlready:
-    """What the initial deployment carries is not carried twice, and no client is empty."""
+    """A topic that the inventory lists as bridged is not carried again; no client has no topic."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_no_client_without_a_topic(self, kind: str) -> None:
@@ -253,12 +253,12 @@ class TestBridgedAlready:
 
 
 class TestWhatPeopleDidInGit:
-    """A claim that its type cannot carry, or an inventory that lost what a claim needs."""
+    """A person edits a claim so that its type cannot carry it, or removes what a claim needs."""
 
     NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
 
     def after(self, kind: str, route: Route, **nodes: Any) -> list[str]:
-        """Return why the books cannot be rendered once a claim or the inventory was edited."""
+        """Return the faults of rendering with this route in a claim and these nodes."""
         world = World(state(**self.NODES))
         world.send(demand(kind))
         (claim,) = world.state.ledger.connection_claims("c")
@@ -299,7 +299,7 @@ class TestWhatPeopleDidInGit:
 
 
 class TestSchemas:
-    """A field that the client does not read never reaches a commit."""
+    """A client's configuration with a field that its schema does not know is never committed."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_a_field_more_anywhere_is_refused(self, kind: str) -> None:

@@ -1,6 +1,6 @@
-"""Which type carries a connection: the automatic choice, and what each type refuses.
+"""The automatic choice of a connection's type, and what each type refuses.
 
-``tests/unit/messages`` holds what is said of ``REFUSED``.
+``tests/unit/messages`` has the messages for ``REFUSED``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def carried(before: State, asked: dict[str, Any]) -> ConnectionType:
 
 
 ABLE = state(vehicle00=SPEAKS | TYPED, edge=REACHABLE | WAN)
-"""Every type can carry a connection here."""
+"""A state in which every type can carry a connection from vehicle00 to the edge."""
 
 BRIDGES = state(vehicle00=SPEAKS, edge=REACHABLE)
 _ONE_ROUTER = {"zenoh": {"connect": ["tcp/router:7447"]}}
@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[State, dict[str, Any]]] = {
 
 
 class TestAutomaticChoice:
-    """Zenoh where both speak it, else MQTT where there is a broker, else ROS, else refused."""
+    """Zenoh if both nodes speak it, else MQTT if there is a broker, else ROS, else a refusal."""
 
     @pytest.mark.parametrize(
         ("before", "asked", "chosen"),
@@ -140,7 +140,7 @@ class TestAutomaticChoice:
 
 
 class TestThroughTheWire:
-    """The reference's message names the three types by number, and says nothing of options."""
+    """The reference's message names the three types by number, and has no options."""
 
     @pytest.mark.parametrize(("number", "name"), [(0, "ROS"), (1, "MQTT"), (2, "ZENOH")])
     def test_each_type_is_honoured_where_the_inventory_allows(self, number: int, name: str) -> None:

@@ -1,6 +1,6 @@
-"""Clients are told nothing that their programs do not declare: `declared.yaml` says where they do.
+"""Clients get only parameters that their programs declare; `declared.yaml` lists the declarations.
 
-Each connection has every option of its type, in both directions, so each field is written once.
+Each connection has every option of its type in both directions, so that every field is written.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def with_all_options(kind: str) -> State:
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and the type of each value."""
+    """Yield the path and the type's name of each value in nested mappings and lists."""
     if isinstance(value, dict):
         for key, item in value.items():
             name = "{}" if "/" in key else key

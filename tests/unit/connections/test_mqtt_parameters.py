@@ -25,7 +25,11 @@ def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
 
 
 def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
-    """Follow each message as two clients would: connection → (ROS in, MQTT) → ROS out."""
+    """Follow each topic through both clients of its connection.
+
+    Return by connection the ROS topic at the target by the ROS topic at the source and the
+    MQTT topic.
+    """
     deployments = books.objects("Deployment")
     ways: dict[str, dict[str, dict[str, str]]] = {}
     for name, parameters in ends(books).items():

@@ -1,4 +1,4 @@
-"""What a route may say at all, whatever carries it."""
+"""Which routes are valid, whatever connection type carries them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever comes as a goal: it is decided, or refused with faults, and nothing else happens."""
+"""Any value sent as a goal is either decided or refused with faults; nothing else is raised."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCALAR: st.SearchStrategy[Any] = (
     st.none() | st.booleans() | st.integers() | st.floats() | TEXT | st.binary(max_size=3)
 )
 UNSEEN = {"Cc", "Cs", "Zl", "Zp"}
-"""What moves a terminal's cursor, or breaks a line for some programs only."""
+"""Unicode categories of characters that move a terminal's cursor or may break a line."""
 
 _GOAL_MODELS = [
     getattr(deployment_request_goal, f"Wire{part}")
@@ -83,7 +83,7 @@ def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
 
 
 def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    """Return goals of the right form, whose texts are made up."""
+    """Return a strategy of goals that have the right form, with texts of the strategy `text`."""
     topics = st.lists(st.tuples(text, text), max_size=2)
     apps = st.lists(
         st.builds(

@@ -16,14 +16,14 @@ REFERENCE, OWN = (Form(model.model_json_schema()) for model in rich.GOAL_MODELS)
 FREE = {"GoalApplication.parameters", "DemandGoal.lease"}
 FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
 ELSEWHERE = {
-    "connections[0].source_topics": "connections[0].target_topics",  # one has more topics then
+    "connections[0].source_topics": "connections[0].target_topics",  # lengths then differ
     "shutdown": "apps[0].header.id",  # the shutdown finds no claim
     "connections[0].type": "connections[0].",  # another type has other rules
-    "applications[0].parameters.rate": "parameters.rate",  # when it is merged, without its place
-    "applications[1].place": "applications[1].node",  # without both
+    "applications[0].parameters.rate": "parameters.rate",  # found in the merge
+    "applications[1].place": "applications[1].node",  # then both are missing
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
-"""Where a fault may also be when the mistake is here."""
+"""By the field of a mistake, another field at which the fault may be reported."""
 
 
 @pytest.mark.parametrize(

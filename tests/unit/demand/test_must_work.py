@@ -1,4 +1,4 @@
-"""Demands that leave much open, or whose requesters look alike."""
+"""Demands that omit much, or whose requesters have similar names, are booked."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class TestOpenBroker:
-    """The only one, the requested one, one on the target node, one on the source node."""
+    """The only broker is chosen, else the requested one, else the target's, else the source's."""
 
     @staticmethod
     def hosts(books: MemoryRepo) -> set[str]:

@@ -1,4 +1,4 @@
-"""What a demand must not say; ``tests/unit/messages`` holds what is said of the two tables."""
+"""Demands that are refused; ``tests/unit/messages`` has the messages for both tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.kit.memory import MemoryRepo
 
 
 def placed(place: Goal, node: str = "", application: str = "fusion") -> Goal:
-    """Return a demand that asks for a place for its application."""
+    """Return a demand whose application has this ``place``."""
     made = put("d", "vehicle01")
     made["applications"][0] |= {"place": place, "node": node, "id": application}
     return made
@@ -140,7 +140,7 @@ CONTRADICTING: dict[str, Goal] = {
     "a shutdown by another requester": goal([application(who=OTHER)], shutdown=True),
     "a shutdown with a misspelt id": goal([application("edge/fusion")], shutdown=True),
 }
-"""What is refused once ``perception()`` is booked."""
+"""Goals that are refused once ``perception()`` is booked."""
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_a_shutdown_sent_again_changes_nothing_and_says_so() -> None:
 
 
 def limited(**limits: int) -> MemoryRepo:
-    """Return a state repo with limits."""
+    """Return a state repo with these ``limits`` in demandops.yaml."""
     settings = yaml.safe_load(skeleton()["demandops.yaml"])
     return MemoryRepo({"demandops.yaml": yaml.safe_dump(settings | {"limits": limits})})
 
@@ -278,7 +278,7 @@ def test_similar_names_are_found_soon_however_many_words_are_unknown() -> None:
     names = [f"vehicle-{number:04}" for number in range(1000)]
     before = time.thread_time()
     found = {suggestion(f"vehicel-{number:04}", names) for number in range(0, 1000, 2)}
-    assert time.thread_time() - before < 5  # it was half a minute
+    assert time.thread_time() - before < 5  # it once took half a minute
     assert len(found) > 100
     for word in ("vehicle-0123x", "xehicle-0123", "vehicle-123"):
         assert suggestion(word, names) == "; did you mean 'vehicle-0123'?"

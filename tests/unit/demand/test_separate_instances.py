@@ -1,4 +1,4 @@
-"""With ``versions: separate`` another version than the default runs in an instance of its own."""
+"""With ``versions: separate`` each version but the default runs in an instance of its own."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def empty() -> MemoryRepo:
 
 
 def own(version: str) -> str:
-    """Return the version of the instance that a demanded one gets; empty for the shared one."""
+    """Return the version of the instance for a demanded version; empty for the default."""
     version = CHANNELS.get(version, version or DEFAULT)
     return "" if version == DEFAULT else version
 
@@ -125,7 +125,7 @@ def test_outputs_of_both_are_delivered_by_topics_of_their_own() -> None:
 
 
 def test_one_topic_for_both_is_refused() -> None:
-    """A delivery may name a topic, and then only one of the instances may."""
+    """If a delivery names its topic, only one instance can publish on that topic."""
     repo = MemoryRepo(SEPARATE)
     delivery = {"output": "object-fusion.fused_objects", "node": "vehicle01", "topic": "/it"}
     for name, version in (("a", ""), ("b", "1.1.0")):

@@ -1,4 +1,4 @@
-"""What runs is the newest version that is asked for, and who must approve that."""
+"""The newest demanded version runs; some updates need approval."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.kit.memory import MemoryRepo, ledger_in, rebuilt
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 LISTED = ("0.9.0", "1.0.0", "1.1.0-rc.2", "1.1.0-rc.10", "1.1.0", "1.10.0", "2.0.0")
-"""The versions, oldest first."""
+"""The versions in the registry, oldest first."""
 CHANNELS = {"stable": "1.0.0", "testing": "1.1.0"}
 DEFAULT = "1.0.0"
 NODES = ("edge", "cloud")
@@ -66,7 +66,7 @@ def release(demand: str) -> dict[str, Any]:
 
 
 def running(repo: MemoryRepo) -> dict[str, str]:
-    """Return service → the version that it runs."""
+    """Return the version that each service runs."""
     return {name: entry["application_version"] for name, entry in repo.books()["services"].items()}
 
 
@@ -148,7 +148,7 @@ def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
     assert asks.approval == (f"{ASKS}the upgrade of {what} from version 1.0.0 to 2.0.0",)
     names = running(repo)
     assert sorted(names.values()) == ["1.0.0", "2.0.0", "2.0.0"]
-    # a third one shares what runs already
+    # a third demand shares the version that already runs
     assert repo.send(put("c", "2.0.0", id="edge/c")).approval == ()
     older = repo.send(put("d", "1.0.0", id="edge/d"))
     assert older.approval == (f"{ASKS}version 1.0.0 of {what}, which runs 2.0.0",)
@@ -207,7 +207,7 @@ def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
 
 
 class Walk:
-    """Demands join and leave by chance; what runs is what the rule says."""
+    """Demands join and leave at random; checks compare the running versions with the rule."""
 
     def __init__(self, random: Random, policy: str) -> None:
         self.random = random
@@ -234,7 +234,10 @@ class Walk:
                 self.asked[demand] = wanted
 
     def assert_as_the_rule_says(self) -> None:
-        """The newest that is asked for, of an application and then of what shares a service."""
+        """Check that each service runs the newest version of the applications that use it.
+
+        An application's version is the newest one that is demanded for it.
+        """
         newest: dict[str, str] = {}
         for version, app, _ in self.asked.values():
             name = CHANNELS.get(version, version or DEFAULT)
@@ -244,7 +247,7 @@ class Walk:
             assert entry["application_version"] == max(versions, key=LISTED.index)
 
     def assert_rendered_from_the_claims(self) -> None:
-        """The files are those of the claims alone, in whatever order they came."""
+        """Check that the claims alone, in any order, render the files of the repo."""
         claims = sorted(self.repo.state.ledger, key=lambda claim: str(claim.key))
         self.random.shuffle(claims)
         for ledger in (rebuilt(claims), ledger_in(self.repo.files)):

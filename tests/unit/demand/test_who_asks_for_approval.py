@@ -1,4 +1,4 @@
-"""What asks for approval of which demands: access domains, their rules, application definitions."""
+"""Access domains, their rules and application definitions require approval of demands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 
 
 def policy(**changed: Any) -> dict[str, str]:
-    """The skeleton's policy, its one domain changed."""
+    """Return the skeleton's policy, with fields of its only domain changed."""
     data = yaml.safe_load(skeleton()[POLICY])
     data["domains"][0].update(changed)
     return {POLICY: yaml.safe_dump(data)}
@@ -77,7 +77,7 @@ def test_a_rule_for_another_application_or_node_lets_nothing_through() -> None:
     other = {"name": "other", "applications": ["recorder"], "approval": "none"}
     books = MemoryRepo(rules(ASKS, elsewhere, other))
     assert books.send(goal([application()])).approval == (f"rule 'asks' of {DOMAIN}",)
-    # a connection is not held to applications, so the rule for another one covers it
+    # a connection has no application, so a rule for another application covers it
     assert books.send(goal([], [connection()], id="other")).approval == ()
 
 
@@ -96,7 +96,7 @@ def test_more_than_what_stands_needs_approval() -> None:
 
 
 def put(**changed: Any) -> dict[str, Any]:
-    """A demand of our own, for one application."""
+    """Return a `Demand` for one application, with further or other fields."""
     inputs = {"point_cloud": [{"topic": "/stations/station00/pointcloud", "source": "station00"}]}
     app = {"id": APP, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
     head = {"apiVersion": "demandops/v1", "kind": "Demand", "demand": "d", "requesters": ["v"]}

@@ -1,4 +1,4 @@
-"""Goals of the wrong form; ``tests/unit/messages`` holds the faults of each, at its own place."""
+"""Goals of the wrong form; ``tests/unit/messages`` has the faults of each, with their fields."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WRONG: dict[str, object] = {
     "text": "id: x",
     "an unknown field, misspelt": perception(shutdwon=True),
     "an unknown field, like none": perception(qos=1),
-    # whether it joins or leaves is not known, so a topic list may be empty
+    # it could be a shutdown, so an empty list of topics is no fault
     "a shutdown that is no truth": goal([application(clouds=[])], [connection(topics=[])])
     | {"shutdown": "yes"},
     "faults of form and of content": goal(

@@ -1,4 +1,4 @@
-"""The detector goes on after a restart and with other rules: nothing ends and starts again."""
+"""A restart or new rules do not make the detector end an event and start it again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The engine gives the events that a plain model gives, which knows no index and no splits."""
+"""The engine reports the same events as a simple model without an index."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RULES = [
 
 
 class Model:
-    """Compares everything with everything at each message."""
+    """A model of the engine that compares all entities with each other at each message."""
 
     def __init__(self) -> None:
         self.at: dict[tuple[str, str], tuple[float, float]] = {}
@@ -71,7 +71,7 @@ class Model:
                     self.events.append((now, *key, True))
 
     def levels(self) -> Iterator[tuple[Any, bool, bool]]:
-        """Yield each event that is possible now, and whether it starts and stops."""
+        """Yield the key of each possible event, whether it starts, and whether it stops."""
         inside = 0
         for (source, entity), (x, y) in self.at.items():
             away = hypot(x, y)

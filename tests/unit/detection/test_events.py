@@ -1,4 +1,4 @@
-"""Events of each kind of rule, one at a time."""
+"""The events of each kind of rule."""
 
 from __future__ import annotations
 

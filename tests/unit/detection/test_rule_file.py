@@ -1,4 +1,4 @@
-"""A file of rules: each mistake is told with its line, its field and how to mend it."""
+"""Each mistake in a file of rules is reported with its line, its field and the remedy."""
 
 from __future__ import annotations
 

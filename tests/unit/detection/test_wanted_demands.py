@@ -1,4 +1,4 @@
-"""What is sent, and when: one goal at a time, again after a fault, nothing that is over."""
+"""The detector sends one goal at a time, repeats it after a fault, and sends none that is over."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ JOIN = Goal("deployment_request", {"id": "r", "apps": []})
 
 
 class Sent:
-    """The goals of one event, sent one by one."""
+    """Sends the goals of one event one by one."""
 
     def __init__(self) -> None:
         self.wanted = WantedDemands()
@@ -27,7 +27,7 @@ class Sent:
         return sending
 
     def done(self, now: float, lease_s: float = 0.0, code: str = "", message: str = "") -> str:
-        """Send the next goal, and answer it."""
+        """Send the next goal and answer it; return its purpose, or after a fault the report."""
         sending = self.next(now)
         told = self.wanted.answered(sending, Outcome(code, message, lease_s), now)
         assert code or not told

@@ -1,7 +1,8 @@
-"""A forge on the loopback that replays recorded exchanges, and fails what was not recorded.
+"""A forge on the loopback that replays recorded exchanges, and refuses all other requests.
 
-An exchange is a request as the forge's API documents it, and the answer: in
-``exchanges/<name>.yaml``, in order. The token's value is looked at and not recorded.
+An exchange is a request as the forge's API documents it, and its answer.
+``exchanges/<name>.yaml`` lists the exchanges in order. The replay checks the token, which is not
+recorded.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _IGNORED = {"host", "connection", "accept-encoding", "user-agent", "content-leng
 
 @dataclass
 class Replay:
-    """A running replay: where it is, what is still to come, what went wrong."""
+    """A running replay: its URL, the exchanges left, the problems, and the requests so far."""
 
     url: str = ""
     left: list[dict[str, Any]] = field(default_factory=list)
@@ -51,7 +52,7 @@ class Replay:
 
 @contextmanager
 def replaying(*names: str, variables: dict[str, str] | None = None) -> Iterator[Replay]:
-    """Replay recorded exchanges one after the other; ``variables`` fill ``{name}`` in them."""
+    """Replay recorded exchanges in order; ``variables`` replace ``{name}`` in them by values."""
     replay = Replay()
     for name in names:
         text = (_EXCHANGES / f"{name}.yaml").read_text()

@@ -1,4 +1,4 @@
-"""The forges' adapters against recorded exchanges: method, path, headers and body of each call."""
+"""Each call of the forges' adapters has the method, path, headers and body that were recorded."""
 
 from __future__ import annotations
 

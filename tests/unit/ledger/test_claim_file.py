@@ -1,4 +1,4 @@
-"""A claim's file says all of the claim, whatever its ids are made of."""
+"""A claim's file contains the whole claim, whatever characters its ids have."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ values = st.recursive(
 
 
 def by_place(found: list[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return the topics as a claim holds them: each place once, sorted."""
+    """Return the topics as a claim holds them: each topic of a source once, sorted."""
     return tuple(sorted({(item.topic, item.source): item for item in found}.values()))
 
 
@@ -127,7 +127,7 @@ claims = st.builds(
 
 @st.composite
 def joined_claims(draw: st.DrawFn) -> Claim:
-    """Return a claim of the reference's action; some of its requesters hold each topic."""
+    """Return a claim of a `DeploymentRequest`; each topic is held by some of its requesters."""
     claim = replace(draw(claims), joined=True)
     some = st.sets(st.sampled_from(claim.requesters), min_size=1)
     holders = {topic: tuple(sorted(draw(some))) for topic in claim.held.topic_keys()}
@@ -186,7 +186,7 @@ def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
 
 
 def written(claim: Claim, *changes: tuple[str, str]) -> Claim:
-    """Return what is read of a claim's file that a person changed."""
+    """Return the claim that is read from its file after a person replaced texts in it."""
     text = claim_file.text_of(claim)
     for old, new in changes:
         assert old in text

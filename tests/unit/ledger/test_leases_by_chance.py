@@ -1,6 +1,6 @@
-"""Demands put, renewed, released and left to expire in any order, as time passes and with restarts.
+"""Demands are put, renewed, released or expire, in any order and with restarts.
 
-Held against ``tests/model/leases.py``, which knows what is promised and not the program.
+The results are compared with ``tests/model/leases.py``, a model of the promises that leases make.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 
 def restart(world: running.World, random: Random) -> None:
-    """Go on from the files alone, read in any order."""
+    """Restart the generator with a ledger that is read from the files in any order."""
     files = random.sample(sorted(world.files.items()), len(world.files))
     ledger = ledger_in(dict(files))
     assert ledger == world.state.ledger
@@ -46,7 +46,7 @@ def restart(world: running.World, random: Random) -> None:
 
 
 def assert_released(world: running.World, promises: Promises, now: int) -> None:
-    """Look at the leases: what must go goes, what may not does not, one commit a demand."""
+    """Release what has expired, and compare it with what must and may be released now."""
     before = set(claims_of(world.state.ledger))
     demands = world.look()
     assert len(demands) == len(set(demands))
@@ -60,7 +60,7 @@ def assert_outcome(taken: Any, expected: str, promises: Promises) -> None:
     outcome = taken.outcome if isinstance(taken, Decision) else "refused"
     if (outcome, expected) == ("booked", "unchanged"):
         assert taken.releases == ()
-        for change in taken.changes.claims:  # only the time that is recorded
+        for change in taken.changes.claims:  # only the recorded time changes
             assert change.before.lease != change.after.lease
             assert change.before.booked == change.after.booked
     else:
@@ -68,7 +68,7 @@ def assert_outcome(taken: Any, expected: str, promises: Promises) -> None:
 
 
 def assert_recorded(world: running.World, promises: Promises) -> None:
-    """The record lags behind what was promised by the slack at most, and is never ahead."""
+    """Check that each recorded end is at most the slack earlier than promised, and never later."""
     for claim in world.state.ledger:
         demand, subject = name_of(claim)
         promised = promises.held[demand][subject].promised
@@ -107,12 +107,12 @@ def test_what_was_promised_is_kept(random: Random, length: int) -> None:
 
 
 def leave_all(world: running.World, promises: Promises, now: int) -> None:
-    """Let every lease end and release the rest: nothing of anybody stays."""
+    """Let every lease end and release the other demands; check that nothing is left."""
     world.clock.pass_(2 * 3600)
     assert_released(world, promises, now + 2 * 3600)
     for claim in list(world.state.ledger):
         if world.state.ledger.get(claim.key) is None:
-            continue  # went with another of its demand
+            continue  # gone with another claim of its demand
         release = {"kind": "Demand", "operation": "release", "demand": claim.demand}
         world.take(release | {"requesters": list(claim.requesters)})
     assert replace(world.state.ledger, shutdowns=RecentShutdowns()) == Ledger()

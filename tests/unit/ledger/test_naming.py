@@ -1,4 +1,4 @@
-"""Two different ids never give one name, and every name is one that Kubernetes and ROS 2 take."""
+"""Different ids give different names, and Kubernetes and ROS 2 accept every name."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROS_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 LONGEST_NAME, LONGEST_TOPIC = 53, 247
 
 Subject = tuple[str, ...]
-"""A prefix and what the name is for."""
+"""A prefix, and the ids that a name is made of."""
 
 close = st.text("ab0-_/.A", min_size=1, max_size=5)
 words = st.sampled_from(["edge", "vehicle00", "vehicle_00", "vehicle/00", "Vehicle00", "a", "b"])
@@ -58,7 +58,7 @@ subjects: st.SearchStrategy[Subject] = st.one_of(
 
 
 def rivals(subject: Subject, name: str) -> Iterator[Subject]:
-    """Yield other subjects that a plain name would read just like ``name``."""
+    """Yield other subjects whose ids, simply joined, would give ``name`` or a similar name."""
     prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
     yield ("of", rest)
     yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")
@@ -80,7 +80,7 @@ def rivals(subject: Subject, name: str) -> Iterator[Subject]:
 
 
 def named_apart(found: set[Subject], name_of: Callable[[Subject], str]) -> dict[str, Subject]:
-    """Return the subjects by name, having seen that none share one."""
+    """Check that all subjects have different names; return the subjects by name."""
     names: dict[str, Subject] = {}
     for subject in sorted(found):
         other = names.setdefault(name_of(subject), subject)
@@ -98,7 +98,7 @@ def test_different_subjects_have_different_names_that_kubernetes_takes(
     drawn: list[Subject],
 ) -> None:
     found = set(drawn)
-    for _ in range(2):  # rivals of the rivals' names too
+    for _ in range(2):  # a second time with the rivals of rivals
         found |= {
             rival for subject in list(found) for rival in rivals(subject, kubernetes_name(subject))
         }
@@ -118,7 +118,7 @@ def topic_instance(subject: Subject) -> str:
 
 
 def as_the_reference(id: str) -> str:
-    """Return an id as application_manager/utils.py of the reference writes it into a topic."""
+    """Return an id in the form that the reference (application_manager/utils.py) uses in topics."""
     return id.replace("-", "_").replace("/", "_")
 
 
@@ -207,7 +207,7 @@ def usual_cloud(nodes: list[str], node: str) -> str:
 
 
 def with_nodes(nodes: list[str]) -> MemoryRepo:
-    """Return a new repo whose inventory lists further nodes, with any ids."""
+    """Return a new repo whose inventory has further nodes with these ids, which may be invalid."""
     repo = MemoryRepo()
     config = repo.state.config
     (domain,) = config.domains.values()
@@ -231,5 +231,5 @@ def with_nodes(nodes: list[str]) -> MemoryRepo:
 
 
 def quoted(text: str) -> str:
-    """Return a text as the templates write it."""
+    """Return a text in the quotes that the templates write."""
     return json.dumps(text, ensure_ascii=False)

@@ -1,4 +1,4 @@
-"""Detection and fusion publish the reference's topics; a node never gets a topic twice."""
+"""Detection and fusion publish the reference's topics; no node gets a topic from two sources."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal
 from tests.kit.memory import MemoryRepo, rebuilt
 
 FRONT, REAR = ("/front/points", "vehicle01"), ("/rear/points", "vehicle01")
-"""Two clouds of a vehicle whose entry in the inventory names none."""
+"""Two point clouds of a vehicle for which the inventory names no usual topic."""
 PLAIN = "/vehicle01_local_objectlist"
 REAR_SLUG = "/vehicle01_rear_points_cf82ae10af3d_local_objectlist"
 NODES = "inventory/nodes.yaml"
@@ -30,7 +30,7 @@ def join(*clouds: Topic, who: str = "vehicle01", id: str = APP, shutdown: bool =
 
 
 def published(repo: MemoryRepo) -> dict[str, str]:
-    """Return the topic of each object list by the topic of its cloud."""
+    """Return the topic of each detection's object list by the topic of its point cloud."""
     values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
     detections = [one["detection"] for one in values if "detection" in one]
     return {one["pointCloudTopic"]: one["objectListTopic"] for one in detections}
@@ -42,7 +42,7 @@ def fused(repo: MemoryRepo) -> set[str]:
 
 
 def with_nodes(*nodes: dict[str, Any]) -> MemoryRepo:
-    """Return a repo in which nodes are added, or have more to say."""
+    """Return a repo whose inventory has these nodes added, or these fields of known nodes."""
     inventory = yaml.safe_load(skeleton()[NODES])
     known = {node["id"]: node for node in inventory["nodes"]}
     for node in nodes:
@@ -195,7 +195,7 @@ def test_a_connection_that_brings_what_a_service_publishes_is_refused(
 
 
 def claims_after(*goals: Any) -> list[Claim]:
-    """Return the claims of goals that are each decided alone."""
+    """Return the claims of goals, each decided in an empty repo of its own."""
     repos = [MemoryRepo() for _ in goals]
     for repo, one in zip(repos, goals, strict=True):
         repo.send(one)

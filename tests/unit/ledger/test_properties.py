@@ -1,6 +1,7 @@
-"""Whatever is asked in whatever order: what must hold of the books and of what they render.
+"""Properties of the ledger and of the rendered files that hold after any requests in any order.
 
-The model in ``tests/model`` knows the design and not the program; both take the same requests.
+The model in ``tests/model`` follows the design and uses no code of the program. Program and model
+take the same requests.
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ Key = tuple[tuple[str, str], str]
 
 
 def key_of(subject: tuple[str, str], demand: Demand) -> Key:
-    """Return what the program knows a claim of the model by."""
+    """Return the key of the program's claim for a claim of the model."""
     return subject, demand_id(*demand)
 
 
 def key_in(key: ClaimKey) -> Key:
-    """Return the key of a claim in plain words."""
+    """Return the key of a claim of the program in the same form as `key_of`."""
     return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
 
 
 class Walk:
-    """A repo and the model, which take the same requests; what must hold is seen after each."""
+    """A repo and the model take the same requests, and are compared after each."""
 
     def __init__(self, random: Random) -> None:
         self.maker = Maker(random)
@@ -63,7 +64,7 @@ class Walk:
                 self._assert_counts_once(request)
 
     def assert_rendered_from_the_files(self) -> None:
-        """Step by step gave what one gives who only has the claims' files."""
+        """Check that the claims' files alone render the files that the steps have written."""
         fresh = replace(self._repo.state, ledger=ledger_in(self._repo.files))
         assert fresh.ledger == self._repo.state.ledger
         at_once = rendered_files(fresh)
@@ -84,7 +85,7 @@ class Walk:
 
 
 def assert_changes(taken: Decision, expected: Result) -> None:
-    """The claims that change are written, no others, and what was not held is named."""
+    """Check that exactly the changed claims are written, and that what was not held is named."""
     changed = {key_in(change.key) for change in taken.changes.claims}
     assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
@@ -98,7 +99,7 @@ def assert_changes(taken: Decision, expected: Result) -> None:
 
 
 def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
-    """Return whether a subject is named for a requester, with this topic or with none."""
+    """Return whether a text names a subject and a requester, with this topic or with no topic."""
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
     named = ": " not in text or f": {words} " in text
     return named and f"'{subject}'" in text and text.endswith(f" for {who}")
@@ -214,7 +215,7 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     one_order = told([*joins, *leaves, *(maker.join() for _ in range(count))])
     other_order: list[Goal] = []
     waiting = random.sample(one_order, len(one_order))
-    while waiting:  # who leaves has joined before
+    while waiting:  # a leave comes after its join
         here = {request["id"] for request in other_order}
         ready = [r for r in waiting if not r["shutdown"] or r["id"] in here]
         other_order.append(ready[0])
@@ -222,7 +223,7 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     one, other = MemoryRepo(), MemoryRepo()
 
     assert "refused" not in {outcome(one.take(request)) for request in one_order}
-    for request in other_order:  # nor does it matter in which order a request lists things
+    for request in other_order:  # the order inside a request does not matter either
         assert outcome(other.take(maker.again(request))) != "refused"
     one.forget_shutdowns()
     other.forget_shutdowns()

@@ -1,6 +1,7 @@
 """Holds are counted as the reference's operators count requesters.
 
-A recorded run of those operators shows that the model of them is right, and what is different here.
+A recorded run of the operators shows that the model of the operators is right, and where DemandOps
+differs from them.
 """
 
 from __future__ import annotations
@@ -40,7 +41,10 @@ def resource(kind: str, *ids: str) -> str:
 
 
 def counted(ledger: Ledger) -> Books:
-    """Return who holds what, as often as they hold it, in the form of :attr:`Reference.books`."""
+    """Return the requesters of each resource, each as often as it holds the resource.
+
+    The form is that of :attr:`Reference.books`.
+    """
     books = defaultdict[str, list[str]](list)
     for claim in ledger:
         if not claim.is_on_application:
@@ -57,7 +61,10 @@ def counted(ledger: Ledger) -> Books:
 
 
 def running(repo: MemoryRepo) -> Books:
-    """Return the topics of each service and connection, further clouds of a source with its own."""
+    """Return the topics of each service and connection by the name of the reference's resource.
+
+    The reference has one detection for all clouds of a source, so their topics are together.
+    """
     runs, books = defaultdict[str, set[str]](set), repo.bookkeeping()
     for service in books["services"].values():
         topics = {topic for role in service["inputs"].values() for topic in role}
@@ -72,7 +79,10 @@ def running(repo: MemoryRepo) -> Books:
 
 
 class Recorded:
-    """The books or what runs, by steps that say only what they change: there, and here."""
+    """The recorded books, or what runs, after each step: in the reference and in DemandOps.
+
+    A recorded step has only the changes.
+    """
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -129,7 +139,7 @@ def some(random: Random, among: list[Any]) -> list[Any]:
 
 
 def made(random: Random) -> Goal:
-    """Return a goal for some topics of an application, or for some connections, or both."""
+    """Return a random goal for topics of an application, for connections, or for both."""
     who = some(random, ["station00", "vehicle00", "vehicle01"])
     topics = [("ego", EGO), ("ego", ("/b", "vehicle01")), ("clouds", CLOUD)]
     chosen = some(random, [*topics, ("clouds", STATION_CLOUD)])
@@ -144,7 +154,7 @@ def made(random: Random) -> Goal:
 
 
 def counts_twice(ledger: Ledger, request: DemandRequest) -> bool:
-    """Return whether a join asks once more for a topic that its own claim has."""
+    """Return whether a join demands a topic that its own claim already has."""
     for one in request.demanded if isinstance(request, Join) else ():
         own = ledger.get(ClaimKey(one.held.subject, demand_id(request.id, one.requesters)))
         if own and {*own.held.topic_keys()} & {*one.held.topic_keys()}:
@@ -159,7 +169,7 @@ def test_what_none_of_the_differences_affects_is_counted_as_by_the_operators() -
         random, ledger, operators = Random(seed), Ledger(), Operators()
         now = datetime(2026, 1, 31, tzinfo=timezone.utc)
         for _ in range(60):
-            now += REMEMBERED + timedelta(minutes=2)  # none is a late repeat
+            now += REMEMBERED + timedelta(minutes=2)  # so no join counts as late
             asked = made(random)
             request, faults = deployment_request_goal.parse(asked, appdef)
             assert request is not None

@@ -1,4 +1,4 @@
-"""Going back to earlier books: what comes back, what goes, what is refused."""
+"""A rollback to an earlier ledger: what it books, what it releases, and what it refuses."""
 
 from __future__ import annotations
 

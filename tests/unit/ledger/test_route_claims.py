@@ -1,4 +1,4 @@
-"""Routes in the books: their files, what contradicts them, and who is linked where."""
+"""Routes in claims: the form in claim files, contradictions between them, and the linked nodes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def refusal(ledger: Ledger, *routes: Route, who: str = "w") -> list[str]:
 
 
 class TestFiles:
-    """A plain route is one line; one with options shows them, and nothing else."""
+    """In a claim file a route without options is one line; another one lists only its options."""
 
     def test_topics_stay_readable(self) -> None:
         held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
@@ -84,7 +84,7 @@ class TestFiles:
 
 
 class TestContradictions:
-    """What stands is kept, and named."""
+    """A demand that contradicts an existing claim is refused, and the message names the claim."""
 
     @pytest.mark.parametrize(
         ("option", "stands", "asked"),

@@ -1,4 +1,4 @@
-"""``make golden``: write the messages anew. Review the diff before you commit it."""
+"""``make golden``: write ``messages.txt``. Review the diff before you commit it."""
 
 from tests.unit.messages.text import FILE, text
 

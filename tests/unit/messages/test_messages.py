@@ -1,4 +1,4 @@
-"""A changed message or field is a diff of one file."""
+"""``messages.txt`` has all messages and fields, so each change of one is a diff of that file."""
 
 from tests.unit.messages.text import FILE, text
 

@@ -1,4 +1,4 @@
-"""The messages of all tables of mistakes, and the form of every field, as one text."""
+"""One text with the messages for all tables of mistakes, and the JSON schema of every field."""
 
 from __future__ import annotations
 

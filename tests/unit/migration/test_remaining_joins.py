@@ -1,4 +1,4 @@
-"""The joins that import finds in the operators' files: their counts, and who joined together."""
+"""The joins that `demandops import` finds in the operators' files, with counts and requesters."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def after(*goals: dict[str, Any]) -> Reference:
 
 
 def read(reference: Reference, *wanted: str) -> ReferenceFiles:
-    """Read the files whose names hold one of these words."""
+    """Read the reference's files whose names contain one of these words."""
     texts = {
         name: text for name, text in reference.texts().items() if any(w in name for w in wanted)
     }
@@ -99,13 +99,13 @@ def test_after_any_goals_the_holds_are_those_of_the_bookkeeping(chance: Random) 
 
 
 def _goals(chance: Random) -> list[dict[str, Any]]:
-    """Return joins, and shutdowns of some of them, all or in part."""
+    """Return random joins, and shutdowns of some of them."""
     goals, open_ = list[dict[str, Any]](), list[dict[str, Any]]()
     for number in range(chance.randrange(1, 15)):
         if open_ and chance.random() < 0.4:
             goals.append(open_.pop(chance.randrange(len(open_))) | {"shutdown": True})
             continue
-        # a goal of its own each time: the cluster reports no change if one comes twice in a row
+        # each goal differs, because the cluster reports no change if a goal is repeated
         requesters = [f"r{number}", *chance.sample(["v0", "v1", "s0"], chance.randrange(3))]
         ego = chance.sample([("/e0", "v0"), ("/e1", "v1")], chance.randrange(3))
         ends = chance.sample(["vehicle00", "station00"], chance.randrange(3))
@@ -128,7 +128,10 @@ def test_the_versioning_of_a_fusion_is_enough() -> None:
 
 
 def test_the_versioning_of_a_connection_is_not() -> None:
-    """Its first request shows who held it when the file was last written."""
+    """A connection's versioning file alone does not show who holds the connection.
+
+    Its first request lists all later requesters too.
+    """
     files = read(experiment(3), "mqtt_versioning")
     first, *_ = files.versions[CONNECTION].values()
     assert first.requester == ["vehicle00", "station00", "vehicle01", "station00"]

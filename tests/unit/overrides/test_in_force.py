@@ -1,7 +1,7 @@
-"""Demands in memory under overrides: what is committed is what the books alone would give.
+"""Under overrides, what demands commit is what the ledger alone would render.
 
-A random crowd comes and goes; after each demand, all files rendered from the books are those that
-the demands left behind one by one, and who is suspended or kept is told from the claims alone.
+Random demands join and leave. After each one, the files rendered from the ledger equal the files
+that the demands have written one by one, and the claims alone tell which are suspended or kept.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ people = st.lists(
 
 @st.composite
 def demands(draw: st.DrawFn) -> tuple[str, Any]:
-    """A demand for an application and a connection, or its end."""
+    """Return a random join or shutdown of an application and a connection."""
     who = draw(people)
     app = application(
         f"app/{draw(st.sampled_from('ab'))}",
@@ -177,7 +177,7 @@ def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
 
 
 def test_a_demand_that_an_override_breaks_is_told_which() -> None:
-    """A patch may fit the invented demand and not the one that comes."""
+    """A patch may fit the demand that `check` invents, but not a real one."""
     fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
     books = MemoryRepo(files(tested=fields))
     with pytest.raises(InvalidInput) as refusal:

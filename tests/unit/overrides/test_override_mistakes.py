@@ -1,4 +1,4 @@
-"""What people write wrong in an override; ``tests/unit/messages`` holds what is said of it."""
+"""Mistakes of people in overrides; ``tests/unit/messages`` has the messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EMPTY = object()
 
 
 def text(**changed: Any) -> str:
-    """Return a valid override with fields changed, left out (``None``) or left ``EMPTY``."""
+    """Return a valid override with fields changed, left out (``None``) or empty (``EMPTY``)."""
     fields = {name: value for name, value in (VALID | changed).items() if value is not None}
     told = {name: None if value is EMPTY else value for name, value in fields.items()}
     return yaml.safe_dump(told, sort_keys=False)

@@ -1,6 +1,6 @@
-"""Ties by chance: what load lets pass can never depend on an order that nobody gave.
+"""A configuration is valid only if no result depends on the order of overrides of equal priority.
 
-Selectors are held against every release that could be, by brute force.
+The tests compare random selectors with every possible release.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ SHARED, OWN, APPDEF = "object-detection", "object-fusion", "object-detection-fus
 
 
 def _releases() -> list[Traits]:
-    """Every release that could be, in a world of few names."""
+    """Return the traits of every possible release in a world with few names."""
     found = []
     for node, who in product(NODES, REQUESTERS):
         found += [Traits((node,), who, (id,), (APPDEF,), service=OWN) for id in IDS]
@@ -110,7 +110,7 @@ def test_selectors_apart_in_what_a_release_has_one_of_do_not_meet() -> None:
         ({"connections": ["a"]}, {"connections": ["b"]}),
     ]
     together: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"applications": ["a"]}, {"applications": ["b"]}),  # a shared service has both
+        ({"applications": ["a"]}, {"applications": ["b"]}),  # a shared service may be of both
         ({"requesters": ["a"]}, {"requesters": ["b"]}),
         ({"nodes": ["edge"]}, {"services": [OWN]}),
     ]

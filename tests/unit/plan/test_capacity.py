@@ -1,4 +1,4 @@
-"""What services request of nodes: counted by what changes, and never more than a node has."""
+"""Resource requests are counted from changes alone, and never exceed a node's capacity."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from tests.scenarios.running import configuration
 
 VEHICLES = ("vehicle00", "vehicle01")
 CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
-"""What nodes have of cpu; the others have no capacity."""
+"""The cpu capacity by node; other nodes have no limit."""
 
 
 @cache
 def recorders() -> State:
-    """Return a state in which a recorder requests 1 cpu for each replica, and a driver too."""
+    """Return a state in which each replica of a recorder, and each driver, requests 1 cpu."""
     nodes = [
         {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
         | ({"capacity": {"cpu": CAPACITY[id]}} if id in CAPACITY else {})
@@ -51,7 +51,7 @@ def recorders() -> State:
 
 
 def recorder(random: Random) -> dict[str, Any]:
-    """Return an application by chance; a recorder has a replica for each two of its topics."""
+    """Return a random recorder application, which has one replica for every two topics."""
     known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
     topics = random.sample(known, random.randint(1, 5))
     where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))
@@ -72,7 +72,7 @@ def goal(random: Random) -> dict[str, Any]:
 
 
 def used(repo: MemoryRepo) -> Counter[str]:
-    """Return the cpu that the services in the books request, by node."""
+    """Return the cpu that the services in the bookkeeping request, by node."""
     found: Counter[str] = Counter()
     for entry in repo.books()["services"].values():
         topics = sum(map(len, entry["inputs"].values()))

@@ -1,4 +1,4 @@
-"""What is delivered ends with what it is made from, also when a node leaves for good."""
+"""A delivery ends when its inputs end, also if the node of an input is decommissioned."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Whatever the services of applications read of each other: every topic comes in exactly one way.
+"""Each topic that a service reads comes to its node in exactly one way, in any service graph.
 
-The configurations are made by chance: some services shared, some not, at any depth.
+The configurations are random: services read each other at any depth, and some are shared.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ TYPES = ("one", "two")
 SOURCES = ("vehicle00", "vehicle01", "edge")
 NODES = ("edge", "cloud", "vehicle01")
 CLUSTER_NODE = "cloud"
-"""Where services run that a cluster has once."""
+"""The node of the services that run once for a cluster."""
 
 
 class Origin(NamedTuple):
-    """A role, or an output of a service: the roles that it is made from, and where and how often.
+    """Something that a service can read: a role of the application's inputs, or a service's output.
 
-    ``kind`` is ``source`` if it is made where a topic comes from, ``topic`` if it is made for each
-    topic at the applications' nodes, ``once`` if an application or a node has one.
+    ``kind`` is ``source`` if it is made at the source of a topic, ``topic`` if it is made for each
+    topic at the node of an application, and ``once`` if an application, a node or a cluster has
+    one. ``roots`` are the roles that it is made from; it is empty if ``kind`` is ``once``.
     """
 
     name: str
@@ -46,12 +47,15 @@ class Origin(NamedTuple):
 
 
 class Graphs:
-    """Two types of applications of services that read each other, made by chance."""
+    """Random definitions of two types of applications, whose services read each other."""
 
     def __init__(
         self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
     ) -> None:
-        """Make them; some services have what ``place`` has, with ``each`` those for topics too."""
+        """Make the definitions; the fields of ``place`` go into the definitions of some services.
+
+        Only services for an application get them; with ``each`` also services for each topic.
+        """
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
         self.files: dict[str, str | None] = {**brokers("edge")}
@@ -88,7 +92,7 @@ class Graphs:
     def _readable(
         self, origins: list[Origin], scope: str, at_source: bool, root: str
     ) -> list[Origin]:
-        """Return what a service may read beside what it runs for."""
+        """Return the origins that a service may read besides its first one."""
         apart = at_source or scope == "cluster"
         found = [one for one in origins if not (apart and one.kind == "topic")]
         if scope == "topic":
@@ -104,7 +108,10 @@ class Graphs:
         return Origin(f"{name}.out", frozenset(roots if kind != "once" else ()), kind)
 
     def _add(self, type: str, name: str, scope: str, at_source: bool, read: list[Origin]) -> Origin:
-        """Note a service of a type; the first that it reads is what it runs for."""
+        """Add a service to a type and return its output as an origin.
+
+        A service for each topic has instances for the topics of the first origin that it reads.
+        """
         if scope == "topic":
             roots = {self._root(type, read[0])}
         else:
@@ -119,7 +126,7 @@ class Graphs:
         return next(iter(self.services[type][name]["roots"])) if "." in origin.name else origin.name
 
     def _each(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
-        """Return something that a service may run for each of."""
+        """Return a random origin that can be the first one of a service for each topic."""
 
         def is_for_each(one: Origin) -> bool:
             service = self.services[type].get(one.name.partition(".")[0])
@@ -175,7 +182,7 @@ class Graphs:
 
 
 class Demands:
-    """Demands for applications of both types, made by chance."""
+    """Random demands for applications of both types."""
 
     def __init__(self, random: Random, graphs: Graphs) -> None:
         self.random, self.graphs = random, graphs
@@ -197,7 +204,7 @@ class Demands:
         return head | {"applications": self.held[demand]}
 
     def others(self, goal: dict[str, Any]) -> set[str]:
-        """Return the applications that demands other than that of a goal hold."""
+        """Return the ids of the applications that other demands than the goal's hold."""
         others = (apps for demand, apps in self.held.items() if demand != goal["demand"])
         return {app["id"] for apps in others for app in apps}
 
@@ -211,7 +218,7 @@ class Demands:
         return app | {"deliver": self._deliveries(self.types[id])}
 
     def _deliveries(self, type: str) -> list[dict[str, Any]]:
-        """Return what only one node makes under its name, to be delivered to a node."""
+        """Return at most one delivery of an output that only one node makes with its name."""
         services = self.graphs.services[type].items()
         names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
         chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
@@ -221,9 +228,9 @@ class Demands:
 def instances(
     graphs: Graphs, app: dict[str, Any], moved: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[ServiceKey]:
-    """Yield the services that must run for an application as a demand has it.
+    """Yield the services that must run for an application of a demand.
 
-    ``moved`` are services that are not on its node.
+    ``moved`` has the nodes of services that do not run on the application's node.
     """
     for name, service in graphs.services[app["type"]].items():
         own = moved.get(name, app["node"])
@@ -245,7 +252,10 @@ def instances(
 def delivered(
     repo: MemoryRepo, demands: Demands, services: list[ServiceRelease]
 ) -> Iterator[tuple[str, str]]:
-    """Yield topic and node of what is delivered: what a demand's own inputs are made into."""
+    """Yield topic and node of each delivery that demands hold.
+
+    A delivery has only outputs that are made from the inputs of its own demand.
+    """
     for app in (app for apps in demands.held.values() for app in apps):
         booked = repo.state.ledger.application(app["id"])
         assert booked is not None
@@ -258,7 +268,7 @@ def delivered(
 
 
 def assert_every_topic_comes_in_one_way(repo: MemoryRepo, demands: Demands) -> None:
-    """Compare what services read and publish with what connections carry."""
+    """Check that each read topic comes in one way, and that connections carry no other topic."""
     releases = [plan(repo.state, key) for key in all_keys(repo.state)]
     services = [one for one in releases if isinstance(one, ServiceRelease)]
     made = {(one.node.id, topic) for one in services for topic in one.outputs.values()}

@@ -1,4 +1,4 @@
-"""A topic that differs from a known one by a letter is told, and no other."""
+"""Only a topic that is a probable misspelling of a known topic gives a warning."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ USUAL = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 
 
 def told(topic: str, *known: str) -> list[str]:
-    """Return the warnings of a demand for a topic, after one for each of those in ``known``."""
+    """Return the spelling warnings of a demand for a topic, after demands for ``known``."""
     books = MemoryRepo()
     for number, one in enumerate(known):
         books.send(_demand(f"known-{number}", one))

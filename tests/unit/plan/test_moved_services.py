@@ -1,4 +1,4 @@
-"""Services that overrides move: what they read and deliver comes with them, and goes back."""
+"""If an override moves a service, its inputs and deliveries follow it, and return at the end."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.unit.plan.test_flows import (
 
 
 def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
-    """Yield overrides that move some services, or all of an application."""
+    """Yield random overrides that each move a service, or all services of an application."""
     names = sorted({name for services in graphs.services.values() for name in services})
     for number in range(random.randint(0, 2)):
         by_service = Selector(services=(random.choice(names),))
@@ -57,7 +57,10 @@ def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
 def wanted(
     graphs: Graphs, app: dict[str, Any], active: Iterable[Override]
 ) -> dict[str, str | None]:
-    """Return where overrides move which services of an application, the highest one last."""
+    """Return the nodes to which overrides move services of an application, by service.
+
+    ``active`` is in the order of priority, so that the override with the highest one wins.
+    """
     return {
         name: override.node
         for override in active
@@ -68,7 +71,7 @@ def wanted(
 
 
 def configure(repo: MemoryRepo, config: Config) -> tuple[tuple[str, str], ...]:
-    """Take a configuration in as a generator does, and return what overrides do not move."""
+    """Replace the configuration as a generator does; return the services that stay, and why."""
     state = State.of(config, repo.state.ledger)
     moved = following_overrides(state)
     for path, text in changed_claim_files(state.ledger, moved.ledger, moved.keys).items():

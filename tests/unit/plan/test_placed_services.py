@@ -1,4 +1,4 @@
-"""Services on nodes of their own: they fit, stay, hold the capacity, and leave a drained node."""
+"""Placed services fit their nodes and stay there, count as capacity, and leave a drained node."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Naming(Demands):
 
 
 def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
-    """Return the configuration with slots on some nodes, in another order each time."""
+    """Return the configuration with GPUs and a capacity on some nodes, in random order."""
     nodes = [
         node.model_copy(
             update={
@@ -142,7 +142,7 @@ def test_services_that_are_placed_fit_stay_and_leave_drained_nodes(
 
 
 class Extreme(Random):
-    """Draws the first or last of what there is, more often than chance does."""
+    """A random generator that draws the first or the last choice more often than others."""
 
     def __init__(self, seed: int) -> None:
         self._often = seed % 10 / 10
@@ -165,14 +165,14 @@ class Extreme(Random):
 
 @pytest.mark.parametrize(("seed", "length"), [(62, 3), (87, 4)])
 def test_a_drain_brings_no_topic_to_a_node_from_two(seed: int, length: int) -> None:
-    """Sources have services with outputs of one name on several nodes."""
+    """In these cases, services at several sources have outputs of the same name."""
     test_services_that_are_placed_fit_stay_and_leave_drained_nodes.hypothesis.inner_test(  # type: ignore[attr-defined]
         Extreme(seed), length
     )
 
 
 def repo_with(domains: list[dict[str, Any]], **nodes: dict[str, Any]) -> MemoryRepo:
-    """Return a repo whose fusion needs a GPU, with more fields of some nodes."""
+    """Return a repo whose fusion needs a GPU, with these access domains and fields of nodes."""
     inventory = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     inventory["nodes"] = [node | nodes.get(node["id"], {}) for node in inventory["nodes"]]
     services = {"services": {"object-fusion": {"place": {"capabilities": ["gpu"]}}}}

@@ -1,4 +1,4 @@
-"""The node that an application gets: one that fits, the same for every generator, and kept."""
+"""An application gets a node that fits, and keeps it; every generator chooses the same one."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SOURCES = ("vehicle0", "vehicle1")
 
 
 def chance(random: Random) -> Config:
-    """Return a configuration with nodes by chance; no requester but 'operator' may use 'closed'."""
+    """Return a random configuration; only the requester 'operator' may use the domain 'closed'."""
 
     def position() -> Position | None:
         if random.random() < 0.4:
@@ -157,14 +157,14 @@ def test_it_is_a_node_that_fits_the_same_in_any_order_and_stays(random: Random) 
 
 
 def inventory(**more: dict[str, Any]) -> dict[str, str]:
-    """Return the skeleton's nodes with more fields of some."""
+    """Return the skeleton's file of nodes, with further fields of some nodes."""
     data = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     data["nodes"] = [node | more.get(node["id"], {}) for node in data["nodes"]]
     return {"inventory/nodes.yaml": json.dumps(data)}
 
 
 def asking(*items: dict[str, Any], demand: str = "d", **more: Any) -> dict[str, Any]:
-    """Return a demand of applications, each given by its place."""
+    """Return a demand with one application for each ``place``."""
     apps = [
         {
             "id": f"{demand}{index}",
@@ -234,7 +234,7 @@ def test_the_middle_of_all_sources_decides() -> None:
 
 
 def with_limits(random: Random) -> MemoryRepo:
-    """Return a repo in which nodes refuse demands: by a quota, for want of a broker or by rules."""
+    """Return a random repo in which a quota, a missing broker or a rule may refuse a node."""
     edges = [f"edge{number}" for number in range(random.randint(1, 5))]
     ids = (*SOURCES, *edges)
     kinds = {id: "vehicle" if id in SOURCES else "edge" for id in ids}

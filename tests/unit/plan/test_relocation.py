@@ -1,4 +1,4 @@
-"""The applications of a drained node: whatever they read and deliver, it comes with them."""
+"""The applications of a drained node move, and their inputs and deliveries follow them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.unit.plan.test_flows import (
 
 
 class Placed(Demands):
-    """Demands that say in ``place`` what the nodes must have."""
+    """Demands whose applications name no node, but have a ``place``."""
 
     def _application(self, id: str) -> dict[str, Any]:
         app = super()._application(id)
@@ -36,7 +36,7 @@ class Placed(Demands):
         return app | {"place": {"capabilities": ["gpu"]}}
 
     def note_nodes(self, repo: MemoryRepo) -> None:
-        """Note the nodes that the applications are on."""
+        """Write the booked node of each application into the demands."""
         for app in (app for apps in self.held.values() for app in apps):
             found = repo.state.ledger.application(app["id"])
             assert found is not None
@@ -44,7 +44,7 @@ class Placed(Demands):
 
 
 def with_nodes(config: Config, drained: str | None = None) -> Config:
-    """Return the configuration with a GPU on some nodes, and one of them drained."""
+    """Return the configuration with a GPU on some nodes, and the node ``drained`` drained."""
     nodes = {
         id: node.model_copy(
             update={"capabilities": ("gpu",) * (id in NODES), "drained": id == drained}

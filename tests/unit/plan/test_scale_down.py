@@ -1,4 +1,4 @@
-"""Replicas come down after the time that the definition names, and the ledger alone says when."""
+"""Replicas are removed after the time that the definition names; the ledger alone decides when."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ SCALING = "{max: 9, per: {topics: 1}, downAfter: 10m}"
 STEPS = st.lists(
     st.tuples(st.integers(0, 400), st.one_of(st.none(), st.integers(0, 9))), max_size=25
 )
-"""Seconds that pass, and the topics demanded then; none: the generator only looks at the clock."""
+"""Steps: the seconds that pass, and the number of topics that are demanded then.
+
+With 0 the demand is released; with None only the time passes.
+"""
 
 
 @lru_cache(maxsize=1)
@@ -46,7 +49,7 @@ def test_a_service_has_the_most_that_it_needed_in_the_time(
 ) -> None:
     repo, now = empty().copy(), NOW
     needs: list[tuple[datetime, int]] = []
-    """Since when it needed how many; as long as it runs."""
+    """The replicas that the service has needed since a time, as long as it runs."""
     for seconds, topics in [(0, 1), *steps]:
         now += timedelta(seconds=seconds)
         repo.scale_down(now)
@@ -85,7 +88,7 @@ def test_it_goes_up_at_once_and_says_until_when_it_stays_up() -> None:
 
 
 def test_a_person_decides_at_once() -> None:
-    """An override sets the number, and a definition with fewer at most or no time is obeyed."""
+    """An override, a lower maximum or a definition without ``downAfter`` applies at once."""
     repo = books(SCALING, **replicas_by_overrides(1))
     repo.send(demand(topics=4))
     repo.send(demand(topics=2))

@@ -63,7 +63,7 @@ def release(demand: str) -> dict[str, Any]:
 
 
 def servers(repo: MemoryRepo) -> dict[str, list[str]]:
-    """Return node → the applications that its map server serves."""
+    """Return the applications that use the map server of each node."""
     return {
         entry["node"]: entry["applications"]
         for entry in repo.books()["services"].values()

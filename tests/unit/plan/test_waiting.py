@@ -1,4 +1,4 @@
-"""Demands that wait: whatever comes and goes, each is booked in turn, and none waits that fits."""
+"""Waiting demands are booked in the order of the queue, and no demand waits if it fits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.unit.plan.test_capacity import CAPACITY, recorders, used
 
 
 def waiting_repo() -> MemoryRepo:
-    """Return a repo whose one access domain lets demands wait."""
+    """Return a repo whose only access domain lets demands wait."""
     state = recorders()
     (domain,) = state.config.domains.values()
     domain = domain.model_copy(update={"when_full": "wait"})
@@ -37,7 +37,7 @@ def waiting_repo() -> MemoryRepo:
 
 
 def put(name: str, topics: int = 1, **more: Any) -> dict[str, Any]:
-    """Return a demand for a recorder, with a replica for each two topics."""
+    """Return a demand for a recorder, which has one replica for every two topics."""
     cloud = [{"topic": f"/{name}/t{number}", "source": "vehicle01"} for number in range(topics)]
     app = {
         "id": name,
@@ -54,7 +54,7 @@ def release(name: str) -> dict[str, Any]:
 
 
 def book_waiting(repo: MemoryRepo) -> list[str]:
-    """Try what waits, in turn; return what was booked."""
+    """Try to book each waiting demand in order; return the ids of those that were booked."""
     booked = []
     for one in in_turn(repo.state.ledger.waiting):
         taken = repo.take(dict(one.goal))
@@ -95,7 +95,7 @@ def test_what_waits_does_not_fit_and_is_booked_in_turn(random: Random, length: i
 
 
 def full_repo() -> MemoryRepo:
-    """Return a repo whose edges are full, and two demands that wait."""
+    """Return a repo whose edges are full and in which two demands wait."""
     repo = waiting_repo()
     for number, topics in enumerate((5, 5, 3)):
         repo.send(put(f"full{number}", topics))

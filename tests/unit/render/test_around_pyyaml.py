@@ -1,4 +1,4 @@
-"""Simple values are written, and long lists read, without PyYAML. It would give the same."""
+"""The shortcuts that write simple values and read long lists give the same result as PyYAML."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands below ``clusters/``: valid, without requesters, and touched only where it must be."""
+"""Files below ``clusters/`` are valid, name no requesters, and change only if they must."""
 
 from __future__ import annotations
 

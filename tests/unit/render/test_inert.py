@@ -1,7 +1,7 @@
-"""Text stays text: whatever an id, a selector or a toleration holds, every parser reads it back.
+"""Text stays text: every parser reads any id, selector or toleration back as it was.
 
-PyYAML reads YAML 1.1, ``Core`` below the core schema of YAML 1.2; Go's parsers read a mixture, so
-``plain`` scalars must be text in all of them.
+PyYAML reads YAML 1.1, and ``Core`` below reads the core schema of YAML 1.2. Go's parsers read a
+mixture of both, so a scalar without quotes must be text in both.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ UNSEEN = [
 
 
 class Core(FAST):  # type: ignore[misc]
-    """The core schema of YAML 1.2.2, section 10.3.2."""
+    """Loads YAML by the core schema of YAML 1.2.2, section 10.3.2."""
 
 
 Core.yaml_implicit_resolvers = {}
@@ -70,7 +70,7 @@ SOMEWHERE_NO_TEXT = re.compile(
 
 
 def both(text: str) -> list[Any]:
-    """Return the documents of a text as YAML 1.1 and 1.2 read them, which must be alike."""
+    """Return the documents of a text; check that YAML 1.1 and 1.2 give the same."""
     old = list(yaml.load_all(text, Loader=FAST))
     new = list(yaml.load_all(text, Loader=Core))
     assert old == new
@@ -95,12 +95,12 @@ def assert_unmistakable(text: str) -> None:
 
 
 def quoted(text: str) -> str:
-    """Return a text as YAML that holds nothing but ASCII letters, whatever the text holds."""
+    """Return any text as a YAML scalar that has only escapes in ASCII characters."""
     return '"' + "".join(f"\\U{ord(char):08X}" for char in text) + '"'
 
 
 def inventory(lines: Iterable[str]) -> MemoryRepo:
-    """Return a state repo with further nodes, each given by what stands below its kind."""
+    """Return a state repo with further vehicles, each given by the lines of its other fields."""
     entries = "".join(f"  - type: vehicle\n    cluster: c-its\n{line}" for line in lines)
     return MemoryRepo({NODES: skeleton()[NODES] + entries})
 
@@ -136,12 +136,12 @@ def test_ids_are_read_back_as_they_were() -> None:
 ANY_TEXT = [
     text for text in (*TRAPS, *UNSEEN) if not control_character(re.sub(r"[\n\t]", " ", text))
 ]
-"""Whatever the configuration accepts; tests/unit/config holds that it refuses the others."""
+"""The texts that the configuration accepts; tests/unit/config shows that it refuses the others."""
 LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true", "12", "1.5"]
 
 
 def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
-    """Tolerations hold any text that YAML can hold, selectors are text for every parser."""
+    """A toleration may have any text, and every parser reads a selector as text."""
     tolerations = [{"key": text, "value": text} for text in ANY_TEXT]
     selector = {label: label for label in LABELS} | {"a": ""}
     texts = ", ".join(f"{{key: {quoted(text)}, value: {quoted(text)}}}" for text in ANY_TEXT)
@@ -163,7 +163,7 @@ def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
 
 @pytest.mark.parametrize("name", ["null", "y", "1e3", "12", "0x1f", "010", "true", "on"])
 def test_names_that_kubernetes_takes_and_yaml_misreads(name: str) -> None:
-    """A namespace, an account, a secret and a cluster may be called so."""
+    """Each name is used for a namespace, an account, a secret and a cluster."""
     domains = (
         "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
         f'  - {{name: "{name}", namespace: "{name}", serviceAccount: "{name}", nodes: ["*"]}}\n'

@@ -1,4 +1,4 @@
-"""Waits between tries: bounded, begun anew, and lines no longer than can be pushed in time."""
+"""Waits between tries grow to a bound; fewer demands go into one push while pushes fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who comes next, when many demands of many requesters wait."""
+"""The order in which the waiting demands of many requesters are taken."""
 
 from __future__ import annotations
 

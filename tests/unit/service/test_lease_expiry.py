@@ -1,4 +1,4 @@
-"""The clock that tells which leases are over: what it does when the machine's clock is set."""
+"""The lease clock decides which leases have ended, also if the machine's clock is set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.kit.memory import rebuilt
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
-    """Return a ledger with a claim for each (demand, seconds, slack), asked for at the start."""
+    """Return a ledger with a claim, booked at `START`, for each (demand, lease seconds, slack)."""
     return rebuilt(
         Claim(
             Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),)),

@@ -1,4 +1,4 @@
-"""When the state repo is looked at: a clock that the test moves, and no chance."""
+"""When the state repo is polled, with a clock that the test moves and no randomness."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock)
         made.request()
     assert made.start_if_due()
     assert not made.start_if_due()
-    made.request()  # while the look is under way: it may have come too late for it
+    made.request()  # during the poll, which may have missed the cause of this request
     made.finished(reached=True)
     assert made.seconds_until_due() == 0.5, "bursts are not followed one by one"
     clock.pass_(0.5)

@@ -1,4 +1,4 @@
-"""How many demands a requester may send in a minute, and what is remembered for it."""
+"""How many demands a requester may send in a minute, and what the limiter keeps in memory."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Sending:
         self._count = 0
 
     def send(self, requester: str, at_s: float, operation: str = "") -> bool:
-        """Send one and tell whether it was let through."""
+        """Send a demand and return whether the limit allowed it."""
         self._count += 1
         moment = START + timedelta(seconds=at_s)
         faults = self.throttle.faults(

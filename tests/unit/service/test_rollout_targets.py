@@ -1,4 +1,4 @@
-"""Where what a demand needs is followed: by Flux's objects, or below an Application of Argo CD."""
+"""The objects of Flux or Argo CD by which the generator follows what a demand needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Decisions to write down: goals decided one after another in memory."""
+"""Fixtures: decisions on goals in memory, which tests then write to a repository."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
 
 class Desk(MemoryRepo):
-    """A repo in memory with one application that takes in a point cloud of station00."""
+    """A repo in memory, with short calls to join and leave an application."""
 
     def join(
         self,
@@ -47,4 +47,4 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """Commit as Petra in every test."""
+    """Make Petra the author of the commits in every test."""

@@ -1,4 +1,4 @@
-"""The messages that a reader of `git log` gets, word for word."""
+"""The exact commit messages that `git log` shows."""
 
 from __future__ import annotations
 

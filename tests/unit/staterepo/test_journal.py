@@ -1,4 +1,4 @@
-"""The journal's file: what a crash, a full disk or a damaged disk may do to it, and its size."""
+"""The journal's file after a crash, on a full disk or a damaged disk, and its size."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_a_damage_names_its_place_and_the_remedy(path: Path, text: bytes) -> Non
 
 @pytest.mark.parametrize("waiting", [0, 1000])
 def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int) -> None:
-    """Not even if one demand waits for approval all the time."""
+    """The file stays small even if many demands wait for approval all the time."""
     journal = Journal(path)
     journal.append(entry(f"waiting-{number}") for number in range(waiting))
     largest = 0

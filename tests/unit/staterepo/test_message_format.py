@@ -1,4 +1,4 @@
-"""A commit message says what its writer said, whatever the values hold."""
+"""A commit message is read back as it was written, whatever text its values have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which addresses are URLs, which are refused, and that no secret shows."""
+"""Which addresses of a state repo are URLs, which are refused; no message shows a secret."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or 
         ("https://user:sec@ret@example.org/state.git", HIDDEN),
         ("http://user:secret@127.0.0.1/state.git", HIDDEN),
         ("ssh://git:secret@example.org/state.git", HIDDEN),
-        # a token as the name; the sixth is of Gitea, the last of Azure DevOps
+        # a token as the user's name; the sixth is one of Gitea, the last of Azure DevOps
         (f"https://ghp_{'secret1' * 5}@github.com/team/state.git", HIDDEN),
         (f"https://github_pat_{'secret1' * 9}@github.com/team/state.git", HIDDEN),
         ("https://glpat-secret@gitlab.com/team/state.git", HIDDEN),
@@ -84,17 +84,17 @@ SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or 
         ("ext::sh -c touch% evil", "a state repo's address cannot start with"),
         ("ext::sh -c touch% evil% ://", "a state repo's address cannot start with"),
         ("testgit::x:y", "a state repo's address cannot start with"),
-        # without a host, which git would take from the path
+        # without a host: git would take the first part of the path as the host
         ("https://", f"{NO_HOST} 'https://'; write https://HOST/PATH, or"),
         ("https:///x", f"{NO_HOST} 'https://'; write https://HOST/PATH, or"),
         ("ssh:///x", f"{NO_HOST} 'ssh://'; write ssh://HOST/PATH, or"),
         ("ssh://git@/x", f"{NO_HOST} 'ssh://'; write ssh://HOST/PATH, or"),
         ("http://:80/x", f"{NO_HOST} 'http://'; write http://HOST/PATH, or"),
-        # what looks like an option, or is mistyped
+        # addresses that look like an option, or are mistyped
         ("-oProxyCommand=touch@x:y", ""),
         ("--upload-pack=touch@x:y", ""),
         ("-x:y", ""),
-        # what no folder can be called
+        # names that no folder can have
         ("a" * 5000, f"'{'a' * 79}…' cannot be opened: File name too long"),
         ("~nobody-of-that-name/x", "'~nobody-of-that-name/x' cannot be opened: Could not"),
         ("~\0/x", "'~\\x00/x' cannot be opened: embedded null byte"),

@@ -1,4 +1,4 @@
-"""The history of a path is what git says it is, in histories of any shape."""
+"""The history of a path equals the output of `git log`, in histories of any shape."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ PATH = "clusters/c/d/n/r.yaml"
 
 
 class History:
-    """Commits on top of each other, some of them merges, a minute apart."""
+    """A repository whose commits are a minute apart; some of them are merges."""
 
     def __init__(self, folder: Path) -> None:
         self.repo = pygit2.init_repository(str(folder), bare=True, initial_head="main")
         self.made: list[pygit2.Oid] = []
 
     def commit(self, text: str | None, *parents: int) -> pygit2.Oid:
-        """Commit with ``text`` at the path, or nothing there, on top of commits by number."""
+        """Commit a tree with ``text`` at `PATH`, or without a file there if it is None.
+
+        ``parents`` are the numbers of earlier commits.
+        """
         number = len(self.made)
         who = pygit2.Signature("a", "a@example.org", 1_770_000_000 + 60 * number, 0)
         files = {"other": str(number)} | ({PATH: text} if text is not None else {})

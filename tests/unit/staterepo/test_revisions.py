@@ -1,4 +1,4 @@
-"""Times as people write them, and which commit stood for the state repo then."""
+"""Times as people write them, and the commit that was the newest on main at a time."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_what_is_no_time(text: str) -> None:
 
 @pytest.fixture
 def repo(tmp_path: Path) -> pygit2.Repository:
-    """Three commits on main, at 10:00, 10:05 and (a clock was set back) 10:02."""
+    """Three commits on main, at 10:00, 10:05 and 10:02, because a clock was set back."""
     repo = pygit2.init_repository(str(tmp_path / "r.git"), bare=True, initial_head="main")
     parents: list[pygit2.Oid] = []
     for minute in (0, 5, 2):

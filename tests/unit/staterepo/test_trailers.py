@@ -1,4 +1,4 @@
-"""What the generator reads out of a commit message is what plain git reads out of it."""
+"""The generator reads the same trailers from a commit message as git itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`trees.write` and `trees.differences` against a dict that stands for a file tree."""
+"""`trees.write` and `trees.differences`, compared with a dict as a model of a file tree."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TEXTS = st.sampled_from(["", "x", "x\n", "ü{{ y }}\n"])
 
 
 def _without_conflict(paths: set[str], path: str) -> bool:
-    """Return whether ``path`` can be a file beside ``paths``."""
+    """Return whether ``path`` can be a file in a tree that has the files ``paths``."""
     return not any(o.startswith(f"{path}/") or path.startswith(f"{o}/") for o in paths - {path})
 
 
@@ -46,7 +46,7 @@ def file_trees(draw: st.DrawFn) -> Files:
 
 @st.composite
 def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
-    """Some removals (of files or of nothing) and some texts that can stand beside each other."""
+    """Return random removals, also of missing files, and texts of files that fit into one tree."""
     known = st.sampled_from(sorted(files)) if files else PATHS
     removed = draw(st.lists(known | PATHS, max_size=4))
     made: dict[str, str | None] = {
@@ -60,7 +60,10 @@ def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
 
 
 def changed(files: Files, change: Mapping[str, str | None]) -> Files:
-    """The model: what is removed goes first, then a text takes the place of what is in its way."""
+    """Return the files after a change, by the model.
+
+    First the removed files go. Then each text replaces the files that conflict with its path.
+    """
     after = {path: text for path, text in files.items() if change.get(path, text) is not None}
     for path, text in change.items():
         if text is None:
@@ -90,7 +93,7 @@ def _text(repo: pygit2.Repository, blob: pygit2.Oid) -> str:
 
 
 def lay(repo: pygit2.Repository, files: Files) -> pygit2.Tree:
-    """Write a tree through an index, which is Git's own way."""
+    """Write a tree through an index, as Git itself does."""
     index = pygit2.Index()
     for path, text in files.items():
         blob = repo.create_blob(text.encode())
@@ -112,7 +115,7 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
         made = trees.write(new, lay(repo, files) if files else None, change)
         assert read(repo, made) == wanted
         assert made == lay(repo, wanted).id, "same files, other tree: an empty folder or a mode"
-        for further in (more, {}):  # the folders of their start are in memory only once
+        for further in (more, {}):  # each starts from a tree that `new` has
             again = trees.write(new, repo[made].peel(pygit2.Tree), further)
             assert again == lay(repo, changed(wanted, further)).id
 
@@ -126,7 +129,7 @@ def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
         old, new = lay(repo, before), lay(repo, after)
         told = list(trees.differences(old, new))
         paths = {path for path in {*before, *after} if before.get(path) != after.get(path)}
-        # a folder that takes a file's place is told as the file's end and its own files
+        # if a folder replaces a file, the file's removal and the folder's files are reported
         assert {path for path, _ in told} == paths
         assert len(told) == len(paths)
         for path, blob in told:

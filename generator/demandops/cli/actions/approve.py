@@ -1,4 +1,4 @@
-"""``demandops approve``: merge a proposal in one's own name."""
+"""``demandops approve``: merge a proposal in the caller's own name."""
 
 from __future__ import annotations
 
@@ -26,7 +26,14 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 
 
 def proposal_named(repo: Reader, name: str) -> PendingProposal:
-    """Return the proposal of this branch or demand, or with this text in the branch's name."""
+    """Return the proposal that ``name`` identifies.
+
+    ``name`` is a branch or the id of a demand. If no proposal has it, ``name`` may also be a part
+    of a branch's name.
+
+    Raises:
+        InvalidInput: if no proposal or several proposals fit.
+    """
     pending = list(pending_proposals(repo.repository))
     exact = [one for one in pending if name == one.branch or name in one.demands]
     found = exact or [one for one in pending if name in one.branch]

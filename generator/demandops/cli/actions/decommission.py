@@ -92,7 +92,10 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
 def _book(
     goal: dict[str, Any], by: Person, state_repo: str, signing_key: Path | None
 ) -> dict[str, Any] | None:
-    """Return the result, or None if the node is known and holds nothing; that is no error."""
+    """Book the decommissioning; return the command's result as JSON data.
+
+    Return None, which is no error, if the inventory has the node but no claim concerns it.
+    """
     with started_generator(state_repo, signing_key) as generator:
         known(by)
         try:
@@ -120,7 +123,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _require_nothing_held(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> None:
-    """Raise the error unless it says that a known node holds nothing."""
+    """Raise the error, unless it reports that a node of the inventory holds nothing."""
     codes = {each.code for each in error.faults}
     if codes != {"not-held"} or goal["name"] not in snapshot.state.config.nodes:
         raise error

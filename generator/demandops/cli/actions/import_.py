@@ -1,4 +1,7 @@
-"""``demandops import``: book the reference's applications and connections as ordinary demands."""
+"""``demandops import``: book what the reference manages as ordinary demands.
+
+The reference is the application manager of the paper (docs/reference.md).
+"""
 
 from __future__ import annotations
 
@@ -68,8 +71,9 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
 ) -> None:
     """Book the reference's applications and connections.
 
-    FILE is a bookkeeping or a versioning file of one of its operators, or its custom resources as
-    `kubectl get -o yaml` prints them; - for standard input. docs/migration.md explains each step.
+    The reference is the application manager of the paper. FILE is a bookkeeping or versioning file
+    of one of the reference's operators, or the reference's custom resources, printed by
+    `kubectl get -o yaml`. Write - for standard input. docs/migration.md explains each step.
     Importing the same files again books nothing more.
 
     \b
@@ -106,7 +110,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return the custom resources of a cluster."""
+    """Return the reference's custom resources in a cluster: a list of one (origin, data) pair."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

@@ -21,8 +21,8 @@ _LOOK_UP_S = 0.5
 def await_answer(future: Future[Any]) -> None:
     """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait.
 
-    It polls, because an endless wait may miss a signal that arrived just before it, or a signal
-    that a handler of another library takes.
+    The function polls the future. A wait without a timeout could miss a signal that arrives just
+    before the wait begins, or a signal that another library handles.
     """
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
@@ -30,7 +30,10 @@ def await_answer(future: Future[Any]) -> None:
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    """Yield a generator, and close it at the end; meanwhile SIGTERM acts like Ctrl-C."""
+    """Yield a started :class:`Generator`, and close it at the end of the block.
+
+    Within the block, SIGTERM acts like Ctrl-C.
+    """
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -67,12 +70,12 @@ def print_consequences(decision: Decision) -> None:
 
 
 def print_refusal(title: str, faults: Iterable[dict[str, Any]]) -> None:
-    """Print faults, given as data of the JSON output, as text on stderr."""
+    """Print the title and the faults on stderr. ``faults`` have the form of the JSON output."""
     errors.print(title)
     for each in faults:
         errors.print(f"  {Fault(**each)}")
 
 
 def claim_text(claim: dict[str, Any]) -> str:
-    """Return the subject of a claim, given as data of the JSON output, as text."""
+    """Return the subject of a claim as text. ``claim`` has the form of the JSON output."""
     return f"{claim['subject']['kind']} '{claim['subject']['id']}'"

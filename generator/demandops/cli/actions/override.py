@@ -1,4 +1,4 @@
-"""``demandops override``: declare and end a deviation, as a commit of one's own."""
+"""``demandops override``: declare or end a deviation, by a commit in the caller's own name."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def override() -> None:
 
 
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    """Return the name, or raise if no override may have it."""
+    """Return the name; raise BadParameter if the name is not valid for an override."""
     if not is_override_name(name):
         raise click.BadParameter(
             f"{quoted(name)} cannot name an override; use lower-case letters, digits and '-'"
@@ -141,7 +141,15 @@ def new_override(
     selected: dict[str, tuple[str, ...]],
     more: dict[str, Any],
 ) -> str:
-    """Return the text of an override's file; ``more`` are its effects and other fields."""
+    """Return the text of a new override's file.
+
+    Args:
+        repo: the open state repo.
+        name: the name of the override.
+        way: the options of the command; the override takes the reason from them.
+        selected: the values of the options that select releases and claims.
+        more: the effects and the other fields of the override; None leaves a field out.
+    """
     if not way.reason:
         raise click.UsageError("give the reason: -m TEXT")
     chosen = selector(selected)
@@ -158,7 +166,7 @@ def new_override(
 
 
 def create_override(repo: Reader, edit: Edit, way: Way) -> None:
-    """Show what a new override does, ask, and commit it."""
+    """Show what a new override does, ask for confirmation, and commit the override."""
     if repo.file_reader()(edit.path) is not None:
         message = "exists already; end it first, or choose another name"
         raise InvalidInput.at("", message, file=edit.path)
@@ -168,7 +176,7 @@ def create_override(repo: Reader, edit: Edit, way: Way) -> None:
 
 
 def end_override(repo: Reader, edit: Edit, way: Way) -> None:
-    """Show what the end of an override changes, ask, and commit it."""
+    """Show what the end of an override changes, ask for confirmation, and commit the removal."""
     known = repo.last_valid_snapshot(repo.commit()).state.config.overrides
     if edit.name not in known:
         message = f"there is no override '{edit.name}'{suggestion(edit.name, known)}"
@@ -198,7 +206,10 @@ def _values(file: str | None) -> dict[str, Any] | None:
 
 
 def ends_at(text: str | None) -> str | None:
-    """Return the end of an override: a time, or a duration from now."""
+    """Return the time at which an override ends, as written in its file; None without ``text``.
+
+    ``text`` is a time, or a duration from now.
+    """
     if text is None:
         return None
     try:
@@ -215,6 +226,6 @@ def ends_at(text: str | None) -> str | None:
 
 
 def _owner(repo: Reader) -> str:
-    """Return the person's name in git, or the address if the name is no id."""
+    """Return the person's name in git, or the e-mail address if the name is not a valid id."""
     person = repo.operator()
     return person.email if id_problem(person.name) else person.name

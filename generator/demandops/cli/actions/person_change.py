@@ -59,12 +59,12 @@ propose_option = click.option(
 
 
 def is_asked(yes: bool, output: str) -> bool:
-    """Return whether to ask a person before something changes; a script is not asked."""
+    """Return whether to ask for confirmation: at a terminal, with text output, without ``yes``."""
     return not yes and output == "text" and sys.stdin.isatty()
 
 
 def confirmed(question: str, yes: bool, output: str) -> None:
-    """Ask the question, unless ``yes`` is given or a script runs the command.
+    """Ask the question if :func:`is_asked` returns true.
 
     Raises:
         click.ClickException: the answer was no.
@@ -74,7 +74,7 @@ def confirmed(question: str, yes: bool, output: str) -> None:
 
 
 def known(person: Person) -> Person:
-    """Return the author of a commit; warn if git's configuration does not name one."""
+    """Return ``person`` unchanged; warn if git's configuration does not name the person."""
     if not person.is_known:
         errors.print(
             f"warning: git does not know who you are, so this is done in the name {person}; to "
@@ -88,7 +88,10 @@ def known(person: Person) -> Person:
 def writable(
     state_repo: str, signing_key: Path | None, *, dry_run: bool = False
 ) -> Iterator[Reader]:
-    """Yield an open state repo to which a person's commits can be published, unless ``dry_run``."""
+    """Yield an open state repo for a person's commits, which ``signing_key`` signs.
+
+    With ``dry_run``, the state repo may also be a checkout without a remote.
+    """
     with reader.opened(state_repo, only_read=dry_run) as repo:
         repo.repository.signer = Signer(signing_key) if signing_key else None
         yield repo
@@ -96,7 +99,7 @@ def writable(
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """The options of a person's edit: where, why, and whether it is proposed or only shown."""
+    """The options that all commands for a person's edit share: state repo, reason and others."""
 
     state_repo: str
     signing_key: Path | None
@@ -108,7 +111,10 @@ class Way:
 
 
 def editing(command: Command) -> Command:
-    """Return the command with the options that give its ``way``."""
+    """Return the command with the options of :class:`Way` added.
+
+    The command gets their values as one argument, ``way``.
+    """
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
@@ -133,7 +139,10 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override: its new text (None: removed), and the commit message."""
+    """A person's edit of one override, and the commit message.
+
+    ``text`` is the new text of the override's file; None removes the file.
+    """
 
     name: str
     text: str | None
@@ -147,7 +156,7 @@ class Edit:
 
 
 def consequence(repo: Reader, edit: Edit) -> Entry:
-    """Return the effect of a new override, or the current effect of a removed override.
+    """Return what a new override will affect, or what the override to remove affects now.
 
     Raises:
         InvalidInput: the new file is not valid.
@@ -164,7 +173,10 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 
 
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
-    """Commit the edit to main, or to a branch with a merge request; return what was published."""
+    """Publish the edit; return its commit, branch and link.
+
+    With ``propose``, the commit goes to a branch with a merge request, otherwise to main.
+    """
     files = {edit.path: edit.text}
     author = Author(known(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason))
     if not propose:
@@ -193,7 +205,10 @@ def _push_options(repo: Reader, edit: Edit) -> list[str]:
 
 
 def _opened(repo: Reader, edit: Edit, branch: str) -> str:
-    """Open a pull request at GitHub or Gitea and return its link; the branch is already pushed."""
+    """Open a pull request at GitHub or Gitea for a pushed branch; return its link.
+
+    Return an empty text if no pull request was opened.
+    """
     try:
         forge = forge_for(_forge_settings(repo), settings.forge_token_file())
         if forge is None:
@@ -205,7 +220,10 @@ def _opened(repo: Reader, edit: Edit, branch: str) -> str:
 
 
 def print_edit(edit: Edit, entry: Entry, made: Published | None, output: str) -> None:
-    """Print what the edit did, or would do, and the releases and claims that it applies to."""
+    """Print the outcome of the edit, and the releases and claims that the override applies to.
+
+    ``made`` is what was published; None if the edit is only shown.
+    """
     data: Json = {
         "outcome": _outcome(made),
         "commit": made.commit if made else None,
@@ -239,7 +257,10 @@ def _lines(edit: Edit, data: Json) -> Iterator[str]:
 
 
 def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
-    """Return lines on what an override changes, or no longer changes if it is removed."""
+    """Return one line for each release and claim that the override affects.
+
+    If the edit removes the override, the lines name what it no longer affects.
+    """
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
     found += [f"  {verb} {claim.subject} of {claim.demand}" for claim in entry.claims]
@@ -273,5 +294,5 @@ def selecting(command: Command) -> Command:
 
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
-    """Return the selector that the options of :func:`selecting` make."""
+    """Return the selector of an override from the values of the options of :func:`selecting`."""
     return {name: list(values) for name, values in given.items() if values}

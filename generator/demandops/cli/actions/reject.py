@@ -20,8 +20,8 @@ from demandops.staterepo.write.proposal_branch import ProposalBranches
 def reject(name: str, yes: bool, state_repo: str, output: str) -> None:
     """Turn a proposed demand down: delete its branch.
 
-    The generator aborts the goal with `turned-down`. If it changed the branch meanwhile, nothing
-    is deleted.
+    The generator aborts the goal with `turned-down`. If the generator changed the branch meanwhile,
+    nothing is deleted.
 
     \b
     Examples:

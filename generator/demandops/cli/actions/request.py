@@ -45,18 +45,18 @@ class Document:
     text: str = ""
     """The text of the file."""
     number: int = 0
-    """The place of the document in the text, from 0."""
+    """The index of the document in the file, from 0."""
 
     @property
     def request_id(self) -> str:
-        """Return the goal's id, by which a person knows it."""
+        """Return the id of the request or demand in the goal; empty without a valid one."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
 
 
 class _Answer(Future["Receipt | dict[str, str]"]):
-    """The receipt of a request, or the proposal with which it awaits approval."""
+    """The future answer to a request: its receipt, or the proposal that awaits approval."""
 
 
 @click.command()
@@ -84,9 +84,9 @@ def request(
     """Book demand requests from files.
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
-    documents of the kind Demand (docs/demand.md). Write - for standard input. If it cannot parse a
-    document, the command books nothing. Otherwise it books the documents in order. If one is
-    refused, it still books the others.
+    documents of the kind Demand (docs/demand.md). Write - for standard input. If the command cannot
+    parse a document, it books nothing. Otherwise it books the documents in order; a document that
+    is refused does not keep it from booking the others.
 
     \b
     Examples:
@@ -111,10 +111,11 @@ def book_or_show(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Book requests, or show the consequences; print the outcome of each.
+    """Book the requests, and print the outcome of each; with ``dry_run``, book nothing.
 
     Raises:
-        click.Abort, click.exceptions.Exit: if some have no answer, or were refused.
+        click.Abort: if a request has no answer.
+        click.exceptions.Exit: if a request is refused.
     """
     if any(form_faults(document.goal) for document in documents):
         rows = _unbooked(documents, state_repo)
@@ -137,7 +138,7 @@ def book_or_show(
 def _is_unanswered(row: dict[str, Any]) -> bool:
     """Return whether a request has no answer yet.
 
-    A commit is the answer to a request that waits for room.
+    A request that waits for room on a node has an answer: the commit that records the wait.
     """
     return row["outcome"] == "waiting" and row["commit"] is None
 
@@ -149,7 +150,10 @@ def _documents(file: str) -> Iterable[Document]:
 
 
 def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    """Return the goal that releases what a goal demands; other data stay, to be refused."""
+    """Return the goal that releases what ``goal`` demands.
+
+    Return data that are not a mapping unchanged; the check of goals refuses them later.
+    """
     if not isinstance(goal, dict):
         return goal
     if not is_demand_goal(goal):
@@ -172,7 +176,7 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
 
 
 def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
-    """Return a refusal for each document because at least one does not parse."""
+    """Return a row with a refusal for each document, because at least one does not parse."""
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
     rows = []
@@ -220,10 +224,10 @@ def _book(
 
 
 def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]:
-    """Return the row of a request.
+    """Return the outcome of a request as a row of the output.
 
     Raises:
-        Unsound: nobody knows whether the request was booked.
+        Unsound: if it is not known whether the request was booked.
     """
     try:
         result = answer.result(timeout=0)
@@ -240,7 +244,10 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
 
 
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
-    """Submit a request; return a future of its receipt, or of the proposal that awaits approval."""
+    """Submit a request; return the future answer.
+
+    Without ``wait``, a proposal that awaits approval is an answer too.
+    """
     answer = _Answer()
     name = document.request_id
 
@@ -266,7 +273,10 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Return the row of each request, decided one after the other, in memory only."""
+    """Return the outcome of each request as a row of the output, without booking.
+
+    Each request is decided as if the requests before it were booked.
+    """
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()
@@ -303,7 +313,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
 
 
 def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
-    """Yield a warning if the lease has no unit; a person may have meant minutes."""
+    """Yield a warning if the lease has no unit: it counts as seconds, but may mean minutes."""
     lease = goal.get("lease") if isinstance(goal, dict) else None
     if isinstance(lease, int) and not isinstance(lease, bool):
         yield f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"

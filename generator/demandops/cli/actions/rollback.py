@@ -99,7 +99,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
 
 def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
-    """Return the outcome of the rollback on a commit, decided in memory only."""
+    """Return the outcome and consequences of a rollback on the commit ``base``; book nothing."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])
@@ -121,7 +121,11 @@ def _consequences(decision: Decision | None) -> dict[str, Any]:
 def _roll_back(
     state_repo: str, goal: dict[str, Any], signing_key: Path | None, base: str
 ) -> dict[str, Any]:
-    """Roll back with a generator; return the outcome, with its consequences if main has moved."""
+    """Roll back with a generator; return the outcome as JSON data.
+
+    ``base`` is the commit for which the caller knows the consequences. The result contains them
+    only if they differ: the rollback was refused, changed nothing, or is based on a newer commit.
+    """
     try:
         with started_generator(state_repo, signing_key) as generator:
             ticket = generator.submit(goal)
@@ -135,7 +139,7 @@ def _roll_back(
         return result | _consequences(None)
     with reader.opened(state_repo) as repo:
         decided_on = repo.commit(f"{receipt.commit}~1")
-        if decided_on != base:  # the tip moved in between
+        if decided_on != base:  # main has moved since
             result |= _dry_run(repo, goal, decided_on)
     return result
 

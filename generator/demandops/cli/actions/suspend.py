@@ -14,7 +14,7 @@ _LONGEST = 40
 
 
 def name_of(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return the name of the override that suspends a selection; equal selections share it."""
+    """Return the name of the override that suspends a selection. Equal selections share a name."""
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
     slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:_LONGEST].rstrip("-")
@@ -52,7 +52,7 @@ def suspend(
 
 
 def described(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return a selection as text."""
+    """Return a selection as text, such as ``node edge, requester vehicle00``."""
     return ", ".join(
         f"{kind.removesuffix('s')} {value}"
         for kind, values in selector(selected).items()

@@ -47,8 +47,8 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
 
     DIR is a checked-out state repo; default: this folder. Its files must be valid, every
     application must render, no generated file may be edited (the override to write instead is
-    printed), and a changed chart needs a new version. Helm lints the charts and renders them, for
-    what runs and for an example of each application. Then the command shows the
+    printed), and a changed chart needs a new version. Helm lints the charts, and renders them for
+    the current releases and for an example of each application. Then the command shows the
     consequences of a merge: changed releases, files and bookkeeping. docs/pull-requests.md
     describes the check in a pipeline.
 
@@ -104,7 +104,7 @@ def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return the diffs that fit in ``most`` lines, by path, and the number of omitted lines."""
+    """Return path → diff, up to ``most`` lines in all, and the number of omitted lines."""
     shown: dict[str, str] = {}
     left = 0
     for file in files:
@@ -160,7 +160,10 @@ def _lines(checked: CheckResult) -> Iterator[str]:
 
 
 def _file_lines(consequence: MergePreview) -> Iterator[str]:
-    """Yield the changed files and their differences, except long new files of no release."""
+    """Yield lines that list the files that a merge changes, and then their diffs.
+
+    A long new file that belongs to no release is listed without a diff.
+    """
     others, files = {*consequence.other_files}, consequence.files
     new = {
         each.path: length

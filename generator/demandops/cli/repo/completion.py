@@ -29,5 +29,5 @@ def completion(shell: str) -> None:
     made = get_completion_class(shell)
     assert made is not None  # noqa: S101 - click has these three
     maker = made(root, {}, "demandops", VARIABLE)
-    code = maker.source_template % maker.source_vars()  # source() would start bash for its version
+    code = maker.source_template % maker.source_vars()  # source() would start bash
     print_lines(code.rstrip("\n").split("\n"))

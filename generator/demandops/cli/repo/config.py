@@ -107,7 +107,7 @@ def _given(options: dict[str, str | None]) -> dict[str, str]:
 
 
 def _absolute(place: str | None) -> str | None:
-    """Return a path as absolute; a URL stays as it is."""
+    """Return an existing path as an absolute path, and anything else, such as a URL, unchanged."""
     if place is None or not Path(place).expanduser().exists():
         return place
     return str(Path(place).expanduser().resolve())

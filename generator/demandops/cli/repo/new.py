@@ -165,8 +165,9 @@ def policy(
 ) -> None:
     """Write a new access domain: who may demand what on which nodes.
 
-    A node may be in one access domain by patterns. So first narrow those that match it in
-    policy/access-domains.yaml; a new state repo has one domain for every node ("*").
+    The patterns of at most one access domain may match a node. A new state repo has one domain for
+    every node ("*"). So first narrow, in policy/access-domains.yaml, the patterns that match the
+    nodes of the new domain.
 
     \b
     Examples:
@@ -266,7 +267,11 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return all values; ask for missing ones on a terminal, elsewhere raise their options."""
+    """Return option → values; ask for the values that are missing.
+
+    Raises:
+        click.UsageError: if values are missing and there is no terminal to ask at.
+    """
     missing = [option for option, values in given.items() if not values]
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
@@ -275,7 +280,13 @@ def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Return an answer's words; ask again until each word is valid."""
+    """Ask the question until the answer is valid; return the words of the answer.
+
+    Args:
+        question: the text to show.
+        check: raises a click exception for a word that is not valid.
+        most: the highest number of words; None for any number.
+    """
 
     def valid(answer: str) -> tuple[str, ...]:
         words = tuple(answer.split())
@@ -345,11 +356,11 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     ),
     "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
 }
-"""The option that is asked for → the question, what refuses a bad word, and how many there are."""
+"""Option → the arguments of :func:`_asked`: the question, the check and the most words."""
 
 
 def _example_node(config: Config) -> str:
-    """Return the node of the example demand: an edge server, if there is one."""
+    """Return the id of the example demand's node: an edge server, if the inventory has one."""
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not nodes:
         raise StateRepoError(
@@ -362,7 +373,14 @@ def _example_node(config: Config) -> str:
 def _lay_down(
     directory: Path, made: Callable[[Config], Files], output: str, then: list[str] | None = None
 ) -> None:
-    """Write new files, but only if the whole configuration is valid with them."""
+    """Write new files, but only if the whole configuration is valid with them.
+
+    Args:
+        directory: the checkout of the state repo.
+        made: returns the new files for the current configuration.
+        output: the output format.
+        then: further hints to print after the names of the files.
+    """
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
         if faults:

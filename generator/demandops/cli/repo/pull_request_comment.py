@@ -1,8 +1,9 @@
 """The result of ``demandops check`` as a comment on a pull request.
 
 Text that people wrote appears only in code spans and fences, so that it cannot mention users, link
-or break the layout: the marks are longer than any run of backticks inside. The length of a comment
-is limited, so the most important parts come first and the number of omitted parts is given.
+or break the layout. Each span or fence uses more backticks than any run of backticks in its text.
+The length of a comment is limited. So the most important parts come first, and the comment states
+how many parts are omitted.
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ from demandops.staterepo.pull_request.merge_check import CheckResult
 from demandops.staterepo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 
 MARK = "<!-- demandops check -->"
-"""The first line of every report, by which a pipeline finds its own comment."""
+"""The first line of every report. A pipeline finds its earlier comment by this line."""
 
 LONGEST = 60_000
-"""The default limit in characters. GitHub allows 65,536, GitLab more."""
+"""The default limit of a report in characters. GitHub allows 65,536, GitLab more."""
 
 _LONGEST_SPAN = 500
 _ROOM_FOR_NOTE = 200
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
-    """Return the report, of at most ``longest`` characters."""
+    """Return the result of a check as Markdown, with at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_head(checked), *_faults(checked), *_suggestions(checked)]
     return _bounded([*parts, *_consequence(checked)], longest)
 
 
 def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
-    """Yield which charts helm rendered, and which it did not render and why."""
+    """Yield lines: which charts helm rendered, and for each other chart why it is not rendered."""
     if charts is None:
         return
     if MISSING in charts.not_rendered.values():
@@ -59,7 +60,7 @@ def code(text: str) -> str:
 
 
 def fence(text: str, language: str) -> str:
-    """Return text as a block of code."""
+    """Return text as a fenced block of code in a language."""
     text = lines(text)
     marks = _longer_than_any(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
@@ -162,7 +163,10 @@ def _plain(path: str) -> str:
 
 
 def _bounded(parts: list[str], longest: int) -> str:
-    """Return the parts joined, without those that exceed the limit."""
+    """Return the parts joined, in at most ``longest`` characters.
+
+    Leave out each part that does not fit in the remaining room, and append their number.
+    """
     room = longest - _ROOM_FOR_NOTE
     taken, left = list[str](), 0
     for part in parts:

@@ -83,7 +83,7 @@ def schema(name: str | None, folder: Path | None) -> None:
 
 
 def text(name: str) -> str:
-    """Return a schema as the command prints it."""
+    """Return the JSON Schema of this name as indented JSON text."""
     model, file = SCHEMAS[name]
     generated: dict[str, Any] = model.model_json_schema(by_alias=True)
     describe(generated, model.__name__)

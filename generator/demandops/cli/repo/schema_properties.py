@@ -41,7 +41,7 @@ def _said(root: str, model: str, name: str) -> list[Any]:
 
 
 def _fixed(field: dict[str, Any]) -> list[Any]:
-    """Return an example of a property with fixed values."""
+    """Return a list with one example if the property has fixed values, otherwise an empty list."""
     for part in (field, *field.get("anyOf", ())):
         if "const" in part:
             return [part["const"]]

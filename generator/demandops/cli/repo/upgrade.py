@@ -81,7 +81,7 @@ def upgrade(
 
 @contextmanager
 def _shown() -> Iterator[Progress]:
-    """Show which files of the ledger are read, and then that everything is rendered."""
+    """Yield a function that shows how much of the ledger is read, and later that files render."""
     with busy("reading the state repo") as say:
 
         def report(done: int, total: int) -> None:

@@ -63,7 +63,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    """Load and return a commit; warn about files whose last valid version is in effect."""
+    """Return the state at a revision; warn about files whose last valid version is in effect."""
     with progress("reading the ledger") as report:
         snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))
@@ -71,14 +71,14 @@ def loaded(repo: Reader, revision: str | None) -> Snapshot:
 
 
 def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:
-    """Yield releases that differ, as text."""
+    """Yield lines for releases that differ; ``word`` goes before each release's name."""
     for release in releases:
         yield f"{SIGNS[release.change]} {word}{release.name} ({release.what})"
         yield from (f"    {detail}" for detail in release.details)
 
 
 def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
-    """Yield entries of the bookkeeping that differ, as text."""
+    """Yield lines for entries of the bookkeeping that differ."""
     for entry in entries:
         who = "" if entry.change == "changed" else f" for {', '.join(entry.requesters)}"
         yield f"{SIGNS[entry.change]} {entry.kind} {entry.name}{who}"

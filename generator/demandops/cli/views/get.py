@@ -45,7 +45,7 @@ _COLORS = {
 
 
 def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
-    """Return the name of a kind, which may be given in the singular."""
+    """Return the name of a kind in the plural; ``value`` may be the singular."""
     if value is None:
         raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
     for name in (value, f"{value}s"):

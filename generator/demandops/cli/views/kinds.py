@@ -47,8 +47,9 @@ class Source:
 class Kind:
     """A kind of thing: its items, each with a ``name``, and how they are shown.
 
-    ``cells`` returns the cells of an item for ``columns`` and ``wide``, the columns that only
-    ``-o wide`` shows. ``filters`` return the values of an item that an option is compared with.
+    ``cells`` returns an item's cells, first for ``columns`` and then for ``wide``. Only ``-o wide``
+    shows the columns in ``wide``. ``filters`` maps the name of an option to a function that returns
+    the values of an item to compare with the option.
     """
 
     items: Callable[[Source], list[Json]]
@@ -72,7 +73,7 @@ def _demands(source: Source) -> list[Json]:
 
 
 def _now(state: str, lease: Lease | None, now: datetime) -> str:
-    """Return the state of what is held: ``overdue`` if its lease ended and it is still booked."""
+    """Return the state now: ``overdue`` instead of ``held`` if the lease has ended."""
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 
@@ -159,7 +160,7 @@ def _lease_text(lease: Json | None, now: datetime) -> str:
 
 
 def effect_words(override: Json) -> list[str]:
-    """Return the effects of an override, given as JSON data, as words for people."""
+    """Return each effect of an override as text for people. ``override`` is JSON data."""
     shown = ("version", "replicas", "node")
     listed = ("images", "values")
     return [

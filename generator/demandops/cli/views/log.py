@@ -43,7 +43,7 @@ OPERATIONS = (
     "init",
     "by-hand",
 )
-"""The operations of commits; ``by-hand`` is a person's commit."""
+"""The operations that ``--operation`` accepts; ``by-hand`` selects commits by people."""
 
 _TRAILERS = {
     "requester": "Requester",
@@ -54,7 +54,7 @@ _TRAILERS = {
 
 
 def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
-    """Return the time of --since or --until."""
+    """Parse the option --since or --until; return its time, or None if it is not given."""
     if text is None:
         return None
     time = revisions.parse_time(text, REAL.now(), end=param.name == "until")
@@ -198,7 +198,10 @@ def _matching(
     until: datetime | None,
     **trailers: str | None,
 ) -> Iterable[LogEntry]:
-    """Return the commits that match every given filter; ``_TRAILERS`` lists the trailers."""
+    """Return the commits that match every given filter.
+
+    ``trailers`` are values of commit trailers; their names are the keys of ``_TRAILERS``.
+    """
     wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 
     def matches(entry: LogEntry) -> bool:
@@ -223,7 +226,7 @@ _WIDE = (Column("Time (UTC)"), Column("Operation"), Column("Author"), Column("Re
 
 
 def log_table(rows: list[Json], now: datetime, *, wide: bool = False) -> Table:
-    """Return commits, given as JSON data, as a table."""
+    """Return a table of commits. ``rows`` are the commits as JSON data."""
     cells = []
     for row in rows:
         requesters = row["requesters"] or [row["author"]]

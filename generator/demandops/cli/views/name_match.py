@@ -34,7 +34,10 @@ _MOST_LISTED = 8
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What the name means: one of the kinds, a claim, or another file."""
+    """What a name identifies.
+
+    ``kind`` is one of ``KINDS``, ``claim`` or ``file``.
+    """
 
     kind: str
     name: str
@@ -44,7 +47,11 @@ class Match:
 
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
-    """Return the object that a name identifies; raise if the name fits none, or several."""
+    """Return what a name or path identifies; ``kind`` limits the search to one kind.
+
+    Raises:
+        StateRepoError: if the name identifies nothing, or several things.
+    """
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
@@ -71,7 +78,7 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     known |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
     known |= {id for kind in ("demand", "requester") for id in world.ledger.indexed_names(kind)}
     parts = {part for running_name in running_names for part in running_name.split("-")}
-    close = closest(name, known | parts)  # a part of a release's name will do
+    close = closest(name, known | parts)  # a part of a release's name is also accepted
     known = {close} if close else known
     raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran{suggestion(name, known)}")
 
@@ -93,7 +100,10 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 
 
 def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Iterator[Match]:
-    """Yield the meanings of a name that is no release, application or connection."""
+    """Yield what a name identifies, if no release, application or connection has exactly this name.
+
+    The name may then be a part of a release's name, or the first part of a demand's id.
+    """
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
     if found is not None:
@@ -124,13 +134,21 @@ def _named(world: World, name: str) -> Iterator[Match]:
 
 
 def _release_with(part: str, world: World) -> Release | None:
-    """Return the only release whose name contains ``part``, or None; raise if several do."""
+    """Return the release whose name contains ``part``; None if there is none.
+
+    Raises:
+        StateRepoError: if several releases have such a name.
+    """
     found = {one.name: one for one in release_causes.releases(world) if part in one.name}
     return found[_only(part, [*found])] if found else None
 
 
 def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator[Match]:
-    """Yield the only ended release whose name contains ``part``; raise if several do."""
+    """Yield the ended release whose name contains ``part``, if there is one.
+
+    Raises:
+        StateRepoError: if several ended releases have such a name.
+    """
     commit = str(snapshot.commit)
     found = sorted(name for name in repo.stopped_release_names(commit) if part in name)
     if found:
@@ -139,7 +157,11 @@ def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator
 
 
 def _demand_from(start: str, world: World) -> str | None:
-    """Return the only demand whose id begins with ``start``, or None; raise if several do."""
+    """Return the id of the demand that begins with ``start``; None if there is none.
+
+    Raises:
+        StateRepoError: if several demands have such an id.
+    """
     found = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(start))
     return _only(start, found, "demands have {} at the start of their id") if found else None
 

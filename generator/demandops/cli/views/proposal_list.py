@@ -18,7 +18,8 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 def proposals(repo: Reader) -> list[Json]:
     """Return the proposals as JSON data.
 
-    If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, links are read from GitHub or Gitea.
+    If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, GitHub or Gitea provides the link to
+    the pull request of each proposal. Otherwise the links are None.
     """
     pending = list(pending_proposals(repo.repository))
     forge = _forge(repo) if pending else None

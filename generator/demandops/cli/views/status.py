@@ -77,10 +77,10 @@ def status(
 ) -> None:
     """Show the state of each release on its cluster.
 
-    That is the commit that the cluster has applied, and the health of the release. The exit code
-    is 1 if a file is invalid or waits for a generator, or if a cluster with a kubeconfig in
-    --clusters does not answer, has an old bootstrap file or a release that is not healthy. A
-    cluster without one is unknown, which is no fault.
+    The state is the commit that the cluster has applied, and the health of the release. The exit
+    code is 1 if a file is invalid or waits for a generator, or if a cluster with a kubeconfig in
+    --clusters does not answer, has an old bootstrap file or a release that is not healthy. The
+    state of a cluster without a kubeconfig is unknown, which is no fault.
 
     \b
     Examples:
@@ -122,7 +122,10 @@ def _healthy(
     timeout: int,
     patience_s: int,
 ) -> Status:
-    """Wait until all releases are healthy or the time has passed; return the last status."""
+    """Wait until nothing is wrong or ``timeout`` seconds have passed; return the last status.
+
+    ``patience_s`` is how many seconds each cluster has to answer.
+    """
     end, told = REAL.monotonic() + timeout, ""
     while (amiss := found.amiss(clusters)) and REAL.monotonic() < end:
         if amiss != told:
@@ -136,7 +139,7 @@ def _healthy(
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What clusters and generator report at one commit; ``rows`` are the releases as JSON."""
+    """The state of all releases at one commit; ``rows`` are the releases as JSON data."""
 
     commit: str
     rows: list[Json]
@@ -146,7 +149,7 @@ class Status:
     old_bootstraps: tuple[OldBootstrap, ...]
     missing_inputs: tuple[MissingInput, ...]
     unreadable: Mapping[str, str]
-    """Cluster → why it cannot be read."""
+    """Name of a cluster → why its objects cannot be read."""
 
     @classmethod
     def of(
@@ -155,7 +158,7 @@ class Status:
         clusters: Mapping[str, clusters_file.ClusterAccess],
         patience_s: int = _PATIENCE_S,
     ) -> Status:
-        """Return the current status of all releases; wait so long for the clusters' answers."""
+        """Return the current status; give the clusters ``patience_s`` seconds to answer."""
         problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
@@ -179,7 +182,10 @@ class Status:
         return cls(commit, rows, problems, known, pending, old, missing, unreadable)
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
-        """Return how many problems and unhealthy releases there are, as text; empty if none."""
+        """Return a text that counts problems and unhealthy releases; empty if there are none.
+
+        Only releases on clusters with a kubeconfig in ``clusters`` count.
+        """
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
         failing = sum(row["failing"] for row in watched)
@@ -210,7 +216,7 @@ class Status:
         }
 
     def text(self) -> list[str | Table]:
-        """Return the status as text and a table."""
+        """Return the status as lines of text and a table of the releases."""
         text: list[str | Table] = [f"  {problem}" for problem in self.problems]
         if self.problems:
             count = len(self.problems)
@@ -221,7 +227,7 @@ class Status:
 
 
 def _wanted(domains: Iterable[ClusterDomain]) -> dict[str, list[ObjectSelector]]:
-    """Return the objects to read of each cluster."""
+    """Return cluster → the selectors of the objects to read there."""
     wanted: dict[str, dict[ObjectSelector, None]] = {}
     for domain in domains:
         watched = health_reader(domain).objects_to_watch(domain)
@@ -234,7 +240,10 @@ def _read(
     wanted: Mapping[str, Iterable[ObjectSelector]],
     patience_s: int,
 ) -> dict[str, ObjectCache]:
-    """Return the objects of each cluster; read all at once, so that none delays the others."""
+    """Return cluster → a cache with the selected objects of the cluster.
+
+    Read all clusters at the same time, so that a slow cluster does not delay the others.
+    """
     stores = {
         name: ObjectCache(name, cluster, lambda: None)
         for name, cluster in clusters.items()
@@ -279,7 +288,7 @@ _COLUMNS = (
 
 
 def releases_table(rows: Iterable[Json]) -> Table:
-    """Return releases, given as JSON data, as a table."""
+    """Return a table of releases. ``rows`` are the releases as JSON data."""
     cells = [
         (
             row["name"],

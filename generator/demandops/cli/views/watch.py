@@ -26,7 +26,7 @@ from demandops.staterepo.reader import Reader
 _PAUSE_S = 2.0
 _COMMITS = 6
 _TITLES = 6
-"""The lines of the title and of the empty lines between the parts."""
+"""How many lines the title and the empty lines between the parts take."""
 
 
 @click.command()
@@ -93,7 +93,7 @@ def _screen(
 
 
 def _part(title: str, table: Table, width: int, room: int) -> list[str]:
-    """Return a title and as many lines of a table as there is room for."""
+    """Return a title and as many lines of a table as fit in ``room`` lines."""
     lines = [painted(title, "bold"), *table.lines(width, painted)]
     if len(lines) <= room:
         return lines

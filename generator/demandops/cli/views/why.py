@@ -74,10 +74,10 @@ def why(
     """Explain why something runs or ran.
 
     The command shows the requesters, the configuration and overrides that apply, and the commits.
-    NAME is a release, or a part of its name that no other release has; the id of an application,
-    connection, demand, node or requester, or the start of a demand's; or the name of an application
-    definition or override. PATH is a file below clusters/ or ledger/. For what no longer runs, the
-    command shows the commit that stopped it.
+    NAME is the name of a release, application definition or override, or the id of an application,
+    connection, demand, node or requester. A part of a release's name or the start of a demand's id
+    is enough if no other release or demand has it. PATH is a file below clusters/ or ledger/. For
+    what no longer runs, the command shows the commit that stopped it.
 
     \b
     Examples:
@@ -96,7 +96,7 @@ def why(
 def _answer(
     repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int
 ) -> dict[str, Any]:
-    """Return the answer as JSON data."""
+    """Return the explanation as JSON data, including at most ``most`` of the changing commits."""
     answer: dict[str, Any] = {
         "commit": str(snapshot.commit),
         "kind": match.kind,
@@ -117,7 +117,7 @@ def _answer(
 
 
 def _missing(world: World, answer: dict[str, Any]) -> list[str]:
-    """Return why topics that the answer's claims need do not arrive."""
+    """Return the reasons why topics that the answer's claims need do not arrive."""
     files = {one["file"] for one in answer.get("claims", ())}
     found = (one for one in missing_inputs(world) if one.file in files)
     return list(dict.fromkeys(f"application '{one.application}': {one.reason}" for one in found))
@@ -126,7 +126,10 @@ def _missing(world: World, answer: dict[str, Any]) -> list[str]:
 def _not_rendered(
     repo: Reader, snapshot: Snapshot, answer: dict[str, Any], match: Match
 ) -> list[str]:
-    """Return the files of the answer that a generator has yet to write or remove."""
+    """Return the answer's files that a generator has yet to write or remove.
+
+    If there are any, the state ``in force`` in ``answer`` becomes ``not rendered yet``.
+    """
     files = {match.path, *(one["file"] for one in answer.get("releases", ()))}
     found = sorted(files & repo.not_rendered(snapshot))
     if found and answer.get("state") == "in force":
@@ -149,7 +152,10 @@ def _of_release(world: World, running: Release) -> dict[str, Any]:
 
 
 def _denied(world: World, match: Match) -> dict[str, Any]:
-    """Return why a release does not run although claims request it, if an override denies it."""
+    """Return JSON data on the override that denies a release, and on the release's place.
+
+    Return an empty mapping if ``match`` is not a release that an override denies.
+    """
     if match.kind != "release":
         return {}
     name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
@@ -199,7 +205,10 @@ def _of_override(world: World, name: str) -> dict[str, Any]:
 
 
 def _held(world: World, what: str, held: Iterable[Claim]) -> dict[str, Any]:
-    """Return what these claims hold, and what runs for them."""
+    """Return JSON data on the claims ``held`` and on the releases that they need.
+
+    ``what`` is the text that describes the subject of the answer.
+    """
     claims = sorted(held, key=lambda claim: (str(claim.subject), claim.demand))
     needed = {
         one.name: one for claim in claims for one in release_causes.releases(world, claim.subject)
@@ -263,8 +272,8 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped what the name means."""
-    if match.kind in ("node", "requester"):  # demandops log --node and --requester have them
+    """Return the commits that started, changed and stopped the object of ``match``."""
+    if match.kind in ("node", "requester"):  # `demandops log` lists the commits of both
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
         return _history(repo, repo.history(match.path, str(snapshot.commit), most))
@@ -276,7 +285,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 
 
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
-    """Return commits as JSON data, each with the people's commits that it renders."""
+    """Return commits as JSON data; each lists the commits by people that it carries out."""
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:
         if entry is None:

@@ -11,7 +11,7 @@ _OF_RELEASES = {"node": "runs", "appdef": "runs", "override": "applies to"}
 
 
 def lines_of(answer: Json) -> Iterator[str]:
-    """Yield the answer, given as JSON data, as text for people."""
+    """Yield the lines of the answer for people. ``answer`` is the JSON data."""
     runs = answer["runs"]
     yield f"{answer['kind']} {answer['name']} {_state(answer)} at {answer['commit'][:10]}"
     if runs or answer["kind"] in ("node", "appdef", "override"):
@@ -46,7 +46,7 @@ def lines_of(answer: Json) -> Iterator[str]:
 
 
 def _state(answer: Json) -> str:
-    """Return the state of the subject as a verb: ``runs``, ``is suspended``."""
+    """Return the predicate of the first line, such as ``runs`` or ``is suspended``."""
     runs, kind = answer["runs"], answer["kind"]
     if kind in ("file", "claim") and not runs:
         return "no longer exists" if answer["stopped"] else "exists"

@@ -24,7 +24,7 @@ from demandops.cluster.health.release_health import (
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""The most objects of a failed sync that a reason lists."""
+"""How many failed objects of a sync a reason lists at most."""
 
 
 class ArgoCd(HealthReader):
@@ -56,11 +56,11 @@ class ArgoCd(HealthReader):
         return Health("waiting", message, name, failing=True)
 
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the Application of the domain's folder."""
+        """Return the key of the Application of the domain's folder."""
         return "Application", *_folder_application(domain)
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that a domain's Application has applied."""
+        """Return the commit that a domain's Application has applied; empty if it is not known."""
         app = objects.get(self.follower(domain))
         return next(iter(_applied_commits(app)), "") if app else ""
 
@@ -120,7 +120,7 @@ def _applied_commits(app: Object) -> list[str]:
 def _why_outdated(
     domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
 ) -> str:
-    """Return why a status is older than the current spec or commit; empty if it is current."""
+    """Return why a status is not about the current spec and commit; empty if it is."""
     sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
     if not sync:
         return "has not been compared yet"
@@ -129,7 +129,7 @@ def _why_outdated(
     application = objects.get(("Application", *_folder_application(domain))) or {}
     folder = (application.get("spec") or {}).get("source") or {}
     if source.get("repoURL") != folder.get("repoURL"):
-        return ""  # the chart is in a registry, and the source includes its version
+        return ""  # the chart is in a registry; its version is in the source, compared above
     revision = str(sync.get("revision", ""))
     path = str(source.get("path", ""))
     if history.includes(revision, commit) or history.unchanged(revision, commit, path):
@@ -157,7 +157,10 @@ def _synced_health(app: Object, name: str, objects: Objects) -> Health:
 
 
 def _failure(app: Object) -> tuple[str, str]:
-    """Return why an Application fails and, if known, for which commit."""
+    """Return why an Application fails, and the commit for which it fails.
+
+    The reason is empty if the Application does not fail. The commit is empty if it is not known.
+    """
     operation = _status(app, "operationState")
     result = operation.get("syncResult") or {}
     revision = str(result.get("revision") or _requested_sync(operation).get("revision") or "")
@@ -174,7 +177,10 @@ def _failure(app: Object) -> tuple[str, str]:
 
 
 def _sync_message(operation: Object) -> str:
-    """Return the message of a failed sync; add messages of failed objects that it omits."""
+    """Return the message of a failed sync.
+
+    Messages of failed objects are added if the sync's message does not contain them.
+    """
     message = str(operation.get("message", ""))
     failed = [
         item
@@ -190,7 +196,10 @@ def _sync_message(operation: Object) -> str:
 
 
 def _error(app: Object) -> str:
-    """Return the first condition that is an error; other conditions are warnings."""
+    """Return the first condition that is an error, as text; empty if there is none.
+
+    The conditions that are not errors are warnings.
+    """
     for item in (app.get("status") or {}).get("conditions") or ():
         if str(item.get("type", "")).endswith("Error"):
             return f"{item['type']}: {item.get('message', '')}"
@@ -202,12 +211,15 @@ def _status(app: Object, part: str) -> Object:
 
 
 def _requested_sync(operation: Object) -> Object:
-    """Return the parameters of a sync."""
+    """Return the parameters of the sync that was requested; empty if there are none."""
     return (operation.get("operation") or {}).get("sync") or {}
 
 
 def _same(source: object, other: object) -> bool:
-    """Return whether two sources are equal; Argo CD may omit empty fields or write them."""
+    """Return whether two sources are equal apart from empty fields.
+
+    Argo CD may omit an empty field or write it.
+    """
     return _without_empty(source) == _without_empty(other)
 
 

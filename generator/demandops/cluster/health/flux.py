@@ -60,18 +60,18 @@ class Flux(HealthReader):
         return Health("waiting", "has not applied the commit yet", name)
 
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the domain's Kustomization."""
+        """Return the key of the domain's Kustomization."""
         return "Kustomization", domain.namespace, domain.name
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that a domain's Kustomization has applied."""
+        """Return the commit that a domain's Kustomization has applied; empty if it is not known."""
         kustomization = objects.get(self.follower(domain)) or {}
         return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        del commit, history  # the domain's health covers the commit
+        del commit, history  # the domain's health has checked the commit
         name = name_of(self._key(target))
         status = item.get("status") or {}
         ready = condition(status, "Ready")

@@ -21,7 +21,10 @@ class ObjectName(NamedTuple):
 
 
 class ObjectSelector(NamedTuple):
-    """Selects objects of a kind: all in a namespace, or only the object with this name."""
+    """Selects objects of a kind in a namespace.
+
+    With a ``name``, it selects only the object of that name.
+    """
 
     kind: str
     namespace: str
@@ -45,7 +48,8 @@ class ClusterDomain:
 class Target:
     """A release, and whether it should run.
 
-    With ``by_helm`` the release is a service, otherwise the Deployment of a communication client.
+    With ``by_helm``, the release is a service. Otherwise it is the Deployment of a communication
+    client.
     """
 
     domain: ClusterDomain
@@ -83,7 +87,7 @@ class History(Protocol):
     """Queries on the state repo's commits."""
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or comes after it."""
+        """Return whether ``commit`` is ``other`` or a descendant of ``other``."""
         ...
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
@@ -92,7 +96,10 @@ class History(Protocol):
 
 
 def worst(healths: list[Health]) -> Health:
-    """Return the least advanced health; if several are equal, prefer a failing one."""
+    """Return the least advanced health; if several are equal, prefer a failing one.
+
+    The result for an empty list is healthy.
+    """
     return min(
         healths,
         key=lambda health: (_ORDER[health.state], not health.failing),
@@ -111,7 +118,10 @@ class HealthReader(ABC):
         """Return the objects that the health of a domain and its releases depends on."""
 
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects to read again before a release counts as healthy: owners first."""
+        """Return the objects to read again before a release counts as healthy.
+
+        The owners come first, then the Deployments that they own.
+        """
         kinds = (self.service_kind, "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
@@ -119,10 +129,16 @@ class HealthReader(ABC):
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far a domain has applied a commit."""
+        """Return the health of a domain: ``reconciled`` once it has applied ``commit``.
+
+        Before that, the state is ``waiting``.
+        """
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return how far a release of a commit is on its cluster: applied, started or removed."""
+        """Return the health of a release of a commit.
+
+        The state is ``waiting`` until the domain has applied the commit.
+        """
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain
@@ -131,7 +147,11 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return whether a release is as its applied commit wants it: running, or gone."""
+        """Return the health of a release of a commit that the domain has already applied.
+
+        A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
+        gone.
+        """
         key = self._key(target)
         item = objects.get(key)
         if not target.wanted:
@@ -144,7 +164,10 @@ class HealthReader(ABC):
 
     @abstractmethod
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the key of the object of the bootstrap file that applies a domain's folder."""
+        """Return the key of the object that applies a domain's folder.
+
+        The cluster's bootstrap file contains this object.
+        """
 
     @abstractmethod
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
@@ -160,7 +183,7 @@ class HealthReader(ABC):
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far a service whose object exists has started."""
+        """Return the health of a service whose object exists."""
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:
@@ -171,7 +194,7 @@ class HealthReader(ABC):
         """Return whether the controller made a Deployment for a service."""
 
     def _why_not_removed(self, item: Object) -> str:
-        """Return why the controller fails to remove a service; empty if it does not fail."""
+        """Return why the controller fails to remove a service; empty if no failure is known."""
         return ""
 
     def _key(self, target: Target) -> Key:
@@ -202,7 +225,10 @@ def name_of(key: Key) -> str:
 
 
 def deployment_health(deployment: Object) -> Health:
-    """Return whether all replicas of a Deployment are available with its current spec."""
+    """Return the health of a Deployment.
+
+    It is healthy if all replicas are available and run the current spec.
+    """
     metadata, status = deployment["metadata"], deployment.get("status") or {}
     name = name_of(("Deployment", metadata.get("namespace"), metadata.get("name")))
     replicas = (deployment.get("spec") or {}).get("replicas")
@@ -234,6 +260,6 @@ def why_unavailable(pods: Iterable[Any]) -> str:
 
 
 def condition(status: Object, kind: str) -> Object:
-    """Return the condition of a type; empty if there is none."""
+    """Return the condition of type ``kind`` in a status; empty if there is none."""
     conditions = status.get("conditions") or ()
     return next((item for item in conditions if item.get("type") == kind), {})

@@ -18,17 +18,18 @@ from demandops.errors import sentences, suggestion
 VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]
 """What happens if demands that share an application or a service ask for different versions.
 
-``refuse``: the later one is refused. ``separate``: another version than the default runs in an
+``refuse``: the later demand is refused. ``separate``: a version other than the default runs in an
 instance of its own (:mod:`demandops.demand.separate_instance`). ``update``: the newest version
-runs; another major version needs a person's approval. ``upgrade``: the newest version runs.
+runs; another major version needs a person's approval. ``upgrade``: the newest version runs, even if
+its major version is another one.
 """
 
 
 class WireNames(CamelModel):
     """The names of this application in the reference's ``DeploymentRequest``.
 
-    ``type`` is the number in ``Application.type``. ``inputs`` maps the topic lists of the
-    message's body to roles.
+    ``type`` is the number in ``Application.type``. ``inputs`` maps each topic list in the message's
+    body to a role of the appdef.
     """
 
     type: Annotated[int, Field(ge=1, le=255)]

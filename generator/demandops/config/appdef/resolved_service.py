@@ -22,10 +22,11 @@ from demandops.errors import suggestion
 class Service(Deployed):
     """A service as the applications of one appdef have it.
 
-    ``folder`` is that of its definition in ``appdefs/``. ``inputs`` maps all its inputs to roles of
-    the appdef or ``<service>.<output>``. ``root`` is the role whose topics a service with ``each``
-    runs for; ``roots`` are the roles that it reads from one source at a time. ``runs_at``
-    maps the node of an application to that of the service, if it runs once for each cluster.
+    ``folder`` is the folder of its definition in ``appdefs/``. ``inputs`` maps each input to a role
+    of the appdef or to ``<service>.<output>``. A service with ``each`` runs once for each topic of
+    the role ``root``. ``roots`` are the roles from which one instance of the service reads the
+    topics of a single source. If the service runs once for each cluster, ``runs_at`` maps the node
+    of an application to the node of the service.
     """
 
     name: str
@@ -51,7 +52,11 @@ class Service(Deployed):
 
     @property
     def is_placeable(self) -> bool:
-        """Whether the service may get a node of its own: no other definition shares it."""
+        """Whether the service may get a node of its own.
+
+        An instance of such a service serves applications of only one appdef, and the service does
+        not run at its sources.
+        """
         return self.scope == "application" or not (self.shared or self.at_source)
 
     @property
@@ -70,7 +75,10 @@ Problem: TypeAlias = "tuple[str, str]"
 def resolved_services(
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> tuple[Services, list[Problem]]:
-    """Return the services of an appdef, its own and those that it uses, or the problems."""
+    """Return the services of an appdef, its own and those that it uses, and the problems.
+
+    If there is a problem, no service is returned.
+    """
     services = {
         name: Service.model_construct(
             **{**dict(own), "inputs": _with_each(own)},
@@ -147,7 +155,10 @@ def _place(service: Service, role: str) -> str:
 
 
 def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
-    """Set the roots of a service from those of the services that it reads; yield the problems."""
+    """Set ``root`` and ``roots`` of a service, and yield the problems.
+
+    The services whose outputs this service reads must have their roots already.
+    """
     service, root = services[name], None
     made_from: dict[str, tuple[str, ...]] = {}
     for role, origin in service.inputs.items():

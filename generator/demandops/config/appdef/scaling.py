@@ -1,4 +1,4 @@
-"""How many replicas a service has, and what the number follows."""
+"""How many replicas a service has, and what decides this number."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Percent = Annotated[int, Field(ge=1, le=1000)]
 """A share of what a pod requests, in percent; a pod may use more than it requests."""
 
 Measure = Literal["topics", "sources", "claims", "requesters"]
-"""What may set the number of replicas: one replica for so many topics, sources and so on."""
+"""What is counted to set the number of replicas: one replica serves a given number of these."""
 
 Resource = Literal["cpu", "memory"]
 """What an autoscaler measures."""
@@ -34,9 +34,10 @@ class Sizes(CamelModel):
     replicas: Annotated[dict[Word, Count], Field(min_length=1)]
 
     def replicas_for(self, value: object) -> int | None:
-        """Return the replicas for a parameter's value; for a list, those of its largest size.
+        """Return the number of replicas for a parameter's value.
 
-        ``None`` means that the value is not a size.
+        A list of sizes gets the replicas of its largest size. Return ``None`` if the value, or an
+        item of the list, is not a size.
         """
         names = value if isinstance(value, list) else [value]
         known = [self.replicas[name] for name in names if name in [*self.replicas]]
@@ -44,13 +45,16 @@ class Sizes(CamelModel):
 
 
 class Scaling(CamelModel):
-    """How many replicas a service has: ``min``, if nothing else decides.
+    """How many replicas a service has.
 
-    ``per`` gives one replica for that many topics, sources, claims or requesters, ``sizes`` as many
-    as a parameter's value stands for. ``autoscaler`` has the targets of a HorizontalPodAutoscaler,
-    in percent of what the pods request. ``divides_work`` says that replicas publish nothing twice.
-    More replicas start at once. With ``down_after`` the service keeps them for that time after the
-    last demand that needed them (:mod:`demandops.ledger.kept_replicas`).
+    A service has ``min`` replicas unless one of three fields decides. ``per`` gives one replica for
+    a number of topics, sources, claims or requesters. ``sizes`` gives the replicas of the size that
+    a parameter names. ``autoscaler`` has the targets of a HorizontalPodAutoscaler, in percent of
+    what the pods request.
+
+    ``divides_work`` says that no two replicas publish the same data. Further replicas start without
+    delay. With ``down_after`` the service keeps them for that time after the last demand that
+    needed them has ended (:mod:`demandops.ledger.kept_replicas`).
     """
 
     min: Count = 1
@@ -106,7 +110,7 @@ class Scaling(CamelModel):
 
     @property
     def kept_for(self) -> timedelta | None:
-        """The time for which a service keeps replicas that no demand needs any longer."""
+        """The time for which a service keeps replicas that no demand needs, or ``None``."""
         return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
 
     @property

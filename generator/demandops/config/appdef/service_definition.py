@@ -23,13 +23,14 @@ TopicPattern = Annotated[
 """A topic name; ``{instance}`` is replaced by the service's source or application."""
 
 Scope = Literal["application", "topic", "node", "cluster"]
-"""What a service has one instance for."""
+"""The scope of a service: what each of its instances is for."""
 
 
 class Place(CamelModel):
     """What the node of a service must have: type, labels of its selector, capabilities, properties.
 
-    A property has a value that it must equal, or bounds of a number: ``{min: 8}``.
+    ``properties`` maps the name of a property to the value that it must have, or to the bounds of
+    its number: ``{min: 8}``.
     """
 
     role: Word | Literal[""] = ""
@@ -39,7 +40,7 @@ class Place(CamelModel):
 
 
 class Input(CamelModel):
-    """A role of demanded topics, for example ``point_cloud``."""
+    """An input role, for example ``point_cloud``, to which a demand assigns topics."""
 
     description: Text = ""
     type: Text = ""
@@ -56,9 +57,10 @@ class Parameter(CamelModel):
 class Deployed(CamelModel):
     """How a service runs: its releases' names, chart and values, and what it publishes.
 
-    ``each`` names an input; the service then runs once for every topic of it. ``place`` is what its
-    node must have, if it gets one of its own (:mod:`demandops.plan.nodes.placement`). ``requests``
-    is what each replica needs of its node (:mod:`demandops.plan.nodes.capacity`).
+    If ``each`` names an input, the service runs once for every topic of this input. ``place`` is
+    what the node of the service must have, if the generator chooses a node for the service
+    (:mod:`demandops.plan.nodes.placement`). ``requests`` is what each replica needs of its node
+    (:mod:`demandops.plan.nodes.capacity`).
     """
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
@@ -86,7 +88,7 @@ class Deployed(CamelModel):
 class OwnService(Deployed):
     """A service of one appdef. Its ``inputs`` name roles of the appdef or ``<service>.<output>``.
 
-    ``each`` names one of these inputs, or a role that is then an input too.
+    ``each`` names one of these inputs, or a role of the appdef. That role then becomes an input.
     """
 
     inputs: dict[Word, str] = Field(default_factory=dict)
@@ -103,7 +105,7 @@ class OwnService(Deployed):
 class ServiceDefinition(Deployed, FileModel):
     """A service that several appdefs may use: ``appdefs/<name>/service.yaml``.
 
-    ``nodes`` has the node of each cluster where a service with the scope ``cluster`` runs.
+    For the scope ``cluster``, ``nodes`` maps each cluster to the node where the service runs.
     """
 
     kind: Literal["ServiceDefinition"]
@@ -140,7 +142,7 @@ class ServiceDefinition(Deployed, FileModel):
 
 
 def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iterator[str]:
-    """Yield the faults of the parameter that names a service's size."""
+    """Yield a message for each fault of the parameter that ``scaling.sizes`` names."""
     sizes = scaling.sizes
     if sizes is None:
         return

@@ -1,6 +1,6 @@
-"""Checks across files and entries: an unknown cluster, a prefix that is used twice.
+"""Checks across files and entries, for example for an unknown cluster or a prefix used twice.
 
-They run when all files are parsed. Every check runs, and the reader collects all faults.
+The checks run after all files are parsed. Every check runs, and the reader collects all faults.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
 
 
 def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    """Yield file, place, name and definition of each service that is defined."""
+    """Yield (file, prefix of its fields, name, definition) for each service that is defined."""
     for appdef in config.appdefs.values():
         for name, service in appdef.services.items():
             yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
@@ -197,7 +197,10 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Add a fault if two appdefs give the ``each`` of a shared service different origins."""
+    """Add the faults of shared services: of their nodes, and of the origins of their inputs.
+
+    All appdefs that use a shared service with ``each`` must give this input the same origin.
+    """
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
         file = f"appdefs/{name}/service.yaml"
@@ -237,7 +240,8 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
     for name, listed in config.versions.items():
         file, place = reader.place_of(VERSIONS_FILE, name)
         if name not in config.appdefs:
-            if f"appdefs/{name}/appdef.yaml" not in reader.files:  # else it has faults of its own
+            # an appdef.yaml that exists but is invalid has faults of its own
+            if f"appdefs/{name}/appdef.yaml" not in reader.files:
                 known = suggestion(name, config.appdefs)
                 message = f"'{name}' is not an application definition{known}"
                 reader.add_fault(file, place, message)
@@ -262,7 +266,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault if a shared service runs for an output that each version makes on its own."""
+    """Add a fault if the ``each`` of a shared service is an output that each version publishes."""
     services = config.services.get(appdef, {})
     for name, service in services.items():
         origin = service.inputs[service.each] if service.shared and service.each else ""

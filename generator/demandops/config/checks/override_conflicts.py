@@ -1,9 +1,12 @@
-"""Overrides of equal priority that might change one release differently.
+"""Refuses two overrides of equal priority that could change one release differently.
 
-Such a pair needs an order, so it is refused. Doubtful pairs are refused too, so that no later
-demand meets a conflict. A field separates two selectors only if a release has a single value for
-it, like service and node. A shared service has many applications and requesters, a Zenoh bridge
-many connections.
+Only different priorities give such a pair an order. A pair is also refused if no release matches
+both overrides yet but a later demand could add one.
+
+Two selectors cannot match the same release if they exclude each other in a field for which a
+release has only one value, like service or node. A shared service has many applications and
+requesters, and a Zenoh bridge has many connections, so two selectors that exclude each other in
+these fields may still match the same release.
 """
 
 from __future__ import annotations
@@ -95,7 +98,7 @@ def _selects_services(selector: Selector) -> bool:
 
 
 def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
-    """Yield the fields that separate the selectors: a release has a single value for each."""
+    """Yield the fields for which every release that the selectors match has a single value."""
     yield from ("services", "nodes")
     if not any(_shared(one, other, services) for services in config.services.values()):
         yield from ("applications", "appdefs")
@@ -104,7 +107,7 @@ def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterat
 
 
 def _shared(one: Selector, other: Selector, services: Services) -> bool:
-    """Return whether both selectors may match the same service that applications share."""
+    """Return whether both selectors may match one service that several applications share."""
     return any(
         service.scope != "application"
         and all(not s.services or matches(name, s.services) for s in (one, other))
@@ -114,7 +117,7 @@ def _shared(one: Selector, other: Selector, services: Services) -> bool:
 
 def patterns_overlap(one: str, other: str) -> bool:
     """Return whether any text matches both patterns (``*`` any characters, ``?`` one)."""
-    # row[i]: whether the part of ``one`` that was read overlaps with the first i characters
+    # row[i]: whether the part of ``one`` that is read overlaps with the first i characters of other
     row = [not other[:length].strip("*") for length in range(len(other) + 1)]
     for a in one:
         after = [row[0] and a == "*"]

@@ -14,7 +14,7 @@ Item = TypeVar("Item")
 
 _SMALLEST_CELL_M = 10.0
 _MOST_CELLS = 4096
-"""An area that covers more cells is compared with every entity."""
+"""The most cells that an area may cover; a larger area is compared with every entity."""
 
 
 class AreaGrid(Generic[Item]):
@@ -39,7 +39,7 @@ class AreaGrid(Generic[Item]):
         self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
 
     def at(self, x: float, y: float) -> Sequence[Item]:
-        """Return all items whose area or margin contains a position, and some others near by."""
+        """Return all items whose area or margin contains a position, and some that are near."""
         return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
 
 

@@ -18,7 +18,7 @@ Seen = Mapping[Who, Observation]
 
 
 class Facts(NamedTuple):
-    """The values of an event for the rule's template, and a sentence for people."""
+    """The values that an event gives to the rule's template, and a sentence for people."""
 
     values: Values
     text: str
@@ -38,7 +38,7 @@ class CompiledRule:
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:
-        """Return whether the rule is for an entity of one of its sources."""
+        """Return whether the rule is for ``who``, an entity of one of the rule's sources."""
         return self.is_for(who[1])
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
@@ -60,14 +60,14 @@ class CompiledRule:
 
 
 class HoursRule(CompiledRule):
-    """A rule whose condition is met at some hours."""
+    """A rule whose condition holds during the hours of a schedule."""
 
     def __init__(self, rule: Rule, hours: Hours) -> None:
         super().__init__(rule)
         self.schedule = hours.schedule
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return no values but the rule's name."""
+        """Return the rule's name as the only value."""
         return Facts(self._named(subjects), "the hours of the schedule")
 
 
@@ -89,7 +89,7 @@ class ThresholdRule(CompiledRule):
         return is_low if self._limits.above is not None else value >= self._limits.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the value."""
+        """Return the number that the entity reported last."""
         value = seen[self.sources[0], subjects[0]].values.get(self.field, 0.0)
         named = {**self._named(subjects), "value": value}
         return Facts(named, f"{self.field} of {subjects[0]} is {value:g}")
@@ -117,7 +117,11 @@ class AreaRule(CompiledRule):
 
 
 class PairRule(CompiledRule):
-    """A rule on the distance of two entities. It looks for them in squares of the stop distance."""
+    """A rule on the distance of two entities.
+
+    The map is divided into squares as wide as the distance at which the condition stops. The rule
+    looks for the partners of an entity in the entity's square and the squares around it.
+    """
 
     def __init__(self, rule: Rule, condition: Together) -> None:
         super().__init__(rule)
@@ -125,11 +129,18 @@ class PairRule(CompiledRule):
         self._first, self._second = self.sources[0], self.sources[-1]
 
     def takes(self, who: Who) -> bool:
-        """Return whether an entity may be in a pair; the patterns are for the first source."""
+        """Return whether an entity may be in a pair.
+
+        The patterns of the rule limit only the entities of the first source.
+        """
         return who[0] != self._first or self.is_for(who[1])
 
     def key(self, one: Who, other: Who) -> Key:
-        """Return the key of a pair's event; entities of the same source are sorted by name."""
+        """Return the key of a pair's event.
+
+        In the key, entities of the same source are sorted by name. Otherwise the entity of the
+        first source comes first.
+        """
         if self._first == self._second:
             return self.name, (min(one[1], other[1]), max(one[1], other[1]))
         return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
@@ -154,7 +165,10 @@ class PairRule(CompiledRule):
         before: Observation | None,
         after: Observation | None,
     ) -> None:
-        """Move an entity from its square to another one; ``None`` is nowhere."""
+        """Move an entity in ``cells`` from its square ``before`` to its square ``after``.
+
+        ``None``, and an observation without a position, stand for no square.
+        """
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
             return
@@ -166,7 +180,10 @@ class PairRule(CompiledRule):
             cells[entered] = cells.get(entered, frozenset()) | {entity}
 
     def around(self, cells: Mapping[Cell, frozenset[str]], one: Observation) -> Iterator[Who]:
-        """Yield the possible partners of an entity: all that are near enough, and some others."""
+        """Yield the possible partners of an entity.
+
+        These are all that are near enough, and some that are too far away.
+        """
         cell = self._cell(one)
         if cell is None:
             return
@@ -186,7 +203,7 @@ def distance(one: Observation, other: Observation) -> float:
 
 
 def compiled(rule: Rule) -> CompiledRule:
-    """Return a rule in the class of its condition."""
+    """Return a rule, compiled to the class for its kind of condition."""
     condition = rule.condition
     if isinstance(condition, Near | Count):
         return AreaRule(rule, condition)

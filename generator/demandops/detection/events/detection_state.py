@@ -14,7 +14,7 @@ Who: TypeAlias = tuple[str, str]
 """An entity: its source and its name."""
 
 Cell: TypeAlias = tuple[str, str, int, int]
-"""A square of the map: the rule whose pairs are looked for, a source, and its place."""
+"""A square of the map, for a rule on pairs and one of its sources: rule, source, column and row."""
 
 _NOTHING: Mapping[Any, Any] = MappingProxyType({})
 
@@ -35,9 +35,9 @@ class Observation(NamedTuple):
 
 
 class Event(NamedTuple):
-    """The start or the end of an event: a demand is wanted from now on, or no longer.
+    """The start or the end of an event: from now on a demand is wanted, or no longer wanted.
 
-    ``values`` fill in the rule's template. ``why`` says for people what has happened.
+    ``values`` are for the rule's template. ``why`` explains to people what has happened.
     """
 
     rule: str
@@ -54,7 +54,10 @@ class Event(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """A condition that is met since ``since``; ``lasts`` is set after the dwell time."""
+    """A condition that is met since ``since``.
+
+    ``lasts`` is false during the dwell time, and then true.
+    """
 
     since: float
     lasts: bool
@@ -64,11 +67,18 @@ class Phase(NamedTuple):
 class State:
     """The engine's whole state; times are in seconds since 1970.
 
-    ``phases`` has the conditions that hold now; ``engaged`` lists their keys by entity.
-    ``awaited`` has the entities of earlier events that were not seen since the start, each with the
-    time at which it counts as gone. Until ``settled`` no count stops. ``counted`` are the rules
-    that count an entity, ``counts`` how many entities each rule counts. ``cells`` has the entities
-    by place, for pairs. Passing time alone changes nothing before ``due``, and no schedule before
+    ``seen`` has the last observation of each entity that is not gone.
+
+    ``phases`` has the conditions that are met now. ``engaged`` has the keys of these conditions by
+    entity.
+
+    ``awaited`` has the entities of earlier events that have not been seen since the start, each
+    with the time at which it counts as gone. Before ``settled``, no condition on a count stops.
+
+    ``counted`` has, for each entity, the rules that count it. ``counts`` has, for each rule, how
+    many entities it counts. ``cells`` has the entities by square, for rules on pairs.
+
+    Without observations, nothing changes before ``due``, and no schedule changes before
     ``hours_due``.
     """
 
@@ -90,7 +100,7 @@ class State:
         return frozenset(key for key, phase in self.phases.items() if phase.lasts)
 
     def shifted(self, seconds: float) -> State:
-        """Return the state after the clock was set forward by ``seconds``; negative: back."""
+        """Return the state after the clock was set forward by ``seconds``, or back if negative."""
         return replace(
             self,
             now=self.now + seconds,

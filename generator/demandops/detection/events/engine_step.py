@@ -1,7 +1,7 @@
 """One step of the engine, which collects the events of observations and of passing time.
 
-It changes a copy of the state. Copies are cheap: the values in the mappings are immutable, and a
-step takes many observations.
+A step changes a copy of the state, not the state itself. The copy costs little: it is shallow,
+because the values in the mappings are immutable, and one step takes many observations.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NO_RULES: frozenset[str] = frozenset()
 
 
 class EngineStep:
-    """The work of one step."""
+    """The work of one step: call its methods, then take ``events`` and :meth:`result`."""
 
     def __init__(self, engine: EventEngine, state: State) -> None:
         self._engine, self._before = engine, state
@@ -51,7 +51,10 @@ class EngineStep:
         )
 
     def resume(self, key: Key) -> None:
-        """Take up an event from before the start, and wait for its entities."""
+        """Continue an event that started before a restart, and wait for its entities.
+
+        An event for which there is no rule is ignored.
+        """
         rule = self._engine.rules.get(key[0])
         if rule is None or len(rule.subjects) != len(key[1]):
             return
@@ -63,7 +66,10 @@ class EngineStep:
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Apply the passing of time: end dwell times, forget silent entities, follow schedules."""
+        """Advance the time to ``until``, and apply all changes that are due by then.
+
+        These are the ends of dwell times, entities that are silent for too long, and schedules.
+        """
         while until >= self._due:
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
                 if at > until:
@@ -192,7 +198,7 @@ class EngineStep:
     # ---- events ----
 
     def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
-        """Start or stop a condition, or keep its state."""
+        """Start a condition if ``starts``, stop it if ``stops``, or else keep its state."""
         phase = self._phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")

@@ -56,8 +56,9 @@ class EventEngine:
 
         Args:
             now: the time.
-            held: the events whose demands are already booked; those without a rule are left out.
-            settle_s: how long the entities of these events may stay unseen until they are gone.
+            held: the events whose demands are already booked. Events without a rule are left out.
+            settle_s: how many seconds the entities of these events may stay unseen until they count
+                as gone.
         """
         state = State(now, due=-inf, settled=now + settle_s, hours_due=now)
         step = EngineStep(self, state)
@@ -68,12 +69,13 @@ class EventEngine:
     def step(
         self, state: State, observations: Iterable[Observation], now: float
     ) -> tuple[State, tuple[Event, ...]]:
-        """Return the state after some observations, and the events.
+        """Return the new state, and the events that observations and passing time cause.
 
         Args:
-            state: the state before; it stays as it is.
-            observations: in the order in which they came. An observation earlier than ``state.now``
-                counts as made then, one later than ``now`` as made now.
+            state: the state before the step; it is not changed.
+            observations: in the order in which they were made. An observation earlier than
+                ``state.now`` counts as made at ``state.now``. An observation later than ``now``
+                counts as made at ``now``.
             now: the time.
         """
         step = EngineStep(self, state)

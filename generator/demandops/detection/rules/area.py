@@ -12,7 +12,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A point, or a polygon of three or more corners whose last one joins the first."""
+    """A point, or a polygon of at least three corners; an edge joins the last one to the first."""
 
     corners: tuple[Point, ...]
 
@@ -31,7 +31,7 @@ class Area:
         nearest, inside = math.inf, False
         for (x1, y1), (x2, y2) in edges:
             nearest = min(nearest, _to_edge(x, y, x1, y1, x2, y2))
-            # an edge that a ray to the right crosses changes the side
+            # each edge that a ray to the right crosses swaps inside and outside
             if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
                 inside = not inside
         return 0.0 if inside else nearest

@@ -64,7 +64,7 @@ def _refuse_distances(start: float, stop: float) -> None:
 
 
 class Near(_InArea):
-    """Starts when an entity is at most ``start`` metres away; ends when over ``stop``."""
+    """Starts when an entity is within ``start`` metres of an area; ends beyond ``stop``."""
 
     start: Metres
     stop: Metres
@@ -76,9 +76,9 @@ class Near(_InArea):
 
 
 class Together(CamelModel):
-    """Starts when two entities are at most ``start`` metres apart; ends when over ``stop``.
+    """Starts when two entities are within ``start`` metres; ends when they are beyond ``stop``.
 
-    They are of the same source, or the second one is of the source ``other``.
+    Both entities are of ``source``, unless ``other`` names the source of the second one.
     """
 
     source: DnsLabel
@@ -93,7 +93,10 @@ class Together(CamelModel):
 
 
 class Count(_InArea):
-    """Starts with ``start`` or more entities within ``radius``; ends with ``stop`` or fewer."""
+    """Starts with ``start`` or more entities within ``radius``; ends with ``stop`` or fewer.
+
+    ``radius`` is the distance to the area in metres.
+    """
 
     radius: Metres = 0.0
     start: Positive
@@ -141,12 +144,12 @@ def _clock(text: str) -> time:
 def _zone(text: str) -> ZoneInfo:
     try:
         return ZoneInfo(text)
-    except (OSError, ValueError, KeyError):  # unknown, or not a name
+    except (OSError, ValueError, KeyError):  # unknown, or no name of a zone
         raise ValueError(f"'{text}' is not a time zone; write it like Europe/Berlin") from None
 
 
 class Hours(CamelModel):
-    """Lasts from a time of day to another one, on some days of the week."""
+    """Lasts from one time of day to another, on certain days of the week."""
 
     days: Annotated[
         tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],

@@ -1,4 +1,4 @@
-"""The check of what a rule demands: its names, its form and its ids."""
+"""Checks what a rule demands: the names in the template, the demand's form and its ids."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ def faults_of_demand(
     """Return the faults of a rule's demand.
 
     Args:
-        template: the demand.
-        field: the place of the demand in the file.
-        subjects: the names of the entities that an event of the rule is about.
-        momentary: the names of values that change; a ``Demand`` may use them, but not in its ids.
+        template: the template of the demand.
+        field: the path of the demand in the file of rules.
+        subjects: the template's names for the entities that an event of the rule is about.
+        momentary: the names of values that are known only when an event starts. A ``Demand`` may
+            use them, but not in its ids.
     """
     stable = {"rule", *subjects}
     known = stable | (momentary if template.action == "demand" else set())
@@ -54,7 +55,10 @@ def faults_of_demand(
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
-    """Yield a fault for each id that is missing, changes, or is the same for two entities."""
+    """Yield a fault for each id that is missing, changes, or is the same for two entities.
+
+    ``needed`` has the names in braces that each id must contain.
+    """
     data = template.data
     if template.action == "demand":
         yield from _missing(data, field, "demand", "requesters")
@@ -82,7 +86,7 @@ def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: A
 
 
 def _requesters_by_field(data: Any) -> Iterator[tuple[str, list[str]]]:  # noqa: ANN401
-    """Yield the requesters of each item of a ``DeploymentRequest``, and their field."""
+    """Yield, for each item of a ``DeploymentRequest``, the field of its requesters, and these."""
     for index, app in enumerate(data.get("apps", ())):
         field = "object_detection_fusion_app"
         yield f"apps[{index}].{field}.requester_ids", app.get(field, {}).get("requester_ids", [])

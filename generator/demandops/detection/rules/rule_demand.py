@@ -1,7 +1,7 @@
 """What a rule demands: a template of a goal of one of the two actions.
 
-It makes the goals that start, renew and end a demand. It also finds the demands in the
-bookkeeping that a rule has made.
+The template makes the goals that start, renew and end a demand. It also finds the demands that a
+rule has made, among those in the bookkeeping.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Goal:
 
     @property
     def document(self) -> Mapping[str, Any]:
-        """The goal as a file of ``demandops request`` has it."""
+        """The goal in the form that a file for ``demandops request`` has."""
         head = {"apiVersion": API_VERSION, "kind": "Demand"} if self.action == "demand" else {}
         return {**head, **self.data}
 
@@ -88,7 +88,10 @@ class RuleDemand:
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
-        """Return the goal; if ``values`` lacks a name, only the demand's id and its requesters."""
+        """Return the goal that starts the demand, as far as ``values`` suffice.
+
+        If ``values`` lacks a name, the goal has only the demand's id and its requesters.
+        """
         if self.names() <= set(values):
             return self.goal(values)
         kept = {name: self.data[name] for name in ("demand", "requesters")}
@@ -104,7 +107,16 @@ class RuleDemand:
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
-        """Return name → entity for which this template makes the held demand, or ``None``."""
+        """Return the entities with which this template makes the demand ``held``.
+
+        Args:
+            held: a demand in the bookkeeping.
+            subjects: the template's names for entities.
+            rule: the name of the rule.
+
+        Returns:
+            The entity for each name in ``subjects``; ``None`` if the rule has not made this demand.
+        """
         if self.action == "demand":
             pairs = [(str(self.data["demand"]), held.demand)]
         else:

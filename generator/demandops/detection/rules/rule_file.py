@@ -34,15 +34,15 @@ POSITIONS: Mapping[str, tuple[str, str]] = {
     "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
     "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
 }
-"""The fields with x and y in messages of a type, unless the source names them."""
+"""For each message type, the fields with x and y that are read unless the source names others."""
 
 
 class Source(CamelModel):
     """The topics of one kind of entity.
 
-    The entity is the part of the topic that ``{entity}`` stands for, or the text in the field
-    ``entity``. ``x`` and ``y`` are the fields with its position. An entity that is silent for
-    ``timeout`` is gone.
+    The name of the entity is the part of the topic that ``{entity}`` stands for, or the text in the
+    message's field that ``entity`` names. ``x`` and ``y`` name the fields with the entity's
+    position. An entity counts as gone when it has been silent for ``timeout``.
     """
 
     topic: Annotated[Text, without(topic_pattern_problem)]
@@ -113,7 +113,7 @@ class Rule(CamelModel):
 
     @property
     def condition(self) -> Near | Together | Count | Threshold | Hours:
-        """The only condition of the rule."""
+        """The condition of the rule; each rule has exactly one."""
         found = self.near or self.together or self.count or self.threshold or self.schedule
         assert found is not None  # noqa: S101 - validated above
         return found
@@ -126,7 +126,7 @@ class Rule(CamelModel):
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """The names of the entities that an event of the rule is about."""
+        """The template's names for the entities that an event of the rule is about."""
         if self.together is not None:
             return ("entity", "other")
         return () if self.count or self.schedule else ("entity",)
@@ -166,7 +166,7 @@ def read(text: str, file: str) -> RuleFile:
     """Return the rules in the text of a file.
 
     Raises:
-        InvalidInput: with every fault; each has its line.
+        InvalidInput: with every fault, each with its line.
     """
     with located_in(text):
         rules = parse_file(RuleFile, text, file)

@@ -1,8 +1,8 @@
 """The template of a rule's demand: plain data in whose texts ``{entity}`` stands for a value.
 
 Values are put in after parsing, so a value cannot change the structure of the demand. A text that
-is only a name in braces becomes the value itself: a number for ``{x}``. ``{{`` and ``}}`` stand
-for braces. A template has no expressions, attributes or formats.
+is only a name in braces becomes the value itself, for example a number for ``{x}``. ``{{`` and
+``}}`` stand for single braces. A template has no expressions, attributes or formats.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Values = Mapping[str, str | float]
 
 _TOKEN = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
 _ENTITY = r"[A-Za-z0-9_.-]+"
-"""What an entity may be called."""
+"""The pattern of an entity's name."""
 
 
 def is_entity(name: str) -> bool:
@@ -27,10 +27,10 @@ def is_entity(name: str) -> bool:
 
 
 def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
-    """Return a template with values for its names.
+    """Return a copy of a template in which values replace the names in braces.
 
     Raises:
-        KeyError: for a name that has no value; :func:`faults` finds it before.
+        KeyError: if a name has no value; :func:`faults` reports such names.
     """
     if isinstance(template, str):
         alone = _TOKEN.fullmatch(template)
@@ -45,7 +45,7 @@ def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
 
 
 def filled_text(template: str, values: Values) -> str:
-    """Return a text with values for its names."""
+    """Return a text in which values replace the names in braces."""
     return str(filled(template, values))
 
 
@@ -54,7 +54,10 @@ def _written(found: re.Match[str], values: Values) -> str:
 
 
 def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN401
-    """Yield the path and the text of each text and key in a template; ``field`` is its path."""
+    """Yield the path and the text of each text and each key in a template.
+
+    ``field`` is the path of the template itself.
+    """
     if isinstance(template, str):
         yield field, template
     elif isinstance(template, Mapping):
@@ -67,12 +70,12 @@ def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN4
 
 
 def names(text: str) -> set[str]:
-    """Return the names in a text."""
+    """Return the names in braces in a text."""
     return {found[1] for found in _TOKEN.finditer(text) if found[1] is not None}
 
 
 def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
-    """Return a fault for each brace that is alone, and for each name that is not ``known``."""
+    """Return a fault for each single brace, and for each name in braces that is not ``known``."""
     found = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):
@@ -86,7 +89,10 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return name → entity with which the template becomes ``text``; empty if none fits."""
+    """Return the entities with which the template becomes ``text``, by their names in the template.
+
+    The mapping is empty if no entities do that.
+    """
     seen: set[str] = set()
     pattern, end = "", 0
     for token in _TOKEN.finditer(template):

@@ -10,7 +10,10 @@ DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """A span of hours on some days of the week; past midnight if ``end`` is before ``start``."""
+    """A span of hours on certain days of the week.
+
+    If ``end`` is before ``start``, the span lasts past midnight. ``days`` are numbers; Monday is 0.
+    """
 
     days: frozenset[int]
     start: time
@@ -18,7 +21,7 @@ class Schedule:
     zone: tzinfo
 
     def is_on(self, now: float) -> bool:
-        """Return whether ``now``, in seconds since 1970 UTC, is in the hours."""
+        """Return whether ``now``, in seconds since 1970 UTC, is in the span of hours."""
         local = datetime.fromtimestamp(now, self.zone)
         clock, today = local.time(), local.weekday()
         if self.start < self.end:
@@ -29,9 +32,9 @@ class Schedule:
         )
 
     def next_check(self, now: float) -> float:
-        """Return a time before which nothing changes; it is later than ``now``.
+        """Return a time after ``now`` until which the result of :meth:`is_on` does not change.
 
-        It is at most an hour ahead, because summer time moves the hours.
+        It is at most an hour ahead, because a change to or from summer time moves the hours.
         """
         local = datetime.fromtimestamp(now, self.zone)
         ahead = [now + 3600.0]

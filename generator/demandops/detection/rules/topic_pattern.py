@@ -18,7 +18,10 @@ def topic_pattern_problem(pattern: str) -> str:
 
 
 def entity_in(pattern: str, topic: str) -> str | None:
-    """Return the entity in a topic, "" if the pattern has none, ``None`` if they do not match."""
+    """Return the entity in a topic that matches a pattern.
+
+    The result is ``None`` if the topic does not match, and "" if the pattern has no entity.
+    """
     before, found, after = pattern.partition(ENTITY)
     if not found:
         return "" if topic == pattern else None

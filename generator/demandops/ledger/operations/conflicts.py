@@ -15,7 +15,7 @@ from demandops.ledger.ledger import Ledger
 
 
 def conflicts(one: Demanded, ledger: Ledger) -> Iterator[Fault]:
-    """Yield why a demanded application or connection contradicts existing claims on it."""
+    """Yield the faults of a demanded application or connection that contradicts existing claims."""
     if isinstance(one.held, Application):
         yield from _of_application(one, one.held, ledger)
     else:

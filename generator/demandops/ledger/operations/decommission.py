@@ -1,8 +1,9 @@
 """Decommissioning: a node or a requester leaves for good; its claims are released or reduced.
 
-Decommissioning a node releases its applications, the inputs from it and the connections that end at
-it, whoever requested them. Decommissioning a requester releases all its claims, also those that it
-shares: it named the other requesters, who might never release them.
+If a node is decommissioned, its applications, the inputs from it and the connections that end at it
+are released for all requesters. If a requester is decommissioned, all its claims are released. This
+includes the claims that it shares with other requesters: its demands named these requesters, and
+they might never release the claims.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from demandops.subject import Subject, SubjectKind
 
 
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without the claims of a node or requester, and the changes.
+    """Return the ledger after a node or requester is decommissioned, and the changes.
 
     Waiting demands whose only requester is decommissioned stop waiting.
 

@@ -9,7 +9,9 @@ from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
-    """Return the ledger without the claims of a demand, waiting or not, and the changes.
+    """Return the ledger without the claims of a demand, and the changes.
+
+    If the demand waits for room, it stops waiting.
 
     Raises:
         Refused: if the demand holds nothing or belongs to other requesters.

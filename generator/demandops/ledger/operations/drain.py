@@ -16,8 +16,8 @@ from demandops.ledger.ledger import Ledger
 class Drain(DemandRequest):
     """The generator's request to move applications that it placed off the drained node ``id``.
 
-    ``moves`` are the changes of claims, ``moved`` says what is placed where, ``stays`` what is not
-    moved and why.
+    ``moves`` are the changes of claims. ``moved`` has a text about each application or service that
+    moves, and ``stays`` has one about each that cannot move.
     """
 
     moves: tuple[ClaimChange, ...] = ()

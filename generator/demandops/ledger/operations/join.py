@@ -33,8 +33,8 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     changes = claim_changes(start, ledger, keys)
     if not changes:
         return start, Changes()
-    # A join that only renews keeps the record of a shutdown. Without the record a repeated shutdown
-    # would count as a new one and end another demand.
+    # A join that only renews claims keeps the records of recent shutdowns. Without its record, a
+    # repeated shutdown would count as a new one and end another demand.
     adds = not all(change.only_renews for change in changes)
     shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
     return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)

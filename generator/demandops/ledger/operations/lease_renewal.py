@@ -15,7 +15,8 @@ from demandops.ledger.operations.ownership import is_waiting, owned_claims
 def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger with each lease of a demand renewed for its term, and the changes.
 
-    Claims without a lease stay as they are. A waiting demand has no lease yet, and keeps its place.
+    Claims without a lease stay as they are. Nothing changes for a waiting demand, because it has no
+    lease yet.
 
     Raises:
         Refused: if the demand holds nothing or belongs to other requesters.

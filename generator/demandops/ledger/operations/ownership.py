@@ -1,6 +1,7 @@
 """The owners of a demand that has an id: the requesters of its claims.
 
-A request that names no owner is refused, so two requesters may choose the same id without harm.
+A request is refused if it names none of the owners. So if a second requester chooses the same id by
+chance, its requests cannot change the demand of the first.
 """
 
 from __future__ import annotations

@@ -66,7 +66,10 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return the changed claims; a claim that differs only in its lease does not change."""
+    """Return the changes of claims that restore the earlier commit.
+
+    A claim that differs only in the term or the end of its lease stays as it is.
+    """
     restored = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
     back = [ClaimChange(ledger.get(key), claim) for key, claim in restored.items()]
@@ -108,10 +111,10 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
 
 
 def faults(request: Restoration, world: World) -> Iterator[Fault]:
-    """Yield why restored claims are not valid in the current configuration."""
+    """Yield the faults of restored claims that are not valid in the current configuration."""
     for change in _changes(world.ledger, request):
         after = change.after
-        if after is None or after.keeping_override is not None:  # overrides decide these
+        if after is None or after.keeping_override is not None:  # only demands' claims are checked
             continue
         booking = request_for(after)
         for found in (
@@ -122,7 +125,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
 
 
 def request_for(claim: Claim) -> Put:
-    """Return a request that books this claim; its faults name the claim's own fields."""
+    """Return a request that books this claim; faults of the request name fields of the claim."""
     return Put(
         id=claim.request,
         demanded=(Demanded(claim.held, claim.requesters, str),),

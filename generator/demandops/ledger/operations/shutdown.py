@@ -1,8 +1,9 @@
-"""A shutdown takes holds: one of each requester that it names, on each topic that it lists.
+"""A shutdown takes one hold from each requester that it names, on each topic that it lists.
 
-It takes a hold from the claim that the same request booked for the same requesters, else from the
-oldest claim in which the requester holds the topic; claims of the same request id come first. It
-never takes holds from claims that a demand with an id booked.
+If several claims hold the topic for the requester, the hold is taken from the first of them in this
+order: the claim with the same request id and the same requesters, then other claims with the same
+request id, then all other claims, the oldest first. A shutdown never takes holds from claims of a
+demand that has an id.
 """
 
 from __future__ import annotations
@@ -71,10 +72,11 @@ def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: s
 def _holds(
     one: Demanded, requester: str, claims: list[Claim]
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield for each listed topic its text, the claim to take holds from, and the keys to take.
+    """Yield (text, claim, keys) for each topic that a shutdown lists.
 
-    The keys are those of the claim's topics that the listed topic means. The claim is ``None`` if
-    the requester holds none of them. If no topic is listed, all holds in the first claim are taken.
+    The text describes the listed topic. The claim is the one from which holds are taken, and the
+    keys are those of its topics that the listed topic means. The claim is ``None`` if the requester
+    holds none of these topics. If no topic is listed, the keys are all those of the first claim.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]

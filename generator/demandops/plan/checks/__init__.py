@@ -1,1 +1,1 @@
-"""Checks of a booking by its plan: denials, quotas and topic clashes."""
+"""Checks of what a booking would deploy: denials, quotas, topic clashes and version differences."""

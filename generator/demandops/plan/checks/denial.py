@@ -1,7 +1,8 @@
-"""``deny``: a demand that an override denies is refused, with the reason and the owner.
+"""Denials: a demand that an override with ``deny`` selects is refused.
 
-A demand that only repeats existing claims renews them. Such a demand is always allowed, and gets a
-warning that the claims are suspended.
+The fault has the reason and the owner of the override. A demand that only repeats existing claims
+renews these claims. Such a demand is always allowed, but gets a warning that an override suspends
+the claims.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def _denied_field(override: Override, one: Demanded, services: list[Traits], con
 
 
 def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
-    """Return the most specific field that a selector matches."""
+    """Return the most specific field of ``one`` that a selector matches."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
@@ -90,7 +91,10 @@ def _message(override: Override) -> str:
 
 
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each claim of a demand that an override suspends."""
+    """Yield a warning for each suspended claim that concerns a demand.
+
+    These are the demand's own claims and claims of the same requesters on the listed subjects.
+    """
     if not any(override.deny for override in world.overrides):
         return
     claims = [

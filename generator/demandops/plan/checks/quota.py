@@ -14,7 +14,10 @@ from demandops.subject import Subject, SubjectKind
 
 
 def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
-    """Yield a fault for each quota that is exceeded and whose count ``changes`` raised."""
+    """Yield a fault for each quota that the booking exceeds.
+
+    A quota that was exceeded before is a fault only if the booking raises its count further.
+    """
     domain_of = after.config.domain_of
     booked = [change.after for change in changes.claims if change.after]
     holders = {(claim.held.home, who) for claim in booked for who in claim.requesters}
@@ -38,7 +41,7 @@ def _claims(requester: str, before: World, after: World, domain: AccessDomain) -
     most = domain.quotas.claims_per_requester
     if (
         most is None or after.ledger.count_of_requester(requester) <= most
-    ):  # this counts the claims in all domains
+    ):  # the ledger counts the claims in all domains, so at least as many as in this one
         return
     count = _held(requester, after, domain)
     if count > most and count > _held(requester, before, domain):

@@ -1,7 +1,7 @@
 """Topic clashes: a node would have two sources of one topic, so a demand is refused.
 
 Topics are named as the reference names them, so two ids may give one name: ``a/b`` and ``a-b``. A
-connection may also bring a topic to a node where a service publishes the same one.
+connection may also bring a topic to a node where a service publishes the same topic.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from demandops.subject import Subject, SubjectKind
 def faults(
     request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new service or route with a topic that its node has already.
+    """Yield a fault for each new service or route that is a second source of a topic on a node.
 
     Args:
         request: the demand; a request that adds no claims has no faults.
         before, after: the world before and after the demand.
-        keys: the releases that the demand may change.
+        keys: the keys of the releases that the demand may change.
     """
     if not request.adds_claims:
         return
@@ -58,7 +58,7 @@ def faults(
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
-    """Yield the faults of a claim that a person wrote or restores, located in its file."""
+    """Yield the topic clashes of a claim that a person wrote or restores, located in its file."""
     keys = keys_of_claims(after, [claim])
     for found in faults(request_for(claim), before, after, keys):
         yield found.within(path_of(claim.key))
@@ -83,7 +83,7 @@ def _of_service(
 def _clashes(
     world: World, key: ServiceKey, service: Service, topic: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield every other source of this topic on the node of ``key``, and the remedy, in words."""
+    """Yield (source, remedy), in words, for each other source of a topic on the node of ``key``."""
     for other in _publishers(world, key.node, topic, but=key):
         yield f"{_words(other)} publishes on", _remedy(key, other, service, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
@@ -95,8 +95,8 @@ def _of_connection(
 ) -> Iterator[Fault]:
     """Yield a fault for each new route to a topic that a service publishes on the same node.
 
-    Only a service that ran before the demand counts: if an application moves, a connection may
-    bring the application's output back to the old node.
+    Only a service that runs both before and after the demand counts. So if an application moves, a
+    connection may bring the application's output back to the old node.
     """
     for index, route in enumerate(connection.topics):
         _, node = route.sender_and_receiver(*connection.nodes)
@@ -117,7 +117,7 @@ def _of_connection(
 def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
     """Yield a fault for each output that the receiving node already gets from another source.
 
-    Inputs may come from several nodes: the demands say which sources they want.
+    A topic that the demand lists as an input is never a fault: the demand names its source.
     """
     apart = app.deliver or app.services or app.moved
     for flow in flows(after.config, app) if apart else ():
@@ -156,7 +156,7 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
 
 
 def _service(world: World, key: ServiceKey) -> Iterator[Service]:
-    """Yield the service of a key, if it must run."""
+    """Yield the service of ``key``, or nothing if no claim needs the instance."""
     for claim in claims_needing(world, key)[:1]:
         first = world.ledger.application(claim.subject.id) or claim.application
         yield world.config.services[first.appdef][key.service]
@@ -171,10 +171,10 @@ def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
 def _publishers(
     world: World, node: str, topic: str, *, but: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
-    """Yield the services on a node that publish ``topic``, except ``but``.
+    """Yield the keys of the service instances on a node that publish ``topic``, except ``but``.
 
-    The patterns of appdefs name the instances that would publish the topic. The ledger says which
-    of these instances run.
+    The output patterns of the appdefs give the instances that would publish the topic. Only those
+    that the ledger needs are yielded.
     """
     for services in world.config.services.values():
         for name, service in services.items():
@@ -195,7 +195,11 @@ def _publishers(
 def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys on a node for which ``{instance}`` of a service becomes ``instance``."""
+    """Yield the keys on a node for which a service's ``{instance}`` is replaced by ``instance``.
+
+    Some of these instances may not be needed. ``but`` is the instance whose clashes are looked for;
+    its own topic does not count as the usual topic of its source.
+    """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
         if naming.topic_part(node) == instance:
@@ -216,7 +220,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the instances of a service on a node."""
+    """Yield the keys that instances of a service on a node have; some may not be needed."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)
@@ -249,7 +253,7 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return the field of the request that needs the service."""
+    """Return the request's field because of which a service is needed, or an empty text."""
     for one in request.demanded:
         if not isinstance(one.held, Application):
             continue

@@ -1,7 +1,7 @@
 """Version differences: demands that share an application or a service ask for different versions.
 
-``versions`` of the application definition says what happens: the demand is refused, or the newest
-version runs, which may need a person's approval first.
+``versions`` of the application definition decides what happens. Either the demand is refused, or
+the newest version is deployed; in some cases a person must approve this version first.
 """
 
 from __future__ import annotations
@@ -31,12 +31,19 @@ from demandops.subject import Subject
 
 _STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
 _REFUSING = ("refuse", "separate")
-"""The policies that refuse a difference. A separate instance has none: it shares nothing."""
+"""The policies that refuse a difference.
+
+With ``separate`` each version is an application of its own, so only shared services can differ.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A demanded version of the shared ``what``, and the newest version that others ask for."""
+    """A difference between the versions of one application or service that demands share.
+
+    ``what`` is this application or service, in words. ``demanded`` is the version of the new
+    demand, ``others`` is the newest version that the other demands ask for.
+    """
 
     what: str
     appdef: str
@@ -44,14 +51,15 @@ class Difference:
     demanded: str
     others: str
     newer: bool
-    """Whether the demanded version is newer than that of the others."""
+    """Whether ``demanded`` is newer than ``others``."""
     fault: Fault
     """The fault to report if the policy refuses the difference."""
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether the difference concerns a demand that asks for ``asked``.
+        """Return whether the difference concerns a demand that asks for version ``asked``.
 
-        A demand that names no version accepts a newer version, unless the policy refuses it.
+        If ``asked`` is empty, the demand names no version. Such a demand accepts the newer version
+        of other demands, except if the policy refuses the difference.
         """
         return bool(asked) or self.newer or self.is_refused
 
@@ -73,7 +81,10 @@ class Difference:
         return f"application definition '{self.appdef}', for {change}"
 
     def warning(self) -> str:
-        """Return a warning that a newer version runs than the demanded one, or an empty text."""
+        """Return a warning that a newer version is deployed than the demanded one.
+
+        The result is an empty text if the demanded version is the newer one.
+        """
         others = f"{self.what} runs version {self.others}, which others ask for"
         return "" if self.newer else f"{others}, not {self.demanded}"
 
@@ -85,7 +96,7 @@ def differences(
     changes: Iterable[ClaimChange],
     plans: Mapping[ReleaseKey, Release | None],
 ) -> Iterator[Difference]:
-    """Yield the differences between the versions that a demand and others ask for.
+    """Yield the differences between the versions that a demand and other demands ask for.
 
     Args:
         request: the demand.
@@ -110,7 +121,10 @@ def differences(
 
 
 def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
-    """Yield the difference between a claim's version and the newest of the other claims, if any."""
+    """Yield the difference between a claim's version and the newest one of the other claims.
+
+    Yield nothing if the versions are the same.
+    """
     app, ledger = claim.application, after.ledger
     known = after.config.application_versions[app.appdef]
     if len({known[word].rank for word in ledger.versions_asked(app.id, known)}) < 2:
@@ -144,7 +158,10 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim on a version, and the version's name there."""
+    """Return the requesters of the first claim that asks for ``version``, and its word for it.
+
+    The word is the claim's version or channel; it is empty if the claim takes the default version.
+    """
     for claim in ledger.claims_on(subject):
         word = claim.application.version
         if same_version(known.get(word, known[""]), version):
@@ -163,9 +180,11 @@ def _of_service(
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield the differences between the demand's versions of a service and those of others.
+    """Yield the differences in version between the applications that share a service.
 
-    The others are applications that use the same release.
+    The version for each application of the demand is compared with the version for the other
+    applications of the release. ``mine`` maps the id of each application of the demand to the
+    listed application and the version that it asks for.
     """
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}

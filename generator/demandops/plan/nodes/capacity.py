@@ -1,8 +1,8 @@
 """Capacity: how much the running services request of each node, and how much the node has.
 
 Each replica of a service requests what the definition says, on the node where it runs. A shared
-service counts once. A change of :class:`Usage` looks only at the releases that a demand affects, so
-a demand costs what it changes. Communication clients request nothing.
+service counts once. To update :class:`Usage`, only the releases that a demand affects are planned
+again, so the cost of a demand depends on what it changes. Communication clients request nothing.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ Plans = Mapping[ReleaseKey, Release | None]
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """How much services request of each node and resource, in thousandths."""
+    """How much of each resource services request on each node, in thousandths of a unit."""
 
     amounts: HashTrieMap[Need, int] = field(default_factory=HashTrieMap)
 
     def of(self, node: str, resource: str) -> int:
-        """Return how much services request of a node's resource."""
+        """Return how much services request of a node's resource, in thousandths of a unit."""
         return self.amounts.get((node, resource)) or 0
 
     def plus(self, more: Mapping[Need, int]) -> Usage:
-        """Return the usage with these amounts added; negative ones are given back."""
+        """Return the usage with these amounts added; a negative amount lowers the usage."""
         amounts = self.amounts
         for need, amount in more.items():
             total = (amounts.get(need) or 0) + amount
@@ -61,16 +61,17 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return how much more is requested ``after``, for each node and resource that differs."""
+    """Return (node, resource) → how much more ``after`` requests, where the amounts differ."""
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return how much more is requested after claims changed.
+    """Return (node, resource) → how much more services request after claims changed.
 
-    A release that cannot be planned requests nothing.
+    A release that cannot be planned requests nothing. The result is empty if no node has a
+    capacity.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.
@@ -93,7 +94,10 @@ def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
 
 
 def _requests(plans: Plans, config: Config) -> Counter[Need]:
-    """Return what releases request of each node, added up over its access domains."""
+    """Return (node, resource) → how much releases request of it.
+
+    If a node is in several access domains, the amounts in all of them are added up.
+    """
     total: Counter[Need] = Counter()
     for release in plans.values():
         if isinstance(release, ServiceRelease) and release.service.requests:
@@ -104,14 +108,14 @@ def _requests(plans: Plans, config: Config) -> Counter[Need]:
 
 
 def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
-    """Yield each node that lacks room for the growth, and a sentence that says why.
+    """Yield (node, reason) for each resource of which a node has too little for the growth.
 
-    A node that is above its capacity, but whose requests do not grow, is left out.
+    A node whose requests do not grow is left out, even if it is above its capacity.
 
     Args:
         usage: what is requested before the growth.
-        grown: by how much the requests grow.
-        config: has the nodes.
+        grown: (node, resource) → by how much the requests grow.
+        config: the configuration, which has the capacities of the nodes.
     """
     for (id, resource), amount in sorted(grown.items()):
         known = config.nodes.get(id)
@@ -137,7 +141,7 @@ def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[
 class Room:
     """The room that nodes have left while applications are placed one by one.
 
-    The claims in ``given_back`` count as released from the start.
+    The claims in ``given_back`` count as released, so their room is free.
     """
 
     def __init__(self, world: World, usage: Usage, given_back: Iterable[Claim]) -> None:
@@ -148,7 +152,7 @@ class Room:
         self._change((one for one in given_back if one.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
-        """Book a claim on an application at its node, and count the application there."""
+        """Book a claim on an application at its node, and count the application in ``soon``."""
         self.soon[claim.application.node] += 1
         self.book([claim])
 
@@ -157,9 +161,9 @@ class Room:
         self._change(claims)
 
     def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
-        """Return which resources a node lacks for an application with these claims, in words.
+        """Return, in words, each resource that a node lacks for an application with these claims.
 
-        If ``service`` names one, only that service is placed there.
+        If ``service`` is not empty, only the service of this name is placed on the node.
         """
         known = self._world.config.nodes.get(node)
         if known is None or known.capacity is None:
@@ -174,7 +178,7 @@ class Room:
         return [excess for id, excess in found if id == host]
 
     def is_full(self, node: Node, least: Mapping[str, int]) -> bool:
-        """Return whether a node has too little for what :meth:`least` returns."""
+        """Return whether a node has too little room for ``least``, a result of :meth:`least`."""
         host = self._world.config.host_of(node.id)
         return any(
             most is not None and self._usage.of(host, resource) + amount > most
@@ -183,10 +187,11 @@ class Room:
         )
 
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
-        """Return what an application's own services request, which is the same on each node.
+        """Return resource → how much an application's own services request, on any node.
 
-        A caller compares it with a node's room before it plans all services there. It is empty if
-        there are overrides whose effects may differ by node.
+        With these amounts a caller can rule out a full node before it plans all services there. If
+        ``service`` is not empty, only the service of this name counts. The result is empty if
+        there are overrides because of which the amounts may differ from node to node.
         """
         subject, world = claims[0].subject, self._world
         if any(one.node or one.deny or one.replicas is not None for one in world.overrides):
@@ -226,16 +231,19 @@ class Room:
     def _after(
         self, claims: Iterable[Claim], *, give_back: bool = False
     ) -> tuple[World, Mapping[Need, int]]:
-        """Return the world with these claims (or without them), and the growth of requests."""
+        """Return the world with these claims booked, and how much more services then request.
+
+        With ``give_back``, the claims are released instead.
+        """
         after, changes = self._booked(claims, give_back=give_back)
         try:
             return after, growth_by(self._world, after, changes)
-        except Refused:  # admission reports why it cannot run
+        except Refused:  # admission reports why the application cannot run
             return after, {}
 
 
 def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
-    """Yield each node on which services request more than it has, and the amounts in words."""
+    """Yield (node, amounts in words) for each resource that services request beyond capacity."""
     for (id, resource), used in sorted(usage.amounts.items()):
         node = world.config.nodes.get(id)
         most = node.most(resource) if node else None

@@ -1,7 +1,7 @@
 """The choice of one node: for an application, or for one of its services.
 
-A placed service gets a node of its own: the application's node if that fits, else the first other
-node that fits.
+A service whose definition has ``place`` gets a node of its own: the application's node if that
+fits, else the first other node that fits.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
 MOST_TRIED = 20
-"""On how many nodes a demand is tried; each costs as much as a booking."""
+"""The highest number of nodes on which a booking is tried, because each trial takes time."""
 NO_ROOM = "no-room"
 """The code of a fault: there are suitable nodes for an application, but none has room."""
 
@@ -42,11 +42,11 @@ class Chosen:
 
 
 Positions = Mapping[str, Position]
-"""The positions of nodes that have none in the inventory."""
+"""Node → position, for nodes whose inventory entry has no position."""
 
 
 def requirement_of(service: Service) -> Requirement:
-    """Return what the definition of a placed service requires of the node."""
+    """Return what the definition of a placed service requires of the service's node."""
     place = service.place or Place()
     return Requirement(
         place.role,
@@ -66,14 +66,15 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
 
 
 def with_overridden_nodes(app: Application, world: World) -> Application:
-    """Return an application with its services moved as overrides say."""
+    """Return an application with its services moved to the nodes that overrides name."""
     return replace(app, moved=MappingProxyType(moved_by_overrides(app, world)))
 
 
 def shares(service: Service, one: Application, other: Application) -> bool:
-    """Return whether two applications share the instances of a service for each topic.
+    """Return whether two applications share the instances of a service that runs for each topic.
 
-    They do so at one node, in one version. What they read must come to that node in one way.
+    They do if they have the same appdef, node and separate version. The generator then tries to
+    place the service on one node for both applications.
     """
     of = ((app.appdef, app.node, app.own_version) for app in (one, other))
     return service.scope == "topic" and len({*of}) == 1
@@ -83,7 +84,8 @@ def shares(service: Service, one: Application, other: Application) -> bool:
 class Choice:
     """The choice of the node of one application, or of one of its services.
 
-    ``claims`` are the claims to book for the application; their node does not matter.
+    ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims to
+    book for the application; their node does not matter.
     """
 
     one: Demanded
@@ -93,7 +95,10 @@ class Choice:
     claims: tuple[Claim, ...]
     service: Service | None = None
     suits: Callable[[Application], bool] | None = None
-    """Whether the demand can be booked with the application on these nodes; by default, it can."""
+    """A function that returns whether the demand can be booked with the given application.
+
+    ``None`` means that a node is chosen without this check.
+    """
 
     @property
     def config(self) -> Config:
@@ -107,7 +112,7 @@ class Choice:
         return self.one.held
 
     def fits(self, node: str) -> bool:
-        """Return whether a node has what is required, and new services may be placed there."""
+        """Return whether a node meets the requirement and may get new services of this demand."""
         known = self.config.nodes.get(node)
         if known is None or any(lacks(known, self.requirement)):
             return False
@@ -144,14 +149,14 @@ class Choice:
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
 
     def chosen(self, node: str, why: str) -> Chosen | None:
-        """Return a node as the choice, if it fits and has room."""
+        """Return ``node`` as the chosen node, or ``None`` if it does not fit or has no room."""
         known = self.config.nodes.get(node)
         if known is None or not self.fits(node) or self._shortage(known):
             return None
         return Chosen(node, why)
 
     def nodes(self) -> list[str]:
-        """Return the nodes that fit and that the requesters may use, whatever room they have."""
+        """Return the nodes that fit and that the requesters may use, even if they are full."""
         return [node.id for node in self._fitting() if self._is_permitted(node)]
 
     def _fitting(self) -> list[Node]:
@@ -165,7 +170,7 @@ class Choice:
         ]
 
     def _shortage(self, node: Node) -> list[str]:
-        """Return which resources a node lacks for the application, in words."""
+        """Return, in words, each resource that a node lacks; empty if the node has room."""
         if node.capacity is None:
             return []
         return self.room.lacks(self._claims_on(node), node.id, self._name)
@@ -190,13 +195,17 @@ class Choice:
         return f"with the {'most' if choose == 'pack' else 'fewest'} applications"
 
     def _is_home(self, node: Node) -> bool:
-        """Return whether the choice is for a service, and the node is the application's."""
+        """Return whether a node for a service is sought, and ``node`` is the application's."""
         return self.service is not None and node.id == self.app.node
 
     def _rank(
         self, node: Node, centre: Position | None, positions: Positions
     ) -> tuple[bool, float, float, str]:
-        """Return a node's sort key: its distance and number of applications, then its id."""
+        """Return a node's sort key; the lowest key is that of the best node.
+
+        ``placement`` of the settings decides whether the distance or the number of applications
+        counts first.
+        """
         distance = self._distance(node, centre, positions)
         booked = self.world.ledger.applications_on.get(node.id) or 0
         booked += self.room.soon[node.id]
@@ -239,7 +248,10 @@ class Choice:
         return permission.may_place(self.one, self.app.appdef, node.id, self.config)
 
     def none_fits(self, positions: Positions) -> Fault:
-        """Return the fault for an application that gets no node; it lists the nearest misses."""
+        """Return the fault for an application that gets no node.
+
+        The fault lists some nodes, those that lack the least first, and what each node lacks.
+        """
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
         centre, code = self._centre(positions), "no-node"
@@ -272,7 +284,11 @@ class Choice:
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
-    """Yield each role and property that no node has, or that is compared with a wrong value."""
+    """Yield a message for each part of a requirement that is wrong for the whole inventory.
+
+    This is a role or property that no node has, or a property compared with a value of a wrong
+    type.
+    """
     role, roles = requirement.role, config.nodes_by_role.keys() - {""}
     if role and role not in roles:
         yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
@@ -289,7 +305,7 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
 
 
 def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
-    """Yield each part of a requirement that a node does not meet."""
+    """Yield, in words, each part of a requirement that a node does not meet."""
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
     labels = node.labels() if requirement.labels else {}
@@ -308,6 +324,6 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
 
 
 def joined(reasons: list[str]) -> str:
-    """Return reasons as one text."""
+    """Return the reasons as one text: ``a, b and c``."""
     *first, last = reasons
     return f"{', '.join(first)} and {last}" if first else last

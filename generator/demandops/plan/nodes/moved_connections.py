@@ -1,8 +1,8 @@
 """Moved connections: when an application moves, its demands' connections follow it.
 
 The connections then carry the same topics to or from the new node, with the same type and options.
-A topic without a connection still has none. The reference's requests list their connections
-themselves, so a move does not change those.
+If a demand holds no connection for what the application reads or delivers, the move adds none. A
+goal of the reference's action lists its connections itself, so a move does not change them.
 """
 
 from __future__ import annotations
@@ -24,13 +24,16 @@ from demandops.plan.implied_connections import carrying
 from demandops.subject import Subject, SubjectKind
 
 Move = Callable[[Application], Application]
-"""Returns an application with other nodes."""
+"""A function that returns an application on its new nodes."""
 
 
 def with_moved(
     world: World, claims: Iterable[Claim], move: Move
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with an application and its connections moved, and the changed claims."""
+    """Return the world with the claimed applications moved, and the changes of claims.
+
+    The connections of the claims' demands follow their applications.
+    """
     ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
@@ -43,7 +46,10 @@ def with_moved(
 
 
 def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which a demand's connections follow a move, and the changed keys."""
+    """Return the ledger in which a demand's connections follow a move of its application.
+
+    The second value has the keys of the changed claims.
+    """
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application
     old, new = (flows(config, each) for each in (app, move(app)))
@@ -81,7 +87,10 @@ def _flows_of_others(world: World, claim: Claim) -> Iterator[Flow]:
 
 
 def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
-    """Yield the flows of inputs that a demand's connections rename, each with its route."""
+    """Yield (flow, route) for each input whose topic a demand's connection renames.
+
+    The flow is that of the input, and the route is the one that renames the topic.
+    """
     for flow in flows(world.config, claim.application):
         for _, route in _carrying(world.ledger, claim.demand, flow):
             if flow.delivery is None and route.read_topic != route.written_topic:
@@ -89,7 +98,7 @@ def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
 
 
 def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    """Yield a demand's claims on connections that bring a flow, each with its route."""
+    """Yield (claim, route) for each of a demand's connections that carries a flow."""
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
         for route in claim.connection.topics if claim else ():
@@ -102,7 +111,8 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 def _carried_by(flow: Flow, known: Connection | None, claim: Claim, world: World) -> Claim:
     """Return a demand's claim on the connection that carries a flow from now on.
 
-    The claim has the type and options of ``known``, which carried the topic before.
+    ``known`` is the connection that carried the topic before, or ``None``. The claim has the type
+    and options of this connection.
     """
     route = known.topics[0] if known else None
     flow = replace(flow, topic=route.read_topic) if route else flow

@@ -1,7 +1,8 @@
 """Placement: nodes for a demand's applications and services that the demand does not place.
 
-The configuration and the claims at a commit alone decide the nodes, before the booking. The
-claim holds the nodes as if the demand had named them, so no later stage knows the difference.
+The nodes are chosen before the booking, from nothing but the configuration and the claims at one
+commit. A claim has chosen nodes in the same fields as named nodes, so later stages treat both
+alike.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ _LAST = datetime.max.replace(tzinfo=timezone.utc)
 
 
 Trial = Callable[[DemandRequest], bool]
-"""Returns whether a request can be booked; what is not placed yet is left out of it."""
+"""A function that returns whether a request can be booked.
+
+The request has no applications that are still without a node.
+"""
 
 
 def with_chosen_nodes(
@@ -45,15 +49,16 @@ def with_chosen_nodes(
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
-    What is booked stays where it is, if the node has what is required. Otherwise it gets the
-    first of the nodes that fit and have room, in the order of ``placement`` in the settings. Last,
-    overrides move services.
+    A booked application or service stays on its node if the node has what is required. Any other
+    gets the first node that fits and has room; ``placement`` in the settings decides the order of
+    the nodes. Finally, services move to the nodes that overrides name.
 
     Args:
         request: the request.
         world: the claims and the configuration before it.
         usage: how much services request of the nodes in ``world``.
-        trial: if given, nodes with which the request cannot be booked are passed over.
+        trial: if given, a node is skipped if ``trial`` returns ``False`` for the request with this
+            node.
 
     Returns:
         The request, and a fault for each application that gets no node.
@@ -73,7 +78,11 @@ def with_chosen_nodes(
 
 
 def is_placed(request: DemandRequest, world: World) -> bool:
-    """Return whether a request leaves a node to the generator, or has services on other nodes."""
+    """Return whether nodes must be worked out for a request.
+
+    This is so if the request leaves a node to the generator, or if a service of one of its
+    applications has a node of its own in the request or in the ledger.
+    """
     apps = (one.held for one in request.demanded if isinstance(one.held, Application))
     return any(
         app.place
@@ -91,9 +100,10 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
 
 
 def _overridden(app: Application, world: World) -> Application:
-    """Return an application with its services moved as overrides say.
+    """Return an application with its services moved to the nodes that overrides name.
 
-    A booked service stays where it is: only a changed override or definition moves it.
+    If the application is booked on the same nodes already, its moved services stay as booked: only
+    a change of an override or a definition moves them again.
     """
     booked = world.ledger.application(app.id)
     if booked is not None and replace(app, moved=booked.moved).decided_like(booked):
@@ -104,7 +114,10 @@ def _overridden(app: Application, world: World) -> Application:
 def _placed(
     request: AnyRequest, world: World, usage: Usage, trial: Trial | None
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with nodes, first of the applications, then of their services."""
+    """Return the request with its nodes chosen, and the faults.
+
+    The applications get their nodes first, then the services do.
+    """
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
     room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept])
@@ -138,14 +151,17 @@ def _placed(
 def _so_far(
     request: DemandRequest, demanded: list[Demanded], index: int, app: Application
 ) -> DemandRequest:
-    """Return what is placed of a request, with the application at ``index`` on these nodes."""
+    """Return a request without the applications that have no node yet.
+
+    ``app`` replaces the application at ``index``; the connections stay in the request.
+    """
     listed = [*demanded[:index], replace(demanded[index], held=app), *demanded[index + 1 :]]
     placed = (one for one in listed if not isinstance(one.held, Application) or one.held.node)
     return replace(request, demanded=tuple(placed))
 
 
 def _without_services(one: Demanded, world: World) -> Demanded:
-    """Return an application without the nodes that are to be chosen for its services."""
+    """Return an application that has nodes only for the services whose node the demand names."""
     if not isinstance(one.held, Application):
         return one
     services = {service.name: "" for service in _services_to_place(one.held, world)}
@@ -177,7 +193,7 @@ def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
 
 
 def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Choice]:
-    """Yield the choices of a node for an application and its services, as if all were free."""
+    """Yield the choices of nodes for an application and its services, as if no node were in use."""
     if not isinstance(one.held, Application):
         return
     free, claims = Room(world, Usage(), ()), (_claim(request, one),)
@@ -188,13 +204,13 @@ def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Ch
 
 
 def _claim(request: DemandRequest, one: Demanded) -> Claim:
-    """Return a claim on an application, dated after all others."""
+    """Return a claim on a demanded application; its booking time is later than all others."""
     demand = request.demand or demand_id(request.id, one.requesters)
     return Claim(one.held.booked(), demand, request.id, one.requesters, _LAST)
 
 
 def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demanded | Fault:
-    """Return a demanded application with its node, or why it gets none."""
+    """Return a demanded application with its node, or the fault if it gets no node."""
     app = choice.app
     if app.node:
         return _named(choice) or replace(one, held=replace(app, place=None))
@@ -209,9 +225,10 @@ def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demande
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
-    """Return the node of an instance that another application here shares for the same topic.
+    """Return the node of a service instance that runs for another application and can be shared.
 
-    Return an empty text if there is none. A second instance would bring its outputs here twice.
+    Return an empty text if there is no such instance. A second instance on another node would bring
+    the same outputs to the application's node once more.
     """
     role = service.root or ""
     for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
@@ -238,7 +255,7 @@ def _named_services(one: Demanded, app: Application, world: World) -> Iterator[F
 
 
 def _contradictions(one: Demanded, app: Application, claim: Claim) -> Iterator[Fault]:
-    """Yield a fault for each service that runs on another node than the one that is named."""
+    """Yield a fault for each service that is booked on another node than the demand names."""
     for name in app.named:
         current = claim.application.chosen_node(name)
         if current != app.services[name]:
@@ -257,7 +274,8 @@ def _positions(request: DemandRequest) -> Positions:
 def _named(choice: Choice) -> Fault | None:
     """Return the fault if the demand names a node that lacks what the demand requires."""
     node = choice.config.nodes.get(choice.app.node)
-    lacking = list(lacks(node, choice.requirement)) if node else []  # admission reports no node
+    # admission reports an unknown node
+    lacking = list(lacks(node, choice.requirement)) if node else []
     if not lacking:
         return None
     message = (
@@ -268,7 +286,11 @@ def _named(choice: Choice) -> Fault | None:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node of the booked application or service; ``None`` to choose another node."""
+    """Return the node on which an application is booked already.
+
+    Return ``None`` if the generator may choose another node. Return a fault if another demand
+    holds the application on a node that lacks what is required.
+    """
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None
@@ -289,7 +311,7 @@ def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
 
 
 def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
-    """Return a claim of another demand; a claim that an override keeps is of no demand."""
+    """Return the first claim of another demand, or ``None``; kept claims belong to no demand."""
     return next((c for c in claims if c.demand != demand and not c.keeping_override), None)
 
 
@@ -302,7 +324,8 @@ def _with_services(
 ) -> tuple[Demanded, list[Fault]]:
     """Return a demanded application with its services on nodes of their own, and the faults.
 
-    If other demands hold the application too, or a join adds to it, its services stay.
+    If other demands hold the application too, or if the request is a join, the services stay on
+    the nodes on which they are booked.
     """
     app = one.held
     assert isinstance(app, Application)  # noqa: S101 - the caller knows

@@ -1,8 +1,9 @@
-"""Relocation: other nodes for what was placed on a drained node, or is moved by an override.
+"""Relocation: applications and services leave a drained node; overrides move services.
 
-Only what the generator placed leaves a drained node: a demand that names the node keeps it. The
-claims and definitions say what is required of the node, so the demands are not needed. The
-connections follow (:mod:`demandops.plan.nodes.moved_connections`).
+An application leaves a drained node only if the generator placed it there. If a demand names the
+node, the application stays. Claims and definitions contain what is required of a node, so the
+original demands are not needed. The connections follow
+(:mod:`demandops.plan.nodes.moved_connections`).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
     """Return the request with the moves of all applications and services that can leave the node.
 
     Args:
-        request: names the node.
+        request: the drain; its ``id`` is the node.
         world: the claims and the configuration.
         usage: how much services request of the nodes in ``world``.
     """
@@ -79,7 +80,10 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the services of an application placed on a node; ``None`` is the application."""
+    """Return what of an application is placed on a node.
+
+    ``None`` stands for the application itself; the services are those with a node of their own.
+    """
     app = world.ledger.application(id)
     if app is None:
         return []
@@ -91,7 +95,11 @@ def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
 
 
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
-    """Return the applications whose service on a node must move together: they share instances."""
+    """Return the ids of the applications that must move together with ``id``, including ``id``.
+
+    These are the applications that share the instances of ``service`` on the node. If nothing is
+    shared, the result has only ``id``.
+    """
     app = world.ledger.application(id)
     if service is None or service.scope != "topic" or app is None:
         return [id]
@@ -127,9 +135,10 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 def _moved(
     world: World, claims: tuple[Claim, ...], room: Room, service: Service | None
 ) -> _Moved | str:
-    """Return the world with an application or service on the best other node, or why it stays.
+    """Move an application, or only ``service``, to the best other node.
 
-    Return the chosen node and the keys of the changed claims too.
+    Return the world afterwards, the chosen node and the keys of the changed claims. If no move is
+    possible, return the reason as text.
     """
     required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
     required = requirement_of(service) if service else required
@@ -159,23 +168,25 @@ def _moved(
 
 @dataclass(frozen=True, slots=True)
 class Followed:
-    """The ledger in which services are where overrides want them.
+    """The ledger in which services are on the nodes that overrides name.
 
-    ``keys`` are the claims that may have changed, ``stays`` says what cannot be moved and why.
+    ``keys`` are the keys of the claims that may have changed.
     """
 
     ledger: Ledger
     keys: tuple[ClaimKey, ...]
     stays: tuple[tuple[str, str], ...]
-    """The file of an override, and which application stays as it is, and why."""
+    """(file of an override, message) for each service that cannot be moved as the override asks."""
 
 
 def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> Followed:
-    """Return the ledger with services moved as overrides say, and their connections with them.
+    """Return the ledger with services moved to the nodes that overrides name.
+
+    The connections follow the services.
 
     Args:
         world: the claims and the configuration.
-        subjects: those whose claims changed; without them, all applications.
+        subjects: the subjects whose claims changed; ``None`` means all applications.
     """
     ids = [one.id for one in subjects or () if one.kind is SubjectKind.APPLICATION]
     if subjects is None:
@@ -190,7 +201,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
         if app is not None and change(app) != app
     ]
     together, left = wanted, list[str]()
-    while together:  # what shares a service must move at once
+    while together:  # applications that share a service must move at the same time
         after, changes = _all_moved(world, together, change)
         wrong = [id for id, of in changes.items() if next(_faults(world, after, of), None)]
         if not wrong:
@@ -209,7 +220,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a rollback with the services of its claims moved as overrides now say."""
+    """Return a rollback whose claims have their services on the nodes that overrides now name."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims
@@ -224,7 +235,7 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
 def _all_moved(
     world: World, applications: Iterable[str], move: Move
 ) -> tuple[World, dict[str, tuple[ClaimChange, ...]]]:
-    """Return the world with these applications moved, and what changes for each."""
+    """Return the world with these applications moved, and application → changes of claims."""
     changes: dict[str, tuple[ClaimChange, ...]] = {}
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
@@ -232,7 +243,7 @@ def _all_moved(
 
 
 def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
-    """Yield the file of each override that fails to move a service of an application, and why."""
+    """Yield (file, message) for each override that cannot move a service of an application."""
     app = world.ledger.application(id)
     assert app is not None  # noqa: S101 - it is claimed
     wanted = with_overridden_nodes(app, world).moved
@@ -269,9 +280,10 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
 
 
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
-    """Yield a fault for each output that comes to a node by this connection and from another node.
+    """Yield a fault for each output that the claimed connection brings to a node a second time.
 
-    Inputs may come from several nodes: the demands say which sources they want.
+    The first time, another connection brings the output from another node. A topic that a demand
+    lists as an input is never a fault: the demand names its source.
     """
     if claim.is_on_application:
         return
@@ -291,7 +303,7 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
 
 
 def _senders(ledger: Ledger, receiver: str, topic: str) -> set[str]:
-    """Return the nodes from which connections bring a topic to a node."""
+    """Return the nodes from which connections bring ``topic`` to the node ``receiver``."""
     connections = map(ledger.connection, ledger.connections_bringing(receiver, topic))
     routes = ((one, route) for one in connections if one for route in one.topics)
     ends = ((*route.sender_and_receiver(*one.nodes), route.written_topic) for one, route in routes)

@@ -1,11 +1,11 @@
 """The effects of overrides on claims: ``deny`` suspends claims, ``keep`` books further claims.
 
-A suspended claim stays booked but is not planned. The planner reads a view of the ledger that
-checks each claim on reading. So there is no second ledger to keep up to date.
+A suspended claim stays booked but is not planned. The planner reads a view of the ledger. The view
+checks each claim when it is read, so there is no second ledger to keep up to date.
 
 When the last claim on a subject is released, ``keep`` books a claim with the same content for the
-override's owner. A later demand for the subject replaces it. Bookkeeping and history show a kept
-claim like any other claim.
+override's owner. A later demand for the subject replaces this kept claim. Bookkeeping and history
+show a kept claim like any other claim.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ from demandops.subject import Subject, SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """The values that a selector is compared with; only a service's release has a ``service``.
+    """The values that a selector is compared with.
 
-    If ``requesters`` is ``None``, the selector's requesters are not compared.
+    ``service`` is set only for a service's release. If ``requesters`` is ``None``, the selector's
+    requesters are not compared.
     """
 
     nodes: tuple[str, ...]
@@ -42,7 +43,7 @@ class Traits:
 
 
 def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
-    """Return the services of an application that overrides move, each with its node."""
+    """Return service → new node for each service of an application that an override moves."""
     moving = [one for one in world.overrides if one.node]
     found: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
@@ -63,7 +64,7 @@ def traits_of(one: Claim | Demanded) -> Traits:
 
 
 def fits(selector: Selector, traits: Traits, config: Config) -> bool:
-    """Return whether every field of a selector matches."""
+    """Return whether a selector matches: each of its fields must match ``traits``."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
@@ -110,12 +111,15 @@ class UnsuspendedClaims(Ledger):
         return next(iter(self.claims_on(subject)), None)
 
     def get(self, key: ClaimKey) -> Claim | None:
-        """Return one claim, or ``None`` if it is suspended."""
+        """Return the claim at ``key``, or ``None`` if it is suspended or does not exist."""
         claim = Ledger.get(self, key)
         return claim if claim and self._is_active(claim) else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        """Return the ``known`` versions that claims ask for, without suspended claims."""
+        """Return the ``known`` versions that unsuspended claims on an application ask for.
+
+        An empty text in the result stands for the default version.
+        """
         booked = Ledger.versions_asked(self, application, known)
         asked = {
             word
@@ -153,14 +157,15 @@ def without_suspended(world: World) -> World:
 
 
 def suspended_by(claim: Claim, world: World) -> Override | None:
-    """Return the highest override that suspends a claim, or ``None``."""
+    """Return the override that suspends a claim, or ``None``; of several, the highest in rank."""
     return denied_by(traits_of(claim), world) if world.overrides else None
 
 
 def denied_by(traits: Traits, world: World) -> Override | None:
-    """Return the highest override that denies something with these traits, or ``None``.
+    """Return the override that denies a claim, demand or release with these traits, or ``None``.
 
-    A selector that names services denies the releases of these services, never a claim or demand.
+    If several do, return the one with the highest rank. A selector that names services denies the
+    releases of these services, never a claim or demand.
     """
     for override in reversed(world.overrides):
         if override.deny and any(
@@ -172,7 +177,7 @@ def denied_by(traits: Traits, world: World) -> Override | None:
 
 
 def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
-    """Yield every suspended claim and the override that suspends it, sorted by subject."""
+    """Yield (claim, suspending override) for each suspended claim, sorted by subject."""
     if not any(one.deny for one in world.overrides):
         return
     for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
@@ -191,7 +196,10 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 def with_kept_claims(
     before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
-    """Return the booking with updated kept claims on ``subjects`` and on those that it changed."""
+    """Return the ledger and the changes of a booking, with the kept claims updated.
+
+    This concerns kept claims on ``subjects`` and on the subjects that the booking changed.
+    """
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, more = update_kept_claims(before, after, touched, now)
@@ -201,9 +209,9 @@ def with_kept_claims(
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger with exactly the kept claims on ``subjects`` that overrides ask for.
+    """Return the ledger whose kept claims on ``subjects`` are exactly those that overrides want.
 
-    Return also the keys of the kept claims before and after.
+    The second value has the keys of all kept claims on ``subjects``, before and after the update.
 
     Args:
         before: the ledger before a change.
@@ -233,7 +241,14 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _needed(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the kept claim for a subject that no demand holds, or ``None`` if nothing keeps it."""
+    """Return the kept claim for a subject that no demand holds, or ``None`` if nothing keeps it.
+
+    Args:
+        existing: the kept claims on the subject.
+        before: all claims on the subject before the change.
+        world: the world after the change.
+        now: the booking time of a new kept claim.
+    """
     for claim in existing:
         if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
             return claim
@@ -258,10 +273,10 @@ def _needed(
 
 
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
-    """Return the overrides that keep the subject of a claim, the highest first.
+    """Return the overrides that keep the subject of a claim, the highest in rank first.
 
-    A kept claim names the owner as its requester, so ``requesters`` of the selector is ignored: it
-    was matched against the original claim.
+    For a kept claim, ``requesters`` of a selector is not compared: the claim names the override's
+    owner as its requester, and the original claim with the original requesters matched already.
     """
     traits = traits_of(claim)
     if claim.keeping_override is not None:

@@ -33,7 +33,7 @@ def apply_overrides(release: Release, world: World) -> Release | None:
     by = []
     for override in world.overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
-        if override.node != release.node.id:  # the node was chosen when the claims were booked
+        if override.node != release.node.id:  # only a booking moves a release to another node
             effects = tuple(one for one in effects if one != "node")
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
@@ -52,7 +52,10 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release changed by the effects of overrides; the last override wins."""
+    """Return a release changed by the effects of overrides; the last override wins.
+
+    ``by`` has pairs of an override and the names of its effects on this release.
+    """
     by = tuple(by)
     if not by:
         return release
@@ -73,7 +76,7 @@ def apply_effects(
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return the effects that an override has on a release that it selects."""
+    """Return the names of the effects that an override has on a release that it selects."""
     possible = {"hold"}
     if isinstance(release, ServiceRelease):
         known = config.charts[release.service.chart].versions()
@@ -89,7 +92,7 @@ def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
     nodes: tuple[str, ...] = (release.node.id,)
     if isinstance(release, ServiceRelease):
         appdefs = {claim.application.appdef for claim in claims}
-        if release.service.is_movable:  # where it runs without overrides
+        if release.service.is_movable:  # a selector is compared with the node before any move
             chosen = {one.application.chosen_node(release.key.service) for one in claims}
             nodes = tuple(sorted(chosen)) or nodes
         return Traits(

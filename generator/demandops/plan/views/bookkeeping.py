@@ -23,15 +23,16 @@ from demandops.subject import Subject, SubjectKind
 
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
 _Requesters: TypeAlias = dict[str, list[str]]
-"""Topic → who requests it, sorted."""
+"""Topic → the requesters of the topic, sorted."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
     """One service, its requesters and those of its inputs (role → topic → requesters).
 
-    ``version`` is its chart's, ``application_version`` that of ``registry/versions.yaml``.
-    ``versions_asked`` has the requesters of each version that claims name.
+    ``version`` is the version of the service's chart. ``application_version`` is the version of
+    the application in ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version
+    that claims name to the requesters of these claims.
     """
 
     applications: list[str]
@@ -49,7 +50,7 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """One connection, its requesters and those of each source topic that it carries."""
+    """One connection and its requesters; ``topics`` has the requesters of each source topic."""
 
     type: str
     source: str
@@ -102,8 +103,8 @@ class Bookkeeping:
     """The whole view: services by release name, connections and demands by id, all sorted.
 
     ``suspended`` are the claims that an override suspends; they are in no service or connection.
-    ``nodes`` are those that declare a capacity, each with its resources. ``waiting`` are
-    the demands that wait for room, in the order in which they get it.
+    ``nodes`` are the nodes that declare a capacity, each with its resources. ``waiting`` are the
+    demands that wait for room, in the order in which the generator tries to book them.
     """
 
     services: dict[str, ServiceEntry]
@@ -176,7 +177,7 @@ def _time(moment: datetime) -> str:
 
 
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
-    """Return what is requested of the nodes that declare a capacity, sorted."""
+    """Return node → resource → amounts for the nodes that declare a capacity, sorted by node."""
     usage = whole_usage(world)
     found: dict[str, dict[str, ResourceEntry]] = {}
     machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
@@ -193,7 +194,10 @@ def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
 
 
 def _demands(world: World) -> dict[str, DemandEntry]:
-    """Return the demands that hold claims; claims that overrides keep belong to no demand."""
+    """Return demand id → entry for each demand that holds claims.
+
+    Claims that overrides keep belong to no demand.
+    """
     found: dict[str, list[Claim]] = {}
     for kind in SubjectKind:
         for id in world.ledger.subjects(kind):
@@ -222,7 +226,7 @@ def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _
     found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
     for claim in claims_of(release, active.ledger):
         for role, topic, key in demanded_inputs(active, release, claim.application):
-            if topic in found[role]:  # a person may have written a claim with another name
+            if topic in found[role]:  # in a claim that a person wrote, the topic may differ
                 found[role][topic].update(claim.holders(key))
     return {role: _sorted(topics) for role, topics in found.items()}
 
@@ -232,7 +236,7 @@ def _sorted(topics: dict[str, set[str]]) -> _Requesters:
 
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
-    """Return the bookkeeping as plain data, the contract of ``bookkeeping --output json``.
+    """Return the bookkeeping as plain data, as ``bookkeeping --output json`` prints it.
 
     ``demands``, ``suspended``, ``nodes`` and ``waiting`` are left out if they are empty.
     """
@@ -244,8 +248,8 @@ def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
 class EntryChange:
     """One service or connection that was added, changed or removed.
 
-    ``requesters`` are the current ones, or the last ones if it was removed. ``lost`` and ``gained``
-    list what changed.
+    ``requesters`` are the requesters after the change, or those before it if the entry was removed.
+    ``lost`` has the facts that a changed entry no longer has, ``gained`` its new facts.
     """
 
     kind: Literal["service", "connection"]
@@ -283,7 +287,11 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield the facts of an entry; those that ``other`` lacks show how the two differ."""
+    """Yield the facts of an entry, as text.
+
+    ``other`` is the same entry before or after a change. A fact that only one of the two entries
+    has is part of the change.
+    """
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"
@@ -300,7 +308,7 @@ def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
     topics, known = _topics(entry), _topics(other)
     for what, who in sorted(topics.items()):
         yield what
-        # the requesters that ``other`` lacks are named above
+        # a requester that ``other`` lacks is a fact of its own above
         yield from (f"{what} for {one}" for one in who if what in known and one in other.requesters)
 
 

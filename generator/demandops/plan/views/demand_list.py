@@ -17,8 +17,11 @@ from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.subject import SubjectKind
 
 State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
-"""A claim is held by its demand, kept by an override, or suspended by one. A demand that waits for
-room has no claim."""
+"""The state of a claim or of a demand.
+
+A claim is held by its demand, kept by an override, or suspended by an override. A demand has the
+state of its claims; it is partly suspended if they differ, and waiting if it has no claims yet.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +49,16 @@ def state_of(claim: Claim, world: World) -> State:
 
 
 def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
-    """Return the access domains of nodes, sorted; a node that is gone has none."""
+    """Return the access domains of nodes, sorted; a node without a domain is skipped."""
     return tuple(sorted({config.domain_of[id].name for id in nodes if id in config.domain_of}))
 
 
 def nodes_of(claim: Claim) -> tuple[str, ...]:
-    """Return the nodes that a claim needs, sorted: its own, and the sources of its inputs."""
+    """Return the nodes that a claim needs, sorted.
+
+    An application needs its node, the sources of its inputs and the nodes to which it delivers. A
+    connection needs the nodes at its ends and the node of its broker.
+    """
     held = claim.held
     if claim.is_on_application:
         sources = (topic.source for _, topic in claim.application.all_inputs())
@@ -71,7 +78,7 @@ def demands(world: World) -> list[HeldDemand]:
 
 
 def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
-    """Return the demand that has these claims."""
+    """Return the list's entry for the demand that has these claims."""
     states = {state_of(claim, world) for claim in claims}
     (state,) = states if len(states) == 1 else ("partly suspended",)
     suspending = filter(None, (suspended_by(claim, world) for claim in claims))
@@ -93,7 +100,7 @@ def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
 
 
 def waiting_demand(one: WaitingDemand) -> HeldDemand:
-    """Return a demand that waits: it holds nothing yet."""
+    """Return the list's entry for a waiting demand, which holds nothing yet."""
     return HeldDemand(
         name=one.demand,
         state="waiting",

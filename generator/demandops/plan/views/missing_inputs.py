@@ -1,7 +1,8 @@
-"""Topics that applications need and that nothing brings any longer. Pure.
+"""Missing inputs: topics that applications need, but that no longer arrive.
 
-A demand that needs a connection gets one, or a warning. Later an override may suspend the
-connection, others may release it, or people may take a node or an output out of the configuration.
+A demand that needs a connection gets the connection, or a warning. Later an override may suspend
+the connection, its demands may release it, or people may take a node or an output out of the
+configuration.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class MissingInput:
 
 
 def missing_inputs(world: World) -> list[MissingInput]:
-    """Return the inputs that do not arrive, sorted; suspended claims need nothing."""
+    """Return the topics that do not arrive, sorted; suspended claims are skipped."""
     active = without_suspended(world)
     found = {
         MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)

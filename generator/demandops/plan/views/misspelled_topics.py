@@ -1,7 +1,7 @@
 """Warnings about misspelled topics: those that differ by a letter from a known topic of the node.
 
 Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ by a
-digit, or by a letter of a short word (``lidar_fl``, ``lidar_fr``), are two topics.
+digit, or by a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two different topics.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def warnings(world: World) -> Iterator[Fault]:
 
 
 class _KnownTopics:
-    """The known topics of each node: those of the inventory, and those that demands took first."""
+    """The known topics of each node: those of the inventory, and the booked usual topics."""
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -47,7 +47,7 @@ class _KnownTopics:
         self._told: set[tuple[str, str]] = set()
 
     def notes_on(self, held: Application | Connection) -> Iterator[str]:
-        """Yield a warning for each misspelled topic, and none that was given before."""
+        """Yield a warning for each misspelled topic; each topic of a node gets only one warning."""
         if isinstance(held, Application):
             for role, one in held.all_inputs():
                 known = self._of(one.source) | self._usual(role, one.source)
@@ -83,7 +83,11 @@ class _KnownTopics:
 
 
 def _is_misspelling(one: str, other: str) -> bool:
-    """Return whether two names differ by one letter, or by two that changed places."""
+    """Return whether ``one`` may be a misspelling of ``other``.
+
+    In a word of at least four letters, ``one`` has one wrong, missing or additional letter, or two
+    letters that changed places.
+    """
     start = _common(one, other)
     end = _common(one[start:][::-1], other[start:][::-1])
     rest, known = one[start : len(one) - end], other[start : len(other) - end]

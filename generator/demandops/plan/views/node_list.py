@@ -19,8 +19,9 @@ from demandops.subject import SubjectKind
 class UsedNode:
     """A node of the inventory, or one that claims still name, and what it is used for.
 
-    ``releases`` run there. ``applications``, ``connections`` and ``requesters`` come from the
-    claims that need the node, even if they only take an input from it.
+    ``releases`` are the releases that run on the node. ``applications``, ``connections`` and
+    ``requesters`` come from the claims that need the node. A claim that only reads an input from
+    the node is among them.
     """
 
     name: str
@@ -38,7 +39,7 @@ class UsedNode:
 
 
 def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
-    """Return every node, sorted by id; ``releases`` are those that run."""
+    """Return every node, sorted by id; ``releases`` are all releases that run."""
     running: defaultdict[str, list[str]] = defaultdict(list)
     for release in releases:
         running[release.node.id].append(release.name)

@@ -18,8 +18,12 @@ from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of_claims
 
 State = Literal["in force", "held back", "expired", "matches nothing", "not rendered yet"]
-"""``held back``: another override holds every file that this override would change. ``not rendered
-yet``: a generator has yet to write files (:mod:`demandops.render.changes.override_state`)."""
+"""What an override does now.
+
+``held back``: another override with ``hold`` keeps every file that this override would change.
+``not rendered yet``: a generator has not written the changed files yet
+(:mod:`demandops.render.changes.override_state`).
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,13 +97,16 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
 
 
 def _is_held(release: Release, override: Override) -> bool:
-    """Return whether another override's hold keeps ``override`` from changing a release."""
+    """Return whether another override with ``hold`` keeps ``override`` from changing a release."""
     effects = next((effects for by, effects in release.shaping.by if by == override), ())
     return release.shaping.held and "hold" not in effects and {*effects} != {"keep"}
 
 
 def _doubled(entry: Entry) -> Iterator[str]:
-    """Yield the services that an override makes publish each message several times."""
+    """Yield each service that publishes every message several times because of an override.
+
+    The override runs several replicas of the service, and each of them publishes every output.
+    """
     for release in entry.releases if (entry.override.replicas or 0) > 1 else ():
         if isinstance(release, ServiceRelease):
             service = release.service

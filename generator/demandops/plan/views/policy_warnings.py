@@ -1,7 +1,8 @@
 """Warnings about access domains, nodes and places, which ``demandops check`` shows.
 
-They say what the cluster will refuse, and which access the cluster cannot prevent. They are not
-faults: a chart may render a kind only with certain values, which only Helm knows.
+Some report what the cluster will refuse or what demands cannot get, others an access that the
+cluster cannot prevent. They are not faults. For example, a chart may render a refused kind only
+with certain values, and only Helm can find that out.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _CRDS = re.compile(r"(.*/)?crds/.*")
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield every warning."""
+    """Yield every warning of this module, each located in the file that causes it."""
     config = world.config
     yield from _charts(config)
     yield from _open_by_host_network(config)
@@ -105,7 +106,10 @@ def _connections_of_before(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield a warning where pods with the host's network can reach another access domain."""
+    """Yield a warning for each access domain whose network is not separate from other domains.
+
+    The cause is that pods of the domain use the host's network.
+    """
     nodes = [
         (config.domain_of[node.id].name, node)
         for node in config.nodes.values()
@@ -141,7 +145,10 @@ def _listed(ids: list[str]) -> str:
 
 
 def _charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each kind that a chart has and its access domain may not use."""
+    """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
+
+    A kind that cannot be read from the chart's files gets a warning, too.
+    """
     for folder, domains in sorted(_domains_of_charts(config).items()):
         yield from _dependencies(folder, config.files)
         texts = {path: text for path, text in config.files.items() if path.startswith(f"{folder}/")}
@@ -154,7 +161,7 @@ def _charts(config: Config) -> Iterator[Fault]:
 
 
 def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return chart folder → the access domains whose rules let the chart run there."""
+    """Return chart folder → the access domains whose rules allow applications with the chart."""
     found: dict[str, list[AccessDomain]] = {}
     for appdef, services in config.services.items():
         domains = [
@@ -198,7 +205,7 @@ def _refused(
 
 
 def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield a warning for each subchart that is not there as files."""
+    """Yield a warning for each subchart whose files are not in the state repo."""
     for one in chart_files.dependencies(folder, files):
         if one.folder is None and f"{folder}/charts/{one.name}/Chart.yaml" not in files:
             message = (

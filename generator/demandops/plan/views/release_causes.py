@@ -17,7 +17,7 @@ from demandops.subject import Subject
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run, all or those that claims on ``subject`` need."""
+    """Yield the releases that run; with a ``subject``, only those that claims on it need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
@@ -50,7 +50,7 @@ def needs(claim: Claim, release: Release) -> bool:
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return the versions that claims on a service's applications name, and who asks for each."""
+    """Return version → requesters for each version that claims on a service's applications name."""
     found: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:
@@ -59,7 +59,7 @@ def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[st
 
 
 def how_to_release(claim: Claim) -> str:
-    """Return how the requesters release a claim."""
+    """Return, in words, how the requesters release a claim."""
     if claim.keeping_override is not None:
         return f"remove keep from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):

@@ -1,8 +1,8 @@
 """A plan that follows a sequence of ledgers, to verify commits.
 
 Planning is a function of ledger and configuration. The plan records which parts of the ledger were
-read for each release. If none of them changes, the release stays the same; only the others are
-planned again. The generator predicts which releases a claim affects
+read for each release. If none of these parts changes, the release stays the same. Only the other
+releases are planned again. The generator predicts which releases a claim affects
 (:func:`demandops.plan.release_keys.affected_keys`). A proof must not rely on that prediction.
 """
 
@@ -55,7 +55,8 @@ class TracedPlan:
             The releases that were planned again; ``None`` for one that does not run.
 
         Raises:
-            Refused: as :func:`demandops.plan.planner.plan`. Do not use this plan afterwards.
+            Refused: for the same reasons as :func:`demandops.plan.planner.plan`. This object is
+                then out of date and of no further use.
         """
         stale = {
             unit for read in (*_changed(changes), *kept) for unit in self._readers.pop(read, ())

@@ -13,7 +13,7 @@ from demandops.quoting import quoted
 def warnings(config: Config) -> Iterator[Fault]:
     """Yield a warning for each pattern of an access domain that matches nothing.
 
-    It does not check patterns of requesters, because the repo has no list of requesters.
+    Patterns of requesters are not checked, because the repo has no list of requesters.
     """
     for name, domain in sorted(config.domains.items()):
         file = config.file_of(DOMAINS_FILE, name)
@@ -27,7 +27,10 @@ def warnings(config: Config) -> Iterator[Fault]:
 def _patterns(
     domain: AccessDomain, config: Config
 ) -> Iterator[tuple[str, str, str, tuple[str, ...]]]:
-    """Yield (field, pattern, the kind of things to match, the names of these things)."""
+    """Yield (field, pattern, kind, names) for each pattern of an access domain.
+
+    ``kind`` says in words what the pattern may match; ``names`` are all names of this kind.
+    """
     own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == domain.name))
     others = tuple(sorted(config.domains.keys() - {domain.name}))
     nodes = tuple(sorted(config.nodes))

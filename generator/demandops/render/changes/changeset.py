@@ -28,15 +28,15 @@ from demandops.render.output_check import check_files
 Change = Literal["start", "change", "stop"]
 
 CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
-"""The order in which changes are listed."""
+"""The kinds of changes, in the order in which lists show them."""
 
 FileReader = Callable[[str], str | None]
-"""Returns the text of a file of the state repo, or ``None`` if there is no such file."""
+"""A function that returns the text of a file of the state repo; None if the file is missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops, its file, and the facts that change."""
+    """A release that starts, changes or stops; ``details`` are lines on the facts that change."""
 
     name: str
     what: str
@@ -52,18 +52,18 @@ class ReleaseChange:
 
 @dataclass(frozen=True, slots=True)
 class Changeset:
-    """The files to write (``None``: to remove) and the releases that change."""
+    """The files to write and the releases that change. The text None means to remove the file."""
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     overrides: tuple[str, ...] = ()
-    """The files of the overrides that shape the written files."""
+    """The paths of the overrides that change the content of the written files."""
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """The releases that may differ, as they are after the change."""
+    """Key → the release after the change, for all releases that may differ."""
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """The same releases as they were before."""
+    """Key → the release before the change, for the keys of ``plans``."""
 
 
 def build_changeset(
@@ -78,12 +78,13 @@ def build_changeset(
     """Return the changes in the state repo that follow from a change of the ledger.
 
     Args:
-        before, after: the world before and after; the configuration is the same.
+        before, after: the world before and after; both have the same configuration.
         changes: what differs in the ledger.
-        keys: the releases that may differ (:func:`demandops.plan.release_keys.affected_keys`).
+        keys: the keys of the releases that may differ
+            (:func:`demandops.plan.release_keys.affected_keys`).
         engine: the engine of the configuration.
-        read: reads the state repo before the change.
-        plans: releases of ``before`` that are planned already.
+        read: returns the text of a file of the state repo before the change.
+        plans: releases of ``before`` that the caller has planned already.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
@@ -133,7 +134,7 @@ def build_changeset(
 
 
 def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
-    """Refuse a file that grows above the limit; a file that shrinks may stay above it."""
+    """Raise Refused if a file has more than ``most`` bytes and is larger than before."""
     faults = []
     for path, text in files.items():
         size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
@@ -153,8 +154,10 @@ def render_all(
     """Return all generated files, by path.
 
     Args:
-        keys: all releases (:func:`demandops.plan.release_keys.all_keys`).
-        current: the generated files in the state repo; ``hold`` overrides keep some unchanged.
+        world: the configuration and the ledger.
+        engine: the engine of the configuration.
+        keys: the keys of all releases (:func:`demandops.plan.release_keys.all_keys`).
+        current: the generated files in the state repo, which ``hold`` overrides may preserve.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
@@ -170,7 +173,7 @@ def render_all(
 
 
 def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
-    """Return the former release, or ``None`` if it can no longer be planned."""
+    """Return the release of a former world; None if the release can no longer be planned."""
     try:
         return plan(world, key)
     except Refused:
@@ -178,9 +181,9 @@ def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return how a release changes; ``existed`` is whether it had a file before."""
+    """Return how a release changes; ``existed`` is true if the release had a file before."""
     release = new or old
-    assert release is not None  # noqa: S101 - it has at least one side
+    assert release is not None  # noqa: S101 - a change has at least one side
     kind: Change = "stop" if not new else "change" if existed else "start"
     details = _differences(old, new) if new and existed else ()
     return ReleaseChange(release.name, release.description, path_of(release), kind, details)

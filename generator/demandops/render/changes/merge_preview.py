@@ -32,7 +32,7 @@ ABSENT = object()
 
 @dataclass(frozen=True, slots=True)
 class FileChange:
-    """A generated file before and after; ``None`` if it does not exist."""
+    """The text of a generated file before and after; None where the file does not exist."""
 
     path: str
     before: str | None
@@ -46,7 +46,7 @@ class FileChange:
         return "removed" if self.after is None else "changed"
 
     def diff(self) -> Iterator[str]:
-        """Yield the lines of a unified diff."""
+        """Return the lines of a unified diff from ``before`` to ``after``."""
         return difflib.unified_diff(
             (self.before or "").splitlines(),
             (self.after or "").splitlines(),
@@ -60,7 +60,7 @@ class FileChange:
 class MergePreview:
     """The releases that start, change or stop, and the files that change.
 
-    ``other_files`` are the files that are not of a release.
+    ``other_files`` are the changed files that belong to no release.
     """
 
     releases: tuple[ReleaseChange, ...]
@@ -69,7 +69,7 @@ class MergePreview:
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return all releases that can be planned."""
+    """Return key → release for all releases that can be planned."""
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         try:
@@ -84,8 +84,9 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
 def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
     """Return the faults that keep releases from being planned or rendered.
 
-    A fault gets the first of these files that exists: the file of a claim on the release that is in
-    ``edited``, the fault's own file, the file of any claim on the release.
+    Each fault names one file. If the claims that need the release include a file in ``edited``, the
+    fault names this file. Otherwise it keeps its own file or, without one, names the file of the
+    first claim.
     """
     faults: list[Fault] = []
     files: dict[ReleaseKey, list[str]] = {}
@@ -104,7 +105,7 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
 
 def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
-    """Return the files of the claims that need a release, by release."""
+    """Return key of a release → the files of the claims that need the release."""
     by_release: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
         paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
@@ -119,7 +120,14 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return the changes from ``old`` to ``new`` releases, and from ``current`` to ``files``."""
+    """Return the releases and the files that a merge changes.
+
+    Args:
+        old: the releases before the merge.
+        new: the releases after the merge.
+        current: path → text of the generated files before the merge.
+        files: path → text of the generated files after the merge.
+    """
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
         for path in sorted({*current, *files})
@@ -150,7 +158,10 @@ def preview(
 def _pairs(
     old: Mapping[ReleaseKey, Release], new: Mapping[ReleaseKey, Release]
 ) -> Iterator[tuple[Release | None, Release | None]]:
-    """Yield each release before and after; a release that moved is found by its name."""
+    """Yield each release before and after; None where it does not exist.
+
+    A release whose key changes is paired by its name.
+    """
     gone = {release.name: release for key, release in old.items() if key not in new}
     for key, release in new.items():
         yield old.get(key) or gone.pop(release.name, None), release
@@ -158,7 +169,7 @@ def _pairs(
 
 
 def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield the first differences between two manifests in words, then the number of others."""
+    """Yield texts for the first differences between two manifests, then a count of the rest."""
     try:
         differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:
@@ -171,7 +182,7 @@ def _facts(before: str, after: str) -> Iterator[str]:
 
 
 def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
-    """Yield (path, old, new) of the smallest parts that differ.
+    """Yield (path, old, new) for each smallest part that differs between two values.
 
     A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
     """

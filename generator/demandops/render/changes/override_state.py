@@ -1,4 +1,4 @@
-"""The state of an override, which is in force only when the files that it changes are written."""
+"""The state of an override. It is in force only when the files that it changes are written."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from demandops.render.gitops.paths import path_of
 
 
 def override_state(entry: Entry, world: World, not_rendered: Collection[str]) -> State:
-    """Return the state of an override: ``not rendered yet`` while an affected file is stale."""
+    """Return the state of an override.
+
+    The state is ``not rendered yet``, instead of ``in force``, while ``not_rendered`` contains a
+    file that the override affects.
+    """
     if entry.state != "in force" or not not_rendered:
         return entry.state
     paths = {path_of(one) for one in affected_releases(entry, world)}

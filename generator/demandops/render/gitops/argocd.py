@@ -1,8 +1,8 @@
-"""Manifests for Argo CD: one Application for each service and one for each access domain's folder.
+"""Manifests for Argo CD: an Application for each service and for each access domain's folder.
 
 The fields are those of argoproj.io/v1alpha1 in Argo CD 3.2. Each cluster has its own Argo CD. The
-Applications of services are in the access domain's namespace. In Argo CD's own namespace they could
-name another domain's project (docs/decisions/0011).
+Applications of services are in the access domain's namespace. If they were in Argo CD's own
+namespace, they could name another domain's project (docs/decisions/0011).
 """
 
 from __future__ import annotations
@@ -26,18 +26,21 @@ from demandops.render.gitops.paths import (
 from demandops.settings import MAIN_BRANCH
 
 IN_CLUSTER = "https://kubernetes.default.svc"
-"""Argo CD's address for the cluster that it runs in."""
+"""The address by which Argo CD reaches the cluster that it runs in."""
 
 
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
-    """Return the name that a domain's AppProject and the Application of its folder share."""
+    """Return the name of a domain's AppProject.
+
+    The Application that applies the domain's folder has the same name.
+    """
     return f"{repository.source}-{domain.name}"
 
 
 def render(
     release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings, engine: Engine
 ) -> str:
-    """Return the file of a service: its Application."""
+    """Return the text of a service's file: an Application."""
     return engine.text(
         "argocd/release.yaml.j2",
         release=release,
@@ -51,7 +54,7 @@ def render(
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return the bootstrap files and a placeholder for each access domain."""
+    """Return path → text of the bootstrap files and of a placeholder for each access domain."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
         for cluster, domains in domains_by_cluster(config).items()
@@ -82,7 +85,7 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
 
 
 def _sources(config: Config) -> list[str]:
-    """Return every URL that a domain's Applications may use as a source."""
+    """Return the URLs that Applications may use as a source: the state repo's and the charts'."""
     section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - required when gitops is "argocd"
     charts = {

@@ -1,6 +1,6 @@
-"""The digest of a bootstrap file: an annotation that says which version a cluster has. Pure.
+"""The digest of a bootstrap file: an annotation that shows which version a cluster has. Pure.
 
-Only a person applies the file, so the cluster may have an older one. The object that applies
+A person applies the file, so the cluster may have an older version. The object that applies
 an access domain's folder carries the digest. ``demandops status`` compares this digest
 with that of the file.
 """
@@ -21,20 +21,23 @@ _LENGTH = 16
 
 
 def with_digest(render: Callable[[str], str]) -> str:
-    """Return the file that ``render`` makes with its digest, which does not cover comments."""
+    """Return the text of a bootstrap file that contains its own digest.
+
+    ``render`` returns the text with a given digest. The digest does not cover comments.
+    """
     objects = json.dumps(list(strict_yaml.load_all(render(""))), sort_keys=True)
     return render(hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH])
 
 
 def digest_of(item: Mapping[str, Any]) -> str:
-    """Return the digest that an object carries, empty if it has none."""
+    """Return the digest in an object's annotations; empty if there is none."""
     annotations = (item.get("metadata") or {}).get("annotations") or {}
     return str(annotations.get(ANNOTATION, ""))
 
 
 @lru_cache(maxsize=1024)  # the web page asks repeatedly
 def digest_in(text: str) -> str:
-    """Return the digest in a bootstrap file, empty if it has none."""
+    """Return the digest in the text of a bootstrap file; empty if there is none."""
     try:
         items = list(strict_yaml.load_all(text))
     except InvalidInput:

@@ -1,8 +1,9 @@
 """The steps on the clusters when a state repo is upgraded, or switches to Flux or Argo CD.
 
-Pure: returns instructions and commands for a person. The order matters. A running controller would
-remove the workloads when its releases leave the repo, so the person stops this controller first.
-The person deletes the old controller's objects only after the new controller has taken over.
+Pure: this module returns instructions and commands for a person. Their order matters. First the
+person stops the old controller, because it would remove the workloads when its releases leave the
+state repo. The person deletes the old controller's objects only after the new controller has taken
+over.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class SwitchSteps:
-    """What a person does on the clusters, before and after the state repo changes."""
+    """The steps that a person takes on the clusters before and after the state repo changes."""
 
     before: tuple[Step, ...] = ()
     after: tuple[Step, ...] = ()
 
 
 def switch_steps(old: Config, new: Config, changed: Container[str]) -> SwitchSteps:
-    """Return the steps to switch the controller or, without a switch, to apply bootstrap files.
+    """Return the steps to switch the GitOps controller, or to apply changed bootstrap files again.
 
     The steps delete no workload (docs/argocd.md has the reasons).
 
@@ -75,7 +76,7 @@ def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
         commands = []
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
-            commands.append(  # Helm's release records: a later Flux would continue from them
+            commands.append(  # Helm's records of releases, from which a later Flux would continue
                 f"{kubectl} get helmrelease -l {_label(domain)} -o name | sed s,.*/,, | "
                 f"xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
             )

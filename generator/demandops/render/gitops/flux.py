@@ -1,8 +1,8 @@
-"""Manifests for Flux: one HelmRelease for each service, one source for each chart and domain.
+"""Manifests for Flux: a HelmRelease for each service, and the chart sources of each domain.
 
 The fields are those of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 in Flux 2.9.
-Requesters are not in the manifests, so one more requester of a running service changes only the
-ledger.
+The manifests do not contain requesters, so another requester of a running service changes only
+the ledger.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from demandops.settings import MAIN_BRANCH
 
 
 def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -> str:
-    """Return the file of a service: its HelmRelease."""
+    """Return the text of a service's file: a HelmRelease."""
     chart = release.chart
     return engine.text(
         "flux/release.yaml.j2",
@@ -39,12 +39,15 @@ def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -
 
 
 def chart_object(name: str, chart: ChartSource) -> str:
-    """Return the name of the object that fetches one version of a chart."""
+    """Return the name of the Flux object that fetches this version of a chart."""
     return f"{name}-{chart.version}".lower()
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return the bootstrap files, and a placeholder and the chart sources for each domain."""
+    """Return path → text of the files that do not depend on demands.
+
+    These are the bootstrap files, and a placeholder and the chart sources for each access domain.
+    """
     flux = config.repo_settings.flux
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)

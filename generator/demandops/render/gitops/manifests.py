@@ -30,11 +30,11 @@ def render(release: Release, config: Config, engine: Engine) -> str:
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return the files that exist even without demands.
+    """Return path → text of the files that exist even without demands.
 
     Each cluster has a bootstrap file, with which its controller follows the repo. Each access
-    domain of a cluster has a placeholder: Git drops empty folders, and on a missing folder Flux and
-    Argo CD fail instead of pruning.
+    domain of a cluster has a placeholder file, which keeps the domain's folder in Git. Without the
+    folder, Flux and Argo CD would fail instead of removing what is no longer demanded.
     """
     if config.repo_settings.gitops == "argocd":
         return argocd.base_files(config, engine)

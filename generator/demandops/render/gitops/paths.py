@@ -15,7 +15,7 @@ BOOTSTRAP_ROOT = "bootstrap"
 
 
 def domain_folder(cluster: str, domain: AccessDomain) -> str:
-    """Return the folder of an access domain on a cluster; a controller applies it as a whole."""
+    """Return the folder of an access domain in a cluster. A controller applies the whole folder."""
     return f"{CLUSTERS_ROOT}/{cluster}/{domain.name}"
 
 
@@ -26,12 +26,12 @@ def path_of(release: Release) -> str:
 
 
 def bootstrap_path(cluster: str) -> str:
-    """Return the path of the manifests with which a cluster follows the repo."""
+    """Return the path of a cluster's bootstrap file."""
     return f"{BOOTSTRAP_ROOT}/{cluster}.yaml"
 
 
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
-    """Return every (cluster, access domain) that has a node, sorted."""
+    """Return each pair of a cluster and an access domain with nodes in it, sorted by name."""
     pairs = {
         (node.cluster, config.domain_of[node.id].name)
         for node in config.nodes.values()
@@ -41,7 +41,7 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
 
 
 def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return the access domains in use, by cluster."""
+    """Return cluster → the access domains that have nodes in it."""
     domains: dict[str, list[AccessDomain]] = {}
     for cluster, domain in domains_in_use(config):
         domains.setdefault(cluster, []).append(domain)

@@ -1,8 +1,9 @@
 """The proposals that await approval, and how each one ends.
 
-This code runs in the worker thread. A proposal is complete once main has its claims, by any kind of
-merge. Until then the branch is kept up to date, so that a merge gives what main would render.
-A :class:`Proposal` decides its verdict; this module carries it out.
+This code runs in the worker thread. A proposal is booked once main has its claims, after a merge
+commit, a squash or a rebase. Until then the worker rebuilds the branch on each new main, so that
+the branch has the files that the generator would render there. :meth:`Proposal.verdict` decides
+what happens to the demands of a proposal; this module carries that verdict out.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ REPLACED = "was replaced by a later demand of the same id before it was approved
 
 
 Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Decision]
-"""A demand of a batch with its answer, or with its decision if it needs approval."""
+"""A demand with its result: a receipt, an error, or the decision if the demand needs approval."""
 
 
 class Approvals:
@@ -90,7 +91,7 @@ class Approvals:
         proposal = next((p for p in self._proposals.values() if p.branch == record.branch), None)
         if proposal is None:
             key = key_of(request) if request else ("operation", ticket.operation)
-            if key in self._proposals:  # an earlier run proposed the same demand
+            if key in self._proposals:  # another branch of an earlier run has the same key
                 key = ("operation", ticket.operation)
             proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
         if ticket.state == "proposed":  # a withdrawn ticket has an older record
@@ -102,10 +103,11 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Remove the proposals that demands of a batch release; call this before the evaluation.
+        """Withdraw each proposal that a demand of the batch releases, and delete its branch.
 
-        Nobody can merge a proposal without its branch. If the proposal was merged earlier, the
-        demands are evaluated on a tip that includes the merge.
+        The worker calls this before it evaluates the batch. After the deletion nobody can merge
+        the proposal. If a person merged it earlier, the batch is evaluated on a tip that includes
+        the merge.
 
         Raises:
             RemoteAway, PushDenied: if the branch could not be deleted.
@@ -122,12 +124,13 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw those earlier demands of a batch that the demand ``by`` releases.
+        """Withdraw each earlier demand of the batch that needs approval and that ``by`` releases.
 
         Args:
-            earlier: the demands with results; the results of withdrawn demands are replaced.
-            by: the demand that may release them.
-            state: the state on which ``by`` is evaluated.
+            earlier: the evaluated demands of the batch. The result of a withdrawn demand becomes
+                :class:`Withdrawn`, in place.
+            by: the next demand of the batch, which may be a release.
+            state: the state on which ``by`` will be evaluated.
         """
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
@@ -136,7 +139,12 @@ class Approvals:
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Add a demand that needs approval, to an existing proposal of the same demand if any."""
+        """Add a demand that needs approval to its existing proposal, or else to a new one.
+
+        A put replaces the earlier demands of its proposal. The demand gets an error as its answer
+        if other requesters own the proposal, if a requester has too many proposals, or if the
+        demand was withdrawn.
+        """
         request, key = decision.request, key_of(decision.request)
         proposal = self._proposals.get(key)
         if proposal is not None and not proposal.requesters() & set(request.requesters()):
@@ -167,13 +175,13 @@ class Approvals:
         self._changed.append(proposal.branch)
 
     def _requester_with_most(self, request: DemandRequest) -> str:
-        """Return a requester that may have no further proposal, or an empty text."""
+        """Return a requester of ``request`` that has too many proposals, or an empty text."""
         counts = Counter(name for each in self._proposals.values() for name in each.requesters())
         full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
         return next(full, "")
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the proposal of a demand that was put again and needs no approval now."""
+        """Withdraw the demand's pending proposal if ``request`` is a put without approval."""
         proposal = self._proposals.get(key_of(request))
         if proposal is not None and isinstance(request, Put):
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
@@ -195,7 +203,9 @@ class Approvals:
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Fetch and return the commits of the branches; plan the next check even if this fails.
+        """Fetch and return the newest commits of main and of the proposals' branches.
+
+        The next check is planned first, in case the fetch fails.
 
         Raises:
             RemoteAway: if the remote cannot be reached.
@@ -204,14 +214,15 @@ class Approvals:
         return self._branches.heads()
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Answer the proposals that are decided or withdrawn, and update the others.
+        """Answer the demands that are decided or withdrawn, and update the other proposals.
 
         Args:
-            snapshot: main, no older than ``heads``.
-            heads: the commits of the branches.
+            snapshot: the state of main, at the commit ``heads.main`` or a later one.
+            heads: the newest commits of main and of the branches.
 
         Raises:
-            RemoteAway: if the remote cannot be reached; the next check continues.
+            RemoteAway: if the remote cannot be reached. The next check handles the proposals that
+                this check did not reach.
         """
         while self._changed:
             branch = self._changed.popleft()
@@ -226,14 +237,15 @@ class Approvals:
                 log.info("%s; checking again", error)
                 self._changed.append(proposal.branch)
             except (SigningFailed, PushDenied) as error:
-                if proposal.tickets and proposal.branch in heads.branches:  # it can be merged
+                # while the branch exists, a person can still merge it
+                if proposal.tickets and proposal.branch in heads.branches:
                     self._runtime.failed(f"rebuilding {proposal.branch}", error)
                 else:
                     self._end(proposal, error)
         self._timer.ended(str(snapshot.commit))
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Carry out the verdict on a proposal."""
+        """Decide the verdict on a proposal, and carry it out."""
         objects, tip = self._repository.objects, str(snapshot.commit)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         proposal.searched_to = tip
@@ -271,7 +283,7 @@ class Approvals:
         recorded: RecordedOutcome | None,
     ) -> Receipt:
         commit = recorded.commit if recorded else str(snapshot.commit)
-        # merged, but a later commit changed the files
+        # a person merged the demand, but a later commit changed its files
         if isinstance(decision, InvalidInput) or decision.files:
             return Receipt(ticket.operation, ticket.name, "booked", commit)
         before = snapshot.state
@@ -286,7 +298,7 @@ class Approvals:
         """Update the branch so that it holds only the demands that still need approval.
 
         Returns:
-            False if the proposal must be checked again; then it keeps all its demands.
+            False if the proposal must be checked again. The proposal then keeps all its demands.
         """
         before, is_updated = proposal.tickets, False
         proposal.wait_for(verdict.waiting)
@@ -298,7 +310,9 @@ class Approvals:
         return is_updated
 
     def _update(self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str) -> bool:
-        """Update the branch, so that a merge gives what main would render now.
+        """Rebuild the branch if it is outdated, open its pull request and notify the requesters.
+
+        A branch with commits by a person stays unchanged.
 
         Returns:
             False if a demand was withdrawn meanwhile and the proposal must be checked again.
@@ -325,7 +339,10 @@ class Approvals:
     def _bring_up_to_date(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
-        """Commit the demands on main and push the branch; return False if one was withdrawn."""
+        """Push the branch with one commit for each demand on top of main, unless it is up to date.
+
+        Return False if a demand was withdrawn; the branch is then not pushed.
+        """
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(verdict.waiting, snapshot.state, commits.read)
         verdict.failed.extend(failed)
@@ -353,7 +370,7 @@ class Approvals:
         return True
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
-        """Journal a record for each demand; return False if one was withdrawn."""
+        """Journal ``record`` for each demand; return False if a demand was withdrawn."""
         proposal.record = record
         waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
         return all(waiting)
@@ -375,12 +392,15 @@ class Approvals:
         self._forge.forget(proposal.branch, close=close)
 
     def _on_forge_update(self, branch: str) -> None:
-        """Have a branch checked again, because the forge answered; runs in the forge's thread."""
+        """Request a check of a branch whose pull request changed; runs in the forge's thread."""
         self._changed.append(branch)
         self._demands.wake()
 
     def suspend(self) -> None:
-        """Answer all demands that await approval; the journal keeps them for the next start."""
+        """Answer all demands that await approval with an error, and keep them in the journal.
+
+        The next start resumes them.
+        """
         error = ShuttingDown("awaits approval; it is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
@@ -389,7 +409,10 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a demand that releases something, else None."""
+    """Return the request of a demand that is a release, or None.
+
+    Return None as well if the demand is withdrawn or its goal is refused.
+    """
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)

@@ -6,13 +6,16 @@ from demandops.runtime import Runtime
 
 CHECK_EMBEDDED_S = 1.0
 CHECK_REMOTE_S = 5.0
-"""The interval between checks of the branches; only a check shows that a branch was deleted."""
+"""The seconds between two checks of the branches; only a check detects a deleted branch."""
 _PAUSE_FACTOR = 9
-"""The pause after a check, as a multiple of its duration, so checks take a tenth of the time."""
+"""The pause before the check of a moved main, as a multiple of the last check's duration.
+
+The pause ends at the latest with the interval.
+"""
 
 
 class CheckTimer:
-    """The times of the checks. After a check that failed, the next one waits for the interval."""
+    """Decides when the next check is due. After a failed check, it is due after the interval."""
 
     def __init__(self, runtime: Runtime, *, embedded: bool) -> None:
         self._runtime = runtime
@@ -23,7 +26,8 @@ class CheckTimer:
     def is_due(self, tip: str, *, has_news: bool) -> bool:
         """Return whether to check now, with main at ``tip``.
 
-        With ``has_news`` a check is due at once, unless the last check failed.
+        If ``has_news``, because a proposal changed, a check is due at once, unless the last check
+        failed.
         """
         if has_news and self._checked_at is not None:
             return True
@@ -36,12 +40,12 @@ class CheckTimer:
         return due - self._runtime.monotonic()
 
     def began(self) -> None:
-        """Plan the next check, in case the check that begins now fails."""
+        """Record that a check begins, and plan the next one in case this one fails."""
         self._began = self._runtime.monotonic()
         self._next, self._checked_at = self._began + self._interval, None
 
     def ended(self, tip: str) -> None:
-        """Note that all proposals were checked with main at ``tip``."""
+        """Record that all proposals were checked with main at ``tip``."""
         now = self._runtime.monotonic()
         self._checked_at = tip
         self._rest_until = now + _PAUSE_FACTOR * (now - self._began)

@@ -20,7 +20,7 @@ from demandops.settings import MAIN_BRANCH
 log = logging.getLogger("demandops")
 
 POLL_S = 30.0
-"""The interval between queries; only the forge knows that a pull request was closed."""
+"""The seconds between queries of the forge, which alone knows that a pull request was closed."""
 
 _TOO_MANY_REQUESTS = 429
 _REST_S = 60.0
@@ -37,7 +37,7 @@ class _Task:
 
 
 class ForgeWorker:
-    """Opens, watches and closes pull requests; its public methods belong to the worker thread."""
+    """Opens, watches and closes pull requests; only the worker thread calls its public methods."""
 
     def __init__(
         self, token_file: Path | None, on_update: Callable[[str], None], runtime: Runtime
@@ -58,7 +58,7 @@ class ForgeWorker:
         self._due.set()
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
-        """Open a pull request for a branch, unless that was requested before."""
+        """Have the forge's thread open a pull request, unless the branch already has a request."""
         if branch not in self._wanted:
             task = _Task(forge, branch, title, body)
             with self._lock:
@@ -66,7 +66,7 @@ class ForgeWorker:
             self._enqueue(task)
 
     def has_answered(self, branch: str) -> bool:
-        """Return whether a first query about a branch has ended, successfully or not."""
+        """Return whether the forge's thread has queried a branch at least once, even in vain."""
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
@@ -74,7 +74,7 @@ class ForgeWorker:
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, *, close: bool) -> None:
-        """Stop watching a branch; ``close``: also close its pull request if it is open."""
+        """Stop watching a branch; if ``close``, also close its pull request if it is open."""
         with self._lock:
             task = self._wanted.pop(branch, None)
             self._pull_requests.pop(branch, None)
@@ -87,7 +87,7 @@ class ForgeWorker:
         if self._thread is None:
             self._thread = self._runtime.keep_running("forge", self._run)
 
-    # ---- in the thread of its own ----
+    # ---- in the forge's thread ----
 
     def _run(self) -> None:
         poll_at = self._runtime.monotonic() + POLL_S

@@ -1,7 +1,7 @@
 """A proposal: demands that wait together on one branch for a person's approval.
 
-This module decides its verdict as a pure function, finds the requests that release it, and writes
-the texts that describe it.
+The functions here have no effects: they decide the verdict on a proposal, recognize the requests
+that release a proposal, and write the texts that describe it.
 """
 
 from __future__ import annotations
@@ -31,10 +31,12 @@ _PREFIX = "awaiting approval: "
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The verdict on each demand of a proposal; some come with their decision on the current main.
+    """The demands of a proposal, grouped by what happens to them.
 
-    ``booked``: main has the claims. ``failed``: the demands were withdrawn or turned down, or can
-    no longer be booked. ``free``: they no longer need approval. ``waiting``: they still need it.
+    ``booked``: main has the claims of these demands. ``failed``: these demands were withdrawn or
+    turned down, or can no longer be booked; each has its error. ``free``: these demands no longer
+    need approval. ``waiting``: these demands still need approval. Booked and waiting demands have
+    the decision that they would get on the current main.
     """
 
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
@@ -45,11 +47,11 @@ class Verdict:
 
 @dataclass(eq=False)
 class Proposal:
-    """Demands that share a key (:func:`key_of`), and so a branch.
+    """Demands that have the same key (:func:`key_of`), and therefore share a branch.
 
-    ``reasons`` say why approval is needed. No commit of main up to ``searched_to`` has one of the
-    demands. ``checked_at`` is the commit of main at the last check. ``edited``: a person committed
-    to the branch.
+    ``reasons`` say why approval is needed. ``searched_to`` is the commit of main up to which the
+    history was searched for merged demands. ``checked_at`` is the commit of main at the last check;
+    it is empty if the proposal must be checked again. ``edited``: a person committed to the branch.
     """
 
     key: Key
@@ -63,11 +65,14 @@ class Proposal:
 
     @property
     def branch(self) -> str:
-        """The branch to merge."""
+        """The name of the branch that a person merges."""
         return self.record.branch
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Return whether nothing changed since the last check, with main at ``tip``."""
+        """Return whether nothing changed since the last check, with main at ``tip``.
+
+        ``branches`` maps the name of each branch to its newest commit.
+        """
         head = branches.get(self.branch)
         all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
         return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
@@ -82,14 +87,14 @@ class Proposal:
     ) -> Verdict:
         """Return the verdict on the proposal's demands.
 
-        A demand is booked if the history of main has its operation id, or if the ledger has its
-        claims: a squash merge may lose the trailer.
+        A demand is booked if a commit of main names its operation id in a trailer. A squash merge
+        may lose this trailer, so a demand is also booked if it would change no file of main.
 
         Args:
             state: the state of main.
             read: reads a file of main.
-            on_main: the operation ids of the new commits on main.
-            head: the commit of the branch; empty if there is none.
+            on_main: the operation ids in the commits of main since ``searched_to``.
+            head: the newest commit of the branch; empty if the branch does not exist.
             pull_request: the pull request, if it is known.
         """
         verdict = Verdict()
@@ -121,12 +126,12 @@ class Proposal:
         return verdict
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
-        """Remove demands that have an answer."""
+        """Remove the demands of ``answered`` from the proposal."""
         gone = [ticket for ticket, _ in answered]
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
     def wait_for(self, left: Decided) -> None:
-        """Keep only the demands that still need approval."""
+        """Keep only the demands of ``left``, which still need approval."""
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
@@ -137,7 +142,7 @@ class Proposal:
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request releases all of ``pending`` and comes from one of its requesters."""
+    """Return whether a request releases all of ``pending``, and shares a requester with them."""
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
@@ -146,17 +151,21 @@ def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
 
 
 def key_of(request: DemandRequest) -> Key:
-    """Return the key of a request's proposal: the demand, or the request and its requesters."""
+    """Return the key of a request's proposal.
+
+    The key contains the demand id. A request of the reference's action has no demand id, so its key
+    contains the request id and the requesters.
+    """
     if request.is_reference:
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
 
 
 def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
-    """Decide demands one after the other, with leases that start at the approval.
+    """Decide each demand on the state after the previous one; leases start at the approval.
 
     Returns:
-        The decision on each demand after the earlier ones, and the demands that are refused.
+        The accepted demands with their new decisions, and the refused demands with their errors.
     """
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
@@ -179,13 +188,13 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a goal that is not parsed yet is a release."""
+    """Return whether a raw goal is a shutdown or a release."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 
 
 def admit_or_none(state: State, goal: object) -> DemandRequest | None:
-    """Return the request of a goal, or None if it is refused."""
+    """Return the request of a goal, or None if the goal is refused."""
     try:
         return admit(state, goal)
     except InvalidInput:
@@ -200,7 +209,7 @@ def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
-    """Return branch and link from a :func:`waiting_text`; the link may be empty."""
+    """Return ``branch`` and ``link`` from a :func:`waiting_text`; the link may be empty."""
     branch, _, rest = text.removeprefix(_PREFIX).partition(" ")
     link = rest.split(" ")[0] if rest.startswith("http") else ""
     return {"branch": branch, "link": link}
@@ -209,7 +218,8 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     """Return the text of a pull request with a commit's message.
 
-    The message is fenced, so that the ids in it, which anyone may choose, do not become links.
+    The message is in a code block, because requesters choose the ids in it. Outside of a code
+    block, an id could become a link or a mention.
     """
     fence = _fence(message, 3)
     return (
@@ -219,7 +229,7 @@ def pull_request_body(message: str, reasons: Iterable[str]) -> str:
 
 
 def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) -> list[str]:
-    """Return the push options that make GitLab open a merge request; each is one line."""
+    """Return the push options that make GitLab open a merge request; each option is one line."""
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = _fence(why, 1)
     description = (
@@ -237,7 +247,7 @@ def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) ->
 
 
 def title_of(message: str) -> str:
-    """Return the title of a pull request with a commit's message."""
+    """Return the title of a pull request: the first line of a commit's message."""
     return message.split("\n", 1)[0]
 
 
@@ -247,5 +257,5 @@ def _asked_for_by(reasons: Iterable[str]) -> str:
 
 
 def _fence(text: str, shortest: int) -> str:
-    """Return enough backticks to fence a text that may contain backticks."""
+    """Return at least ``shortest`` backticks, and more than any run of backticks in ``text``."""
     return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])

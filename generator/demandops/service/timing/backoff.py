@@ -1,7 +1,8 @@
 """The delay until the next attempt to publish, and how many demands to publish at once.
 
-Two cases have delays of their own: another writer was first, or the remote cannot be reached. Both
-are jittered and bounded, so no writer starves and a remote that comes back is not flooded.
+There are two kinds of delays: after another writer was first, and while the remote cannot be
+reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not flood a
+remote that comes back.
 """
 
 from __future__ import annotations
@@ -12,10 +13,17 @@ FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
 """The longest delay while the remote cannot be reached."""
 LONGEST_TURN_S = 0.4
-"""The longest delay after another writer was first; with longer ones a writer loses again."""
+"""The longest delay after another writer was first.
+
+A writer with a longer delay would lose again to writers that wait less.
+"""
 LIMIT_EMBEDDED = 20
 LIMIT_REMOTE = 200
-"""How many demands to publish together: a push costs some 50 ms, moving a branch less than one."""
+"""How many demands to publish together at most.
+
+The limit is higher for a remote, because a push takes about 50 ms. Moving a branch of a repository
+on this disk takes less than 1 ms.
+"""
 
 
 class Backoff:
@@ -28,16 +36,16 @@ class Backoff:
     def published(self) -> None:
         """Reset the delays, because commits were published."""
         self.max_demands = self._limit
-        """How many demands to publish next."""
+        """How many demands the next attempt may publish."""
         self._turn = self._away = FIRST_PAUSE_S
 
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
-        """Return the seconds to wait after another writer was first.
+        """Return the seconds to wait after another writer was first, and adjust ``max_demands``.
 
         Args:
-            size: how many demands were to be published.
-            evaluating_s: seconds that it took to evaluate and commit them.
-            pushing_s: seconds until the push was rejected.
+            size: how many demands the attempt tried to publish.
+            evaluating_s: the seconds that the attempt took to evaluate and commit the demands.
+            pushing_s: the seconds from the start of the push to its rejection.
         """
         # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))

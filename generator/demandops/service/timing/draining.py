@@ -37,7 +37,7 @@ class Draining:
                 self._tried[node] = tried
                 self._warn(node, map(str, error.faults))
                 continue
-            # with files, the commit may still lose to another writer, so it is not done yet
+            # a commit may still lose to another writer, so only a try without commit is recorded
             if not decision.files:
                 self._tried[node] = tried
             for moved in decision.placed:
@@ -45,7 +45,7 @@ class Draining:
             self._warn(node, decision.warnings)
 
     def _warn(self, node: str, stays: Iterable[str]) -> None:
-        """Log, once, which applications stay on a drained node and why."""
+        """Log which applications stay on a drained node and why; log each text only once."""
         texts = frozenset(stays)
         for text in sorted(texts - self._logged.get(node, frozenset())):
             log.warning("'%s' is drained: %s", node, text)

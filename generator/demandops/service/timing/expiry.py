@@ -45,9 +45,11 @@ class LeaseExpiry:
         self._next_end: datetime | None = None
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, unless one was just answered.
+        """Return a ticket for each demand whose lease has ended.
 
-        Use the tickets at once: later a lease may have been renewed, or the clock set.
+        A demand gets no new ticket in the minute after its last answered ticket. The tickets are
+        correct only at the time of the call: later, a requester may have renewed a lease, or a
+        person may have set the clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
@@ -71,10 +73,10 @@ class LeaseExpiry:
         return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the current time, and the claims whose lease has ended, the first to end first.
+        """Return the current time, and the claims whose lease has ended, sorted by the end.
 
-        The ended claims of one demand are released together: if one of them is granted more time,
-        none is returned.
+        The ended claims of one demand are released together. If one of them gets more time after
+        a jump of the clock, none of them is returned.
         """
         now = self._read_clocks()
         ended = ledger.ended_claims(now)
@@ -84,11 +86,11 @@ class LeaseExpiry:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        It is never zero, because an ended lease stays in the ledger if its release failed or if
-        it was granted more time.
+        The minimum lets the worker wait although a lease has ended. The ledger keeps such a lease
+        if its release failed, or if it gets more time after a jump of the clock.
         """
         first = ledger.first_to_end()
-        if first is not self._first:  # many leases may end in one minute
+        if first is not self._first:  # computed once, because many leases may end in one minute
             self._first, self._next_end = first, ledger.next_lease_end()
         end = self._next_end
         return longest if end is None else _seconds_until(end, self._read_clocks(), longest)
@@ -130,7 +132,7 @@ class OverrideExpiry:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
     def postpone(self, now: datetime) -> None:
-        """End no override for a while, because the commits could not be published."""
+        """Delay the end of every override, because the commits could not be published."""
         self._not_before = now + _RETRY
 
     def is_due(self, world: World, now: datetime) -> bool:
@@ -151,7 +153,7 @@ class OverrideExpiry:
 
 
 class ScaleDown:
-    """Removes the extra replicas of services whose time is over, in a commit for each service."""
+    """Removes the replicas that a service no longer keeps, in one commit for each service."""
 
     def __init__(self) -> None:
         self._retry_at: dict[Instance, datetime] = {}
@@ -171,11 +173,11 @@ class ScaleDown:
                     log.error("cannot scale down: %s; trying again later", problem)
 
     def postpone(self, now: datetime) -> None:
-        """Remove no replicas for a while, because the commits could not be published."""
+        """Delay every scale-down, because the commits could not be published."""
         self._not_before = now + _RETRY
 
     def is_due(self, ledger: Ledger, now: datetime) -> bool:
-        """Return whether to remove extra replicas now."""
+        """Return whether a scale-down is due now."""
         retried = (self._retry_at.get(one, now) <= now for one in ledger.kept.due(now))
         return self._not_before <= now and any(retried)
 

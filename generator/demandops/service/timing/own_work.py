@@ -1,4 +1,4 @@
-"""What the generator commits by itself when it is due, without a demand."""
+"""The work that the generator commits by itself at its due time, not because of a new demand."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class OwnWork:
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book what waited for room, if the demand decided on ``before`` gave room back."""
+        """Book waiting demands if the last demand, decided on ``before``, freed room."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """End nothing for a while, because the commits could not be published."""
+        """Delay the ends of overrides and the scale-downs, because a publication failed."""
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
 

@@ -1,6 +1,6 @@
 """When to fetch from the state repo while no demand comes.
 
-It does not fetch itself; the caller fetches and reports the end of each fetch.
+This module does not fetch; the caller fetches, and reports the end of each fetch.
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ _EMBEDDED_S = 1.0
 
 
 def parse_interval(text: str) -> float:
-    """Return the seconds of a fetch interval: a duration like ``30s``, or seconds; 0: never.
+    """Return a fetch interval in seconds; 0 means no fetches at an interval.
+
+    The text is a duration like ``30s``, or a number of seconds.
 
     Raises:
-        ValueError: if it is neither.
+        ValueError: if the text is neither of them.
     """
     if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
         return float(text)
@@ -31,14 +33,14 @@ def parse_interval(text: str) -> float:
 class PollTimer:
     """The times of the fetches: on request and at an interval that grows while fetches fail.
 
-    Any thread may call :meth:`request`; everything else belongs to one thread.
+    Any thread may call :meth:`request`. Only one thread may call the other methods.
     """
 
     def __init__(self, interval: float, runtime: Runtime, *, embedded: bool = False) -> None:
         """Start the timer; the first fetch is due at once.
 
         Args:
-            interval: seconds between two fetches; 0: only on :meth:`request`.
+            interval: seconds between two fetches; with 0, only :meth:`request` makes a fetch due.
             runtime: provides the time.
             embedded: whether the repository is on this disk.
         """
@@ -50,7 +52,7 @@ class PollTimer:
         self._requested = runtime.event()
 
     def request(self) -> None:
-        """Make a fetch due now; several requests before it starts make one fetch."""
+        """Make a fetch due now; several requests before the fetch starts cause one fetch."""
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
@@ -61,14 +63,20 @@ class PollTimer:
         return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
-        """Return whether a fetch is due; a request from now on leads to another fetch."""
+        """Return whether a fetch is due, which the caller then starts.
+
+        A request after this call causes another fetch.
+        """
         due = self.seconds_until_due() == 0.0
         if due:
             self._requested.clear()
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Plan the next fetch after a fetch or a push, because a push finds new commits too."""
+        """Plan the next fetch after the end of a fetch or of a push, which finds new commits too.
+
+        ``reached``: the remote could be reached; otherwise the interval grows.
+        """
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._runtime.monotonic()
         if self._next is not None:

@@ -1,6 +1,7 @@
 """How many demands a requester may send in a minute, by the quotas of the access domains.
 
-It counts each demand that this generator received once, however often it is evaluated.
+A generator counts only the demands that it receives itself. It counts a demand once, even if it
+evaluates the demand several times.
 """
 
 from __future__ import annotations
@@ -42,7 +43,10 @@ class RateLimit:
                     yield fault("", message, code="quota")
 
     def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
-        """Return how many demands were received in the minute up to this one."""
+        """Count a demand for ``key``, and return its number among those of the last minute.
+
+        A demand that is counted already keeps its number.
+        """
         self._forget_idle(received)
         seen = self._seen.pop(key, None) or deque()
         self._seen[key] = seen  # at the end, so that the longest idle come first

@@ -20,7 +20,7 @@ class Rest:
 
     @property
     def follows_success(self) -> bool:
-        """Whether the next rest is the first since something worked."""
+        """Whether no rest has begun since the last success."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
@@ -28,7 +28,7 @@ class Rest:
         return self._until - self._runtime.monotonic()
 
     def begin(self) -> None:
-        """Rest from now on."""
+        """Begin a rest now."""
         self._until = self._runtime.monotonic() + self._next
         self._next = min(2 * self._next, LONGEST_S)
 

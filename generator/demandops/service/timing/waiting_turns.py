@@ -1,7 +1,7 @@
 """When the demands that wait for room are tried again, and in which order.
 
-When a state may have room for them, the generator tries them before it decides others. So no demand
-gets the room for which an earlier demand, or a demand of higher priority, was waiting.
+When a state may have room, the generator tries the waiting demands before it decides new demands.
+So no demand gets the room for which an earlier demand, or a demand of higher priority, was waiting.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ class WaitingTurns:
         self._tried: State | None = None
 
     def book_due(self, commits: CommitBatch) -> None:
-        """Commit each waiting demand that fits, in turn, unless all were tried on this state."""
+        """Commit each waiting demand that fits, in the order of :func:`in_turn`.
+
+        Do nothing if all waiting demands were already tried on this state.
+        """
         if not self.is_due(commits.head.state):
             return
         for waiting in in_turn(commits.head.state.ledger.waiting):
@@ -42,15 +45,15 @@ class WaitingTurns:
         self._tried = commits.head.state
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the demand decided on ``before`` gave room back."""
+        """Book waiting demands if the last demand, decided on ``before``, freed room."""
         if commits.frees:
             commits.frees = False
             self.book_due(commits)
-        elif self._tried is before:  # there is no more room than when they were tried
+        elif self._tried is before:  # the last demand freed no room, so the tries are still valid
             self._tried = commits.head.state
 
     def is_due(self, state: State) -> bool:
-        """Return whether any waiting demand was not tried on this state."""
+        """Return whether demands wait that were not yet tried on this state."""
         tried = self._tried
         return bool(state.ledger.waiting) and not (
             tried is not None and tried.ledger is state.ledger and tried.config is state.config

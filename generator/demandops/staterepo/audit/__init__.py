@@ -1,1 +1,1 @@
-"""The audit: whether commits are signed, and match ledger and configuration."""
+"""The audit: checks of the signatures of commits, and of their files."""

@@ -14,7 +14,10 @@ from demandops.staterepo.history.commit_log import entry_of
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts with the check of each commit's signature added."""
+    """Return the verdicts, with the result of the check of each commit's signature.
+
+    A verdict no longer holds if a required signature is missing or not valid.
+    """
     found = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = allowed_signers.checks(
         repo, [commit for _, commit in found if entry_of(commit).by_generator]

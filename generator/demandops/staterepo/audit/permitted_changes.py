@@ -1,4 +1,8 @@
-"""Which files a commit of the generator may change: generated files, and claims it names."""
+"""Finds the files that a commit of the generator changed, but may not change.
+
+Such a commit may change generated files, reports, and the claims that its message names. Some
+operations may change further files.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +36,7 @@ _RECORDS = tuple(
         kept_replicas.REPLICAS_ROOT,
     )
 )
-"""The ledger's folders of records, which are not claims."""
+"""The ledger's folders of records. A record is not a claim."""
 _REWRITING = ("follow", "upgrade")
 """Operations that may rewrite a claim, to start its lease or to change its schema."""
 _ENDING = ("follow", "upgrade", "expire-override")
@@ -40,10 +44,10 @@ _ENDING = ("follow", "upgrade", "expire-override")
 
 
 def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
-    """Yield the files that a commit changed without a reason in its message.
+    """Yield the files that a commit of the generator changed, but may not change.
 
-    These are files that people write, claims of demands that the message does not name, and claims
-    that are not formatted as the generator writes them.
+    These are files that people write, claims of demands that the message does not name, claims in
+    another format than the generator's, and records that the operation may not change.
     """
     if not commit.parents:
         return
@@ -94,7 +98,7 @@ def _is_canonical(commit: Commit, path: str) -> bool:
 
 
 def _may_record(commit: Commit, path: str, operation: str) -> bool:
-    """Return whether an operation may write or remove a record, a file of :data:`_RECORDS`."""
+    """Return whether an operation may write or remove the record at ``path``."""
     text = trees.read_text(commit.tree, path) or ""
     if path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
         return operation in _ENDING and (not text or bool(ended_override_file.read({path: text})))

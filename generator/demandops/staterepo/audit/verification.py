@@ -1,11 +1,13 @@
-"""Proves commits: their generated files are those that ledger and configuration give.
+"""Verifies commits: renders their generated files again, and compares them with the committed ones.
 
-A commit is proven whole (everything is loaded and rendered) or by its differences from the commit
-proven before it. The second way assumes that equal object ids mean equal files, and that plans and
-rendered files depend only on their input. It does not rely on the releases that the generator
-considered affected: it plans and renders each release again if any input of its plan changed
-(:mod:`demandops.plan.views.traced_plan`), and compares every file that differs in Git. The first
-and the last commit are proven whole.
+A commit is verified whole or by differences. To verify a commit whole, the program loads and
+renders everything. The first and the last commit are verified whole.
+
+To verify a commit by differences, the program starts from the commit that it verified before. It
+assumes that equal object ids mean equal files, and that plans and rendered files depend only on
+their input. It does not rely on the generator's choice of the affected releases. Instead, it plans
+and renders each release again if any input of its plan changed
+(:mod:`demandops.plan.views.traced_plan`), and compares every file that differs in Git.
 """
 
 from __future__ import annotations
@@ -41,11 +43,13 @@ _CHARTS = "/_charts/"
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether the generated files of a commit are those that ledger and configuration give.
+    """The result of verifying one commit.
 
-    ``holds`` is true if no fault was found. ``skipped`` says why the commit was not compared.
-    ``touched`` lists files that the commit changed although it may not. ``signature`` says why a
-    required signature is not valid. ``signer`` names who signed.
+    ``holds`` is true if no fault was found. ``skipped`` is the reason why the commit was not
+    compared, or empty. ``fault`` is the error of rendering the commit again, or empty.
+    ``differing`` lists the generated files that differ from the rendered ones. ``touched`` lists
+    the files that the commit changed, but may not change. ``signature`` is the reason why a
+    required signature is not valid, or empty. ``signer`` is the name with a valid signature.
     """
 
     commit: str
@@ -61,14 +65,14 @@ class Verdict:
 
 
 class _Proof:
-    """A commit that was rendered again; the proof of the next commit reuses its results."""
+    """The rendered files of a commit; :meth:`advance` reuses them for a later commit."""
 
     def __init__(self, state: State, commit: Commit) -> None:
         self.state, self._commit = state, commit
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         self._held: dict[ReleaseKey, Release] = {}
-        """Releases whose files an override holds: they depend on the parent commit."""
+        """The releases whose files an override holds. Their text depends on the parent commit."""
         base_files = manifests.base_files(state.config, state.engine)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
@@ -80,7 +84,10 @@ class _Proof:
         return trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Render the releases that a later commit affects, and record the files that it changed."""
+        """Advance to a later commit, and render the releases that its changes affect.
+
+        Raises _Unreadable if a changed claim file is not valid.
+        """
         before, after = self._commit.tree, commit.tree
         try:
             changes = [
@@ -103,7 +110,10 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Plan and render the releases that changes affect, and those that overrides hold."""
+        """Plan and render the releases that are affected, and render those that overrides hold.
+
+        The affected releases are those of the claims in ``changes`` and of the instances ``kept``.
+        """
         for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
@@ -120,7 +130,7 @@ class _Proof:
         return path, _blob(release_file.release_text(release, state.config, state.engine, current))
 
     def differing(self) -> tuple[str, ...]:
-        """Return the committed files that differ from the rendered ones."""
+        """Return the paths at which committed and rendered files differ, sorted."""
         wanted = self._undemanded | dict(self._planned.values())
         before = trees.parent_tree(self._commit)
         if before is not None and _holds(self.state):
@@ -135,7 +145,13 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each commit, oldest first; with ``whole``, prove each commit whole."""
+    """Yield a verdict on each of ``commits``.
+
+    Args:
+        repo: the repository.
+        commits: the commits to verify, oldest first.
+        whole: verify each commit whole, and none by differences.
+    """
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
@@ -180,7 +196,7 @@ def _loaded(repo: Repository, entry: LogEntry) -> State:
 
 
 def _differing_whole(commit: Commit, state: State) -> tuple[str, ...]:
-    """Return the files in which a commit differs from its rendering as a whole."""
+    """Render all files of a commit; return the paths at which committed files differ, sorted."""
     before = trees.parent_tree(commit) if _holds(state) else None
     held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
     wanted = {path: _blob(text) for path, text in rendered_files(state, held).items()}

@@ -21,7 +21,7 @@ def is_checkout(folder: Path) -> bool:
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the checkout of a state repo to which a folder belongs, or None."""
+    """Return the checkout of a state repo that ``folder`` is or is inside of, or None."""
     return next((one for one in (folder, *folder.parents) if is_checkout(one)), None)
 
 
@@ -52,7 +52,7 @@ class Checkout(LocalRepository):
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Refuse: a generator writes to a bare repository or through a URL."""
+        """Raise PushDenied, because the program only reads checkouts."""
         raise PushDenied(f"{self.address} is a checkout, which commands only read; name its remote")
 
 

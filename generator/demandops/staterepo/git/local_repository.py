@@ -24,7 +24,10 @@ from demandops.staterepo.git.repository import (
 )
 
 _STALE_LOCK_S = 5.0
-"""Git locks a branch for milliseconds. A killed process left a lock that is older than this."""
+"""The age in seconds from which a branch's lock counts as left behind by a killed process.
+
+Git locks a branch only for milliseconds.
+"""
 
 log = logging.getLogger("demandops")
 
@@ -56,7 +59,10 @@ class LocalRepository(StateRepository):
         )
 
     def renew_if_damaged(self) -> bool:
-        """Return False; raise StateRepoError if git finds damage, because there is no copy."""
+        """Check the repository with git; return False, or raise StateRepoError if it is damaged.
+
+        A repository on this disk has no remote to clone again from.
+        """
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
@@ -109,7 +115,7 @@ class LocalRepository(StateRepository):
         except (pygit2.GitError, OSError) as error:
             reason = disk_error(error, self.address)
             if isinstance(reason, PushDenied) and self.tip() != expected:
-                return False  # the tip may be this very commit, written but not synced
+                return False  # the new tip may be ``commit`` itself, written but not synced
             if reason is not None:
                 raise reason from None
             self._break_stale_lock()
@@ -119,7 +125,7 @@ class LocalRepository(StateRepository):
         return True
 
     def write_anew(self, since: str) -> None:
-        """Write the commits after ``since`` and the branch to new files, and sync the files."""
+        """Write the branch, and the commits after ``since``, to new files; sync these files."""
         branch = Path(self.objects.path) / MAIN
         lock = branch.with_name(f"{branch.name}.lock")
         try:

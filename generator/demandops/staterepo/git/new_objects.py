@@ -1,8 +1,8 @@
-"""New objects of a state repo: in memory until one pack makes them durable.
+"""New objects of a state repo: kept in memory, then written to the disk as one pack.
 
-A pack costs a few syncs, however many commits a batch has; loose objects cost some syncs each.
-The pack has every object that its commits need and their parent lacks, even an object that the repo
-already has: a loose object may not be on the disk yet, or may be about to be pruned.
+A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each. The
+pack has every new object that its commits need. It repeats an object that the repository already
+has as a loose object, because that one may not be on the disk yet, or git may soon prune it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from demandops.staterepo.git.pack_file import write_pack
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 _LAST = 0
-"""The lowest priority among the sources of objects, because most objects that are read are old."""
+"""The lowest priority of an object source. Most objects that are read are in other sources."""
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
@@ -43,9 +43,12 @@ _ID = re.compile(rb"[0-7]+ [^\0]+\0(.{20})", re.DOTALL)
 _FOLDER = b"40000"
 
 Entries = dict[bytes, bytes]
-"""The entries of a folder by name; a folder's name ends in a slash, as Git sorts it."""
+"""Name → raw entry, for each entry of a folder.
+
+The name of a subfolder ends in a slash, because Git sorts it so.
+"""
 _REMEMBERED = 32
-"""How many of the last written folders to remember, because demands often change them again.
+"""How many folders to remember: those written last, because demands often change them again.
 
 A remembered folder never becomes outdated, because an id always means the same content.
 """
@@ -70,19 +73,25 @@ class NewObjects(pygit2.OdbBackend):
         return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
-        """Keep an object and return its id."""
+        """Keep an object in memory until it is packed, and return its id."""
         header = b"%s %d\0" % (_TYPES[kind], len(data))
         oid = Oid(raw=_sha1(header + data))
         self._known[oid] = (kind, data)
         return oid
 
     def folder(self, oid: Oid) -> Entries:
-        """Return the entries of a folder; the caller may change them and add them again."""
+        """Return the entries of a folder.
+
+        The caller may change the entries, and pass them to :meth:`add_folder`.
+        """
         known = self._folders.pop(oid, None)
         return _entries_of(self.repo[oid].peel(Tree).read_raw()) if known is None else known
 
     def add_folder(self, entries: Entries) -> Oid:
-        """Keep a folder and return its id; the caller must not change ``entries`` afterwards."""
+        """Keep a folder like :meth:`add`, and return its id.
+
+        The caller must not change ``entries`` afterwards.
+        """
         oid = self.add(ObjectType.TREE, b"".join(map(entries.__getitem__, sorted(entries))))
         self._folders[oid] = entries
         if len(self._folders) > _REMEMBERED:
@@ -95,9 +104,10 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def packed(self, commit: Oid) -> Iterator[None]:
-        """Write the new objects that a commit needs as one pack, synced.
+        """Write the new objects that a commit needs to one synced pack, then run the block.
 
-        Within the block git's housekeeping keeps the pack, although no reference leads to it yet.
+        While the block runs, git's housekeeping does not remove the pack, although no reference
+        leads to its commits yet.
         """
         needed = self._needed_by(commit)
         if not needed:
@@ -110,20 +120,21 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
-        """Write the objects between two commits again, as one new synced pack.
+        """Write the objects that ``commit`` has and ``since`` lacks again, to a new synced pack.
 
-        An earlier sync may have failed; then the objects can be read, but may not be durable.
-        Git's housekeeping keeps the pack, like that of :meth:`packed`.
+        An earlier sync may have failed. Then the objects can be read, but may not be durable.
+        While the block runs, git's housekeeping does not remove the pack.
         """
         with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n^{since}\n")):
             yield
 
     @contextmanager
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
-        """Build a pack, then move it and its index into place, in this order.
+        """Build a pack, move the pack into place, move its index into place, then run the block.
 
-        Git removes an index without a pack. The .keep file of the pack begins like an index, so
-        that :meth:`clean` recognizes the file.
+        The pack comes first, because git removes an index without a pack. While the block runs, a
+        .keep file protects the pack. The .keep file begins like an index, so that :meth:`clean`
+        recognizes it.
         """
         packs = self._packs
         with _locked(packs, fcntl.LOCK_SH), _folder_until_done(self.repo.path) as folder:
@@ -138,7 +149,7 @@ class NewObjects(pygit2.OdbBackend):
                 sync_folder(packs)
                 yield
             finally:
-                with suppress(OSError):  # the next start removes it
+                with suppress(OSError):  # the next start removes the .keep file
                     keep.unlink(missing_ok=True)
 
     @property
@@ -157,7 +168,10 @@ class NewObjects(pygit2.OdbBackend):
                     keep.unlink()
 
     def _copy_to_pack(self, folder: str, revisions: str) -> Path:
-        """Have git write checked objects to a synced pack, and return the pack's path."""
+        """Have git write the objects that ``revisions`` selects to a synced pack in ``folder``.
+
+        Return the pack's path. Git checks the objects, because it does not copy packed bytes.
+        """
         done = subprocess.run(
             ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
              "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
@@ -210,7 +224,7 @@ class NewObjects(pygit2.OdbBackend):
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return type, content and id of a new object; a shortened id finds nothing here."""
+        """Return type, content and id of the new object with this full id; find no shortened id."""
         kind, data = self._known[oid]
         return kind, data, oid
 
@@ -231,7 +245,10 @@ def _entries_of(data: bytes) -> Entries:
 
 @contextmanager
 def _folder_until_done(parent: str) -> Iterator[str]:
-    """Yield a new folder, and remove it at the end. If that fails, the next start removes it."""
+    """Yield a new folder, and remove the folder after the block.
+
+    If the folder cannot be removed, the next start of the program removes it.
+    """
     folder = mkdtemp(dir=parent, prefix=UNFINISHED)
     try:
         yield folder
@@ -242,7 +259,10 @@ def _folder_until_done(parent: str) -> Iterator[str]:
 
 @contextmanager
 def _locked(folder: Path, how: int) -> Iterator[None]:
-    """Lock a folder within the block; writers of packs share the lock."""
+    """Lock a folder while the block runs; ``how`` is the operation of ``flock``.
+
+    Several writers of packs may share the lock.
+    """
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(handle, how)
@@ -252,15 +272,18 @@ def _locked(folder: Path, how: int) -> Iterator[None]:
 
 
 def _pack_in(folder: str) -> Path:
-    """Return the only pack in a folder. Unlike glob, raise if the folder cannot be read."""
+    """Return the path of the only pack in a folder.
+
+    Raises OSError if the folder cannot be read. :meth:`Path.glob` would not raise.
+    """
     (pack,) = [path for path in Path(folder).iterdir() if path.suffix == ".pack"]
     return pack
 
 
 def _mark(keep: Path, index: Path) -> None:
-    """Make the .keep of a pack: a link to its index, which is synced already.
+    """Make the .keep file of a pack: a hard link to the pack's index, which is synced already.
 
-    On a file system without hard links, the .keep is a new file, synced before it gets its name.
+    On a file system without hard links, write and sync a new file, then move it to ``keep``.
     """
     try:
         keep.hardlink_to(index)

@@ -1,4 +1,4 @@
-"""How a state repo is opened by its address: a folder, or a URL that Git can clone."""
+"""Opens a state repo by its address: a folder, or a URL that Git can clone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 
 
 def is_url(address: str) -> bool:
-    """Return whether this is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
+    """Return whether an address is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``).
+
+    The path of an existing file or folder is not a URL.
+    """
     try:
         exists = Path(address).exists()
     except OSError:  # the address is too long, or in a folder that this user cannot read
@@ -40,12 +43,14 @@ def connect(
     allow_offline: bool = False,
     only_read: bool = False,
 ) -> StateRepository:
-    """Return the state repo at an address: a bare repository, or a URL, cloned to ``folder``.
+    """Return the state repo at an address.
 
     Args:
+        address: the folder of a bare repository, or a URL.
+        folder: the folder in which the clone of a URL is made.
         notify: called with a text before work that takes a while.
         allow_offline: use an existing clone if its remote cannot be reached.
-        only_read: the address may also be a checkout.
+        only_read: the address may also be the folder of a checkout.
 
     Raises:
         StateRepoError: the address is not usable, or the remote cannot be reached.
@@ -56,7 +61,7 @@ def connect(
     try:
         path = Path(address).expanduser()
         is_folder = path.is_dir()
-    except (OSError, ValueError, RuntimeError) as error:  # ``~x``, but there is no user x
+    except (OSError, ValueError, RuntimeError) as error:  # for example ``~x`` without a user x
         reason = getattr(error, "strerror", None) or str(error)
         raise StateRepoError(
             f"{quoted(address)} cannot be opened: {reason}; name the folder of a state repo"
@@ -71,7 +76,7 @@ def connect(
 
 
 def _check_url(url: str) -> None:
-    """Refuse a URL that git accepts but a generator should not use."""
+    """Raise StateRepoError if a URL has another scheme, holds a password or token, or no host."""
     scheme = _SCHEME.match(url)
     if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
         raise StateRepoError(

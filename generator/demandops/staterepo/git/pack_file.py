@@ -1,7 +1,7 @@
-"""A pack and its index, as Git reads them, written and synced.
+"""Writes and syncs a pack and its index in Git's format.
 
-Objects are compressed and stored whole. A search for deltas would cost more than the rest of a
-demand's commit; git's housekeeping makes them later (:mod:`demandops.staterepo.git.new_objects`).
+Each object is compressed and stored whole, not as a delta. To search for deltas would take longer
+than the rest of a demand's commit. Git's housekeeping makes deltas later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 _LEVEL = 1
 """The level of compression. A pack is short-lived, so speed counts more than size."""
 _SHORT_OFFSETS = 1 << 31
-"""An index keeps offsets of at least this size in a separate table."""
+"""An index keeps offsets from this value on in a separate table."""
 
 
 class Packed(NamedTuple):
@@ -37,7 +37,7 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
     """Write a pack and its index into a folder, sync both, and return the pack's path.
 
     Raises:
-        OSError: if either cannot be written or synced.
+        OSError: if the pack or the index cannot be written or synced.
     """
     parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
     packed, offset = list[Packed](), len(parts[0])
@@ -54,7 +54,10 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
 
 
 def _header(kind: int, size: int) -> bytes:
-    """Return the type and size of an object, seven bits of the size in each byte but the first."""
+    """Return the header of an object in a pack: its type and size.
+
+    The first byte has the type and four bits of the size. Each further byte has seven bits.
+    """
     first, size = kind << 4 | size & 0xF, size >> 4
     header = bytearray()
     while size:
@@ -65,7 +68,12 @@ def _header(kind: int, size: int) -> bytes:
 
 
 def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
-    """Return the parts of an index (version 2) for a pack with this checksum."""
+    """Return the bytes of the index (version 2) of a pack, in parts.
+
+    Args:
+        packed: the objects in the pack.
+        checksum: the checksum of the pack.
+    """
     found = sorted(packed)
     firsts = [one.oid[0] for one in found]
     far = [one.offset for one in found if one.offset >= _SHORT_OFFSETS]

@@ -43,14 +43,14 @@ _TEMPORARY = re.compile(
 )
 """Matches a temporary rejection: the cause is the server or another writer, not a rule."""
 _RULE = re.compile(r"fsck|exceeds maximum|[Ii]nsufficient permission")
-"""Matches the server's reason if the server will never accept the push."""
+"""Matches the reason of a permanent rejection: the server will never accept the push."""
 _WITHOUT_REASON = re.compile(
     r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
     r"error: failed to push some refs|Please make sure you have the correct access|"
     r"and the repository exists|send-pack: unexpected disconnect|"
     r"fatal: unknown error occurred while reading the configuration files"
 )
-"""Matches the last lines of git's output that give no reason."""
+"""Matches lines at the end of git's output that do not give the reason of a failure."""
 _REMEDIES = (
     (
         re.compile(r"resolve host|Name or service not known", re.IGNORECASE),
@@ -73,23 +73,23 @@ _REMEDIES = (
         "check the host and the port in the address, and the network",
     ),
 )
-"""Matches git's reason → what to do about it."""
+"""Pairs: a pattern that matches git's reason, and the remedy for a person."""
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
-"""The limit of a first clone. Git ends an idle connection much earlier."""
+"""How many seconds a clone may take. Git ends an idle connection much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 _NO_CLONE = re.compile(
     r"^(?!remote:).*fatal: (not a git repository|'origin' does not appear to be a git|"
     r"detected dubious ownership in repository at '.*/clone\.git')",
     re.MULTILINE,
 )
-"""Matches git's error if it cannot read the clone in which it runs.
+"""Matches git's error if git cannot read the clone in which it runs.
 
-Git knows no ``origin`` if it finds nothing in the clone's configuration.
+If git finds no remote in the clone's configuration, its error is about ``origin``.
 """
 _NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
-"""Matches git's error if it cannot read a file (not a URL), here or on the server."""
+"""Matches git's error if git cannot read a file, here or on the server. A URL does not match."""
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
@@ -124,7 +124,7 @@ class RemoteRepository(StateRepository):
         self._folder = folder
         self._aborted = False
         self._process: subprocess.Popen[bytes] | None = None
-        for lock in folder.rglob("*.lock"):  # left by a killed process: no other uses the folder
+        for lock in folder.rglob("*.lock"):  # of a killed process: only this one uses the folder
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
@@ -180,7 +180,8 @@ class RemoteRepository(StateRepository):
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
                 config.set_value("gc", "auto", 0)
-                # keep a fetched pack, which git syncs: libgit2 hangs on a half-written loose object
+                # Keep each fetched pack, because git syncs packs. Loose objects may be half-written
+                # after a crash, and libgit2 hangs on them.
                 config.set_value("fetch", "unpackLimit", 1)
             partial.joinpath("config").chmod(0o600)
             self._fetch(repo, timeout=_CLONE_TIMEOUT_S)
@@ -194,12 +195,17 @@ class RemoteRepository(StateRepository):
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = TIMEOUT_S,
     ) -> None:
-        # not in the configuration, or a push that outlives its generator moves the reference
+        # The refspec is not in git's configuration. If it were, a push that outlives its generator
+        # would move the reference.
         spec = f"+{MAIN}:{_REMOTE_MAIN}"
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch and return the tip; stop if ``urgent``: a demand must not wait for the remote."""
+        """Fetch, and return the remote's tip; raise RemoteAway if the remote cannot be reached.
+
+        Raises FetchInterrupted as soon as ``urgent`` returns true, because a demand must not wait
+        for the remote.
+        """
         self._fetch(self._git, urgent)
         return self.tip()
 
@@ -209,7 +215,7 @@ class RemoteRepository(StateRepository):
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except git.GitCommandError as error:
-            if _REMOTE_MOVED.search(str(error)):  # git noticed before it sent anything
+            if _REMOTE_MOVED.search(str(error)):  # git sent nothing
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
@@ -224,13 +230,19 @@ class RemoteRepository(StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        """Return name → commit of the remote's references that match, or raise RemoteAway."""
+        """Return name → commit of the remote's references that match ``patterns``.
+
+        Raises RemoteAway if the remote cannot be reached.
+        """
         out = self._read(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches with a prefix and drop deleted ones, or raise RemoteAway."""
+        """Fetch the branches whose names begin with ``prefix``, or raise RemoteAway.
+
+        Branches that the remote has deleted are removed here too.
+        """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         self._read(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
@@ -251,7 +263,7 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return the error to raise for a failed push: ``PushDenied`` if it will always fail."""
+        """Return the error to raise for a failed push; ``PushDenied`` if a retry would fail too."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()
@@ -293,7 +305,7 @@ class RemoteRepository(StateRepository):
             raise self._unreadable()
         failed = "read" if command[0] == "ls-remote" else "fetched"
         reason = _reason(text)
-        known = _NO_FILE.sub("", reason)  # credentials do not help with a file
+        known = _NO_FILE.sub("", reason)  # credentials do not make a file readable
         remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(known)), "")
         raise RemoteAway(f"{self.address} cannot be {failed}: {reason}{remedy}")
 
@@ -342,7 +354,7 @@ class RemoteRepository(StateRepository):
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
     def abort(self) -> None:
-        """End the running git command and start no more."""
+        """End the running git command, if any; each later command raises RemoteAway."""
         self._aborted = True
         process = self._process
         if process is not None:
@@ -353,7 +365,10 @@ class RemoteRepository(StateRepository):
 def _wait_for(
     process: subprocess.Popen[bytes], urgent: Callable[[], bool], timeout: float, slow: SlowGit
 ) -> tuple[bytes, bytes]:
-    """Return git's output; end git if it takes too long or something is urgent."""
+    """Return git's standard output and error output; end git after ``timeout`` seconds.
+
+    If ``urgent`` returns true before that, end git and raise FetchInterrupted.
+    """
     start = REAL.monotonic()
     end = start + timeout
     while True:
@@ -371,7 +386,10 @@ def _wait_for(
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its children and return the output; SIGTERM first, to let git unlock."""
+    """End git and its children, and return git's standard output and error output.
+
+    The first signal is SIGTERM, so that git can remove its locks.
+    """
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)

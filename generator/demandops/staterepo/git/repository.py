@@ -1,7 +1,7 @@
-"""The state repo that a writer uses: Git objects, and a tip that only moves forward.
+"""The base class of state repos: Git objects, and a tip that only moves forward.
 
-There are two kinds, on this disk and behind a URL;
-:mod:`demandops.staterepo.git.open_repository` chooses.
+A state repo is on this disk or behind a URL. For each of the two there is a subclass;
+:mod:`demandops.staterepo.git.open_repository` chooses it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class DiskFull(Unavailable):
 
 
 class FetchInterrupted(StateRepoError):
-    """Raised when a fetch ended because something was more urgent."""
+    """Raised when a fetch was stopped for more urgent work, like a new demand."""
 
 
 class PushDenied(StateRepoError):
@@ -62,10 +62,10 @@ _TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objec
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
-    """Return the error to raise if the disk prevented a write to the state repo, or None.
+    """Return the error to raise if the disk caused ``error``, which prevented a write, else None.
 
-    libgit2 gives the number of an error only as text. After an I/O error nobody knows what is on
-    the disk.
+    libgit2 gives the system's error only as text, so this function recognizes the text. For an
+    I/O error it returns Unsound, because the content of the disk is then unknown.
     """
     number = getattr(error, "errno", None)
     if number is None:
@@ -106,11 +106,11 @@ class StateRepository(ABC):
     """The objects that were written since the last publication."""
     address: str
     signer: Signer | None = None
-    """Signs the commits made here; None: they are not signed."""
+    """Signs the commits that this process makes. If it is None, they are not signed."""
     runtime: Runtime = REAL
     """The clock, randomness and threads of the code that writes to the state repo."""
     always_current: bool
-    """Whether :meth:`tip` is never out of date (a repository on this disk)."""
+    """Whether :meth:`tip` is never out of date. True for a repository on this disk."""
     _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
     """The reference of main, or of its remote-tracking branch."""
@@ -132,10 +132,11 @@ class StateRepository(ABC):
 
     @abstractmethod
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Make ``commit`` the tip, durably, if the tip is ``expected``; else return false.
+        """Make ``commit`` the tip, durably, and return true.
 
-        Raises Unavailable or PushDenied if it could not be published for another reason, and
-        Unsound if nobody knows whether it was published.
+        If the current tip is not ``expected``, change nothing and return false. Raises Unavailable
+        or PushDenied if the commit could not be published for another reason. Raises Unsound if
+        nobody knows whether the commit was published.
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
@@ -161,7 +162,10 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` is equal in two commits; false if either is unknown here."""
+        """Return whether ``path`` exists and is equal in two commits.
+
+        False if either commit is unknown here.
+        """
         found = self._trees(commit, other)
         if found is None:
             return False
@@ -194,7 +198,7 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git join the packs in the background, unless it is still doing so."""
+        """Have git join the packs in the background, unless an earlier call still does so."""
         if self._tidying is not None and self._tidying.poll() is None:
             return
         self._tidying = subprocess.Popen(

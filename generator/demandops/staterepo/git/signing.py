@@ -24,14 +24,17 @@ _PROBE = b"demandops: can this key sign?\n"
 
 
 class SigningFailed(StateRepoError):
-    """Raised instead of making a commit that cannot be signed."""
+    """Raised when the key cannot sign; then no commit is made."""
 
 
 class Signer:
     """Signs with one key: a private key file, or the public file of a key that an agent holds."""
 
     def __init__(self, key: Path) -> None:
-        """Try the key, so that a useless key is noticed before a demand is accepted."""
+        """Sign a test text with the key, or raise SigningFailed.
+
+        So a key that cannot sign is noticed before a demand is accepted.
+        """
         self.key = key.expanduser()
         if not self.key.is_file():
             raise SigningFailed(

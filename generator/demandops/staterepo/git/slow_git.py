@@ -11,24 +11,34 @@ _listeners: list[Callable[[str], None]] = []
 
 
 def listen(listener: Callable[[str], None]) -> None:
-    """Call ``listener`` each second with what git does, and with an empty text when git ends."""
+    """Register the listener, instead of an earlier one.
+
+    A slow run of git calls the listener each second with a text about what git does, and with an
+    empty text when git has ended.
+    """
     _listeners[:] = [listener]
 
 
 class SlowGit:
-    """One run of git, and how long it takes."""
+    """Reports to the listener how long one run of git takes."""
 
     def __init__(self, what: str) -> None:
         self._what, self._told = what, 0
 
     def lasts(self, seconds: float) -> None:
-        """Call the listener once a second, after :data:`AFTER_S`."""
+        """Report that git has run for ``seconds``.
+
+        The listener is called at most once a second, and not before :data:`AFTER_S` seconds.
+        """
         if int(seconds) > self._told and int(seconds) >= AFTER_S:
             self._told = int(seconds)
             for listener in _listeners:
                 listener(f"{self._what}, {self._told} s")
 
     def ends(self) -> None:
-        """Call the listener with an empty text, so that it clears what it shows."""
+        """Report that git has ended.
+
+        A listener that was called for this run is called with an empty text, to clear its output.
+        """
         for listener in _listeners if self._told else ():
             listener("")

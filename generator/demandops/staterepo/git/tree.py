@@ -11,7 +11,8 @@ from pygit2.enums import FileMode, ObjectType
 from demandops.errors import StateRepoError
 from demandops.staterepo.git.new_objects import Entries, NewObjects
 
-pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)  # a reported commit is on the disk
+# Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
+pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 # By default libgit2 does not cache trees over 4 KiB and parses them at every look-up.
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
@@ -60,13 +61,16 @@ def entry_id(tree: Tree | None, path: str) -> Oid | None:
 
 
 def read_text(tree: Tree | None, path: str) -> str | None:
-    """Return the text of a file, or None."""
+    """Return the text of the file at a path, or None if there is no file."""
     found = entry(tree, path)
     return text_of(found) if isinstance(found, Blob) else None
 
 
 def text_of(blob: Object) -> str:
-    """Return the text of a file. Invalid UTF-8 is replaced, so that it is visible."""
+    """Return the text of a file, or an empty text for any other object.
+
+    Invalid UTF-8 is replaced by a visible character.
+    """
     return blob.data.decode("utf-8", "replace") if isinstance(blob, Blob) else ""
 
 
@@ -122,9 +126,10 @@ def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
 def differences(
     before: Tree | None, after: Tree | None, roots: Iterable[str] = ()
 ) -> Iterator[tuple[str, Oid | None]]:
-    """Yield (path, new blob id or None) of each file that differs; skip equal subtrees.
+    """Yield (path, new id) of each file that differs between two trees.
 
-    It compares what is at or below the paths ``roots``, by default everything.
+    The new id is the file's id in ``after``, or None if the file was removed. Only files at or
+    below the paths ``roots`` are compared; by default all files. Equal subtrees are not read.
     """
     if not roots:
         yield from _differences_below(before, after, "")
@@ -202,7 +207,10 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
-    """Return the raw name of the entry that is shown as ``name``, or ``name`` encoded."""
+    """Return the raw name of the entry that the program shows as ``name``.
+
+    If there is no such entry, return ``name`` in UTF-8.
+    """
     raw = name.encode()
     if raw in entries or b"\\" not in raw:
         return raw

@@ -32,7 +32,10 @@ class Check(NamedTuple):
 
 
 _good: dict[str, Check] = {}
-"""The good checks so far, by commit: a commit, its signature and its parent never change."""
+"""Commit → check, for each commit whose signature was found valid.
+
+A check stays true, because a commit, its signature and its parent never change.
+"""
 
 
 def are_listed(repo: Repository, commit: Oid) -> bool:
@@ -46,7 +49,7 @@ def signature_of(commit: Commit) -> str:
 
 
 def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
-    """Return commit → fault of each commit that should have a good signature and has none."""
+    """Return commit → fault of each commit whose required signature is missing or not valid."""
     return {commit: one.fault for commit, one in checks(repo, commits).items() if one.fault}
 
 
@@ -74,7 +77,10 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
 
 
 def _fault(signature: str, state: str) -> str:
-    """Return why a signature is not valid; ``state`` is git's letter for it."""
+    """Return why a signature is not valid, or an empty text if it is valid.
+
+    ``state`` is the letter that git prints for the signature (``%G?``).
+    """
     if not signature:
         return f"is not signed, but {ALLOWED_SIGNERS} requires it"
     if state == "B":
@@ -87,7 +93,10 @@ def _fault(signature: str, state: str) -> str:
 def _check_with_git(
     repo: Repository, allowed: str, commits: list[str]
 ) -> Iterable[tuple[str, str, str]]:
-    """Return for each commit its id, git's letter for its signature, and the signer."""
+    """Return for each commit its id, git's letter for its signature, and the signer.
+
+    ``allowed`` is the text of the list of keys.
+    """
     with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
         file = Path(folder) / "allowed-signers"
         file.write_text(allowed)

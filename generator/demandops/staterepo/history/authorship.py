@@ -1,6 +1,6 @@
-"""Authors: the commits by people, and the person who runs this program.
+"""Authors: who made the commits by people, and who runs this program.
 
-A follow commit renders what people committed; it names these commits, and their authors become its
+A follow commit renders what people committed. It names their commits, and has their authors as its
 author. A commit is by a person if no generator on any machine made it (:mod:`.commit_log`).
 """
 
@@ -36,7 +36,7 @@ class Person(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether git's configuration has the address; else the address is made from the login."""
+        """Whether git knows the address; if not, the address was made from the login."""
         return not self.email.endswith(_NO_ADDRESS)
 
     def __str__(self) -> str:
@@ -50,12 +50,13 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return a function that finds the commit and author of people's last change to a path.
+    """Return a function from a path to the commit and author of people's last change to the path.
 
-    If no person changed the path, the function finds people's last change to any path.
+    The function considers the commits after ``known`` up to ``to``. If none of them changed the
+    path, it returns people's last change to any path. If there is none, it returns None.
     """
 
-    @cache  # read only when needed: most problems are already in the report
+    @cache  # the commits are read only when needed: most problems are already in the report
     def commits() -> list[Commit]:
         return list(commit_log.person_commits(repo, to, known))
 
@@ -80,14 +81,19 @@ def author_of(commit: Commit) -> Person:
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return ``Caused-By: <commit> <name> <email>`` for the newest commits, oldest first."""
+    """Return a trailer ``Caused-By: <commit> <name> <email>`` for each cause, oldest first.
+
+    ``causes`` are listed newest first. Only the newest :data:`_MOST_NAMED` get a trailer.
+    """
     return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
 
 
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
     """Return the author of a follow commit: the people whose commits it renders.
 
-    If it is one person, name and address are kept, so that ``git log --author`` finds both commits.
+    For one person, the author has the person's name and address, so that ``git log --author``
+    finds the follow commit too. For several people, the address is the generator's. If there are
+    no ``causes``, the author is the generator.
     """
     if not causes:
         return commit_message.generator_signature(now)

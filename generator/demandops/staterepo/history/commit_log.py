@@ -47,9 +47,10 @@ class LogEntry:
     by_generator: bool = False
     """Whether the generator is the committer; then the files should match the ledger.
 
-    The message alone proves nothing, because anybody may write trailers. A proposal has False: a
-    person merges it, perhaps onto other changes, so its files are read again.
-    :func:`is_by_generator` also requires a signature.
+    The trailers alone do not prove this, because anybody may write them. The value is False for a
+    commit of a proposal: a person merges the proposal, perhaps onto other changes, so the
+    generator must read the files again. :func:`is_by_generator` also checks the signature, if one
+    is required.
     """
     authored: datetime | None = None
     """The author's time; for a demand's commit, the time when the demand was received."""
@@ -131,7 +132,10 @@ def person_commits(
 def _told_apart(
     repo: Repository, tip: str | Oid, until: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return commits and entries; ``by_generator`` is false if a required signature is bad."""
+    """Return the pairs of :func:`commits`, with the signatures checked.
+
+    ``by_generator`` is false if a required signature is missing or not valid.
+    """
     found = list(commits(repo, tip, until))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
     return [
@@ -148,7 +152,7 @@ def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
 
 
 Settled = Literal["unchanged", "waiting", "released", "refused"]
-"""The outcomes of demands that need no commit; the next commit's message records them."""
+"""The outcomes of demands that get no commit of their own; the next commit records them."""
 _Outcome = Literal["changed", Settled]
 
 
@@ -172,7 +176,7 @@ class RecordedOutcome:
 
 
 def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
-    """Return operation id → outcome of every demand that commits after ``base`` record.
+    """Return operation id → outcome of every demand that is recorded in a commit after ``base``.
 
     A person's merge of a proposal may keep the proposal's trailers; any other commit by a person
     records no demand. If ``base`` is unknown, because the remote was made anew, the whole history
@@ -211,10 +215,11 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class PathHistory:
-    """The commits that last added a path, changed it since, and removed it.
+    """The commits that changed a path since it was added for the last time.
 
-    ``newest`` lists commits that changed the path since it was added, newest first; ``more`` counts
-    the older ones. ``stopped`` is the commit that removed the path, or None if the path exists.
+    ``started`` is the commit that added the path. ``newest`` lists the commits that changed the
+    path afterwards, newest first. ``more`` counts the older changes, which are not listed.
+    ``stopped`` is the commit that removed the path, or None if the path exists.
     """
 
     started: LogEntry | None
@@ -252,7 +257,10 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of a release, or of the last stopped release with this name, or None."""
+    """Return the path of the release ``name``.
+
+    If it does not exist, return the path of the last stopped release ``name``, or None.
+    """
     if not _NAME.fullmatch(name):
         return None
     files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
@@ -273,7 +281,7 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 
 
 def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
-    """Return the items that ``git log`` prints; ``query`` has its options, then the path."""
+    """Return the items that ``git log`` prints; ``query`` has options for git, then the path."""
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
     with git.Repo(repo.path) as opened:

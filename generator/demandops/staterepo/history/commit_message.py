@@ -44,7 +44,10 @@ _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an
 
 
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
-    """Return a person and a time as Git's signature, without characters that Git refuses."""
+    """Return an author or committer as Git records it: name, address and time.
+
+    Characters that Git refuses are left out.
+    """
     address = one_line(_UNFIT.sub("", email), _MAX_AUTHOR).strip(_CRUD) or GENERATOR_EMAIL
     plain = one_line(name.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
     return pygit2.Signature(plain.strip(_CRUD) or "unnamed", address, int(time.timestamp()), 0)
@@ -76,7 +79,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 def of_decision(
     decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``settled`` has further trailers for it."""
+    """Return the message of a demand's commit; ``settled`` has further trailers."""
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     title, why = _title_and_why(decision, received)
@@ -215,7 +218,16 @@ def of_follow(
     *,
     reports: bool = True,
 ) -> str:
-    """Return the message of a commit that renders people's changes of the state repo."""
+    """Return the message of a commit that renders people's changes of the state repo.
+
+    Args:
+        releases: the releases that the commit changes.
+        cause: the newest commit by people that is rendered.
+        since: the commit of the state before people's changes.
+        problems: the faults of invalid files.
+        more: further trailers.
+        reports: whether the commit changes the problem report.
+    """
     problems, releases = list(problems), tuple(releases)
     names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
     title = f"Update ledger{after}"

@@ -24,7 +24,7 @@ _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-"""A quoted value; it has an escape, because only values that need one are quoted."""
+"""Matches a quoted value. It contains an escape, because only such values are quoted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,21 +37,27 @@ class MessageText:
 
 
 def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
-    """Return a message of paragraphs, each a list of lines, and trailers; leave out empty ones."""
+    """Return a message: paragraphs, each a list of lines, then the trailers.
+
+    Empty paragraphs, and trailers with an empty value, are left out.
+    """
     lines = [f"{key}: {_encoded(value)}" for key, value in trailers if value]
     body = ("\n".join(map(one_line, paragraph)) for paragraph in paragraphs)
     return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
 
 
 def parse(message: str) -> MessageText:
-    """Return the summary, the reason and the trailers of any message, even of a person's."""
+    """Return the summary, the reason and the trailers of any commit's message."""
     lines = message.split("\n")
     whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
     return MessageText(lines[0], next(whys, ""), _trailers(message))
 
 
 def _trailers(message: str) -> dict[str, list[str]]:
-    """Return the lines ``Key: value`` of the last paragraph; none if it has any other line."""
+    """Return key → values of the trailers: the lines ``Key: value`` of the last paragraph.
+
+    If the paragraph has any other line, return no trailers.
+    """
     trailers: dict[str, list[str]] = {}
     head, _, last = message.rstrip("\n").rpartition("\n\n")
     for line in last.split("\n") if head else ():

@@ -31,11 +31,12 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
     """Return the time that a text names, or None.
 
     Args:
-        text: a date, a time of the day (the last time the clock showed it), both, or a duration
-            before ``now`` (``2h``, ``1h30m``, ``2d``).
-        now: with time zone.
-        end: whether a date means the end of its day, and a time without seconds the end of its
-            minute, instead of the beginning.
+        text: a date, a time of day, a date with a time of day, or a duration before ``now``
+            (``2h``, ``1h30m``, ``2d``). A time of day without a date means its last occurrence
+            before ``now``.
+        now: the current time, with a time zone.
+        end: if true, a date means the end of its day, and a time without seconds means the end of
+            its minute. If false, they mean the beginning.
     """
     text = text.strip()
     try:
@@ -99,7 +100,7 @@ def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
 
 
 def format_time(at: datetime) -> str:
-    """Return a time in the form that people read."""
+    """Return a time as messages show it: ``2026-01-31 14:03:00 UTC``."""
     return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 

@@ -1,8 +1,9 @@
-"""The configuration at a commit; the last valid versions of files replace invalid ones.
+"""The configuration at a commit, with the last valid versions of invalid files.
 
-If a file is invalid, its last valid version is in effect. The same is true for the other files of
-its application definition, and for all files of the commits that changed it: a commit applies whole
-or not at all. All other changes apply. If the result is not valid either, no change applies.
+If a file is invalid, its last valid version is in effect. A commit applies whole or not at all, so
+this is also true for all files of each commit that changed the file. It is also true for the other
+files of the same application definition. All other changes apply. If the result is still not valid,
+no change applies.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ NO_STATE_REPO = (
 )
 
 Replacements = Mapping[str, Oid | None]
-"""Path → the blob in effect instead of the commit's; None if no such file is in effect."""
+"""Path → the blob that is in effect instead of the commit's file; None if no file is in effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +55,8 @@ class ConfigSource:
 class LastValidConfig:
     """A commit's configuration, with the last valid versions of its invalid files.
 
-    ``config`` is None if no version is valid.
+    ``config`` is None if the configuration is not valid even with these versions. ``source`` is
+    then the source of the configuration that was in effect before.
     """
 
     config: Config | None
@@ -76,12 +78,15 @@ def end_markers_at(tree: Tree) -> dict[str, str]:
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return override → the time at which it ended."""
+    """Return override → end time, for each ended override."""
     return ended_override_file.read(end_markers_at(tree))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise if another version renders this repo, because two versions undo each other's work."""
+    """Raise StateRepoError if a generator of another version writes this repo.
+
+    Generators of two render versions would undo each other's changes.
+    """
     for folder in RESERVED_FOLDERS:
         if trees.entry_id(tree, folder) is not None:
             raise StateRepoError(
@@ -113,9 +118,11 @@ def load_last_valid_config(
     """Return the configuration of a commit, with the last valid versions of invalid files.
 
     Args:
-        before: the source of the configuration that was in effect.
+        repo: the repository.
+        before: the source of the configuration that was in effect before ``to``.
         last_valid_commit: the newest commit where all files were valid.
-        load: makes a configuration from texts, or raises ``InvalidInput``.
+        to: the commit to load.
+        load: returns the configuration of path → text, or raises ``InvalidInput``.
     """
     known, source = before.files(repo), ConfigSource(to)
     files = source.files(repo)
@@ -139,7 +146,11 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return the broken files, and all files of the same commits or the same definitions."""
+    """Return the broken files, and all files that must apply together with them.
+
+    A file must apply together with the other files of a commit that changed it, and of its
+    application definition. This is repeated for each file that is found.
+    """
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}

@@ -23,7 +23,7 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class ClaimFiles:
-    """The claims of some files, and the faults of the files that are not valid."""
+    """The claims that were read from files, and the faults of the files that are not valid."""
 
     claims: tuple[Claim, ...]
     faults: tuple[Fault, ...]
@@ -64,7 +64,10 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
 
 
 def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
-    """Return the key of the claim in effect at a path, or None; search the whole ledger."""
+    """Return the key of the claim that the ledger has for a path, or None.
+
+    This searches the whole ledger.
+    """
     if claim_file.kind_of(path) is None:
         return None
     return next((one.key for one in ledger if claim_file.path_of(one.key) == path), None)
@@ -73,10 +76,11 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
 def last_valid_claims(
     repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
-    """Return path → the claim as the generator last wrote it, without manual edits.
+    """Return path → the claim that the generator last wrote, without manual edits.
 
-    ``last_valid_commit`` is the newest commit with only valid files. Its claim is returned if the
-    generator wrote none after it.
+    The claim is None if the generator wrote none, or removed it. ``last_valid_commit`` is the
+    newest commit with only valid files. If the generator has not changed the file since, the claim
+    at this commit is returned.
     """
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
@@ -91,7 +95,10 @@ def last_valid_claims(
 
 
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
-    """Return the lease that a claim had on main before the proposal that changes it was merged."""
+    """Return the lease that a claim had on main before its proposal was merged.
+
+    None if the claim did not exist then, or had no lease.
+    """
     for commit in commit_log.first_parents(repo, to):
         claim = valid_claim_at(commit.tree, path)
         if claim is None or claim.lease is None or claim.lease.has_started:
@@ -102,11 +109,13 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
 ) -> list[ClaimChange]:
-    """Return people's changes of claims: ``before`` is the claim that the generator last wrote.
+    """Return people's changes of claims, each from the claim that the generator last wrote.
 
     Args:
-        last_valid_commit: the newest commit with only valid files; older claims are left out.
-        known: the claims that were in effect before; these are left out too.
+        repo: the repository.
+        last_valid_commit: the newest commit with only valid files; older changes are left out.
+        to: the newest commit to consider.
+        known: the claims that were in effect before; a claim that equals one of them is left out.
     """
     paths = {
         path
@@ -122,7 +131,11 @@ def claims_by_people(
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
-    """Return the request to roll back to a commit, or raise every fault of its claim files."""
+    """Return the request to roll back to the ledger of the commit ``to``.
+
+    ``more`` has further fields of the request. Raises InvalidInput with every fault of the
+    commit's claim files.
+    """
     commit = trees.commit_of(repo, to)
     found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
     if found.faults:

@@ -1,7 +1,8 @@
 """The problem report: a file in the state repo that lists the invalid files.
 
-It names each fault, the commit that caused it, and the author of the commit. The same problems give
-the same bytes, so an unchanged report causes no commit. Pure: texts and faults in, text out.
+The report names each fault, the commit that caused it, and the author of the commit. The same
+problems give the same bytes, so an unchanged report causes no commit. This module only converts
+between problems and text; it reads and writes no files.
 """
 
 from __future__ import annotations
@@ -44,13 +45,16 @@ class Problem:
 
 
 Origin = Callable[[str], tuple[str, str] | None]
-"""Maps a path to the commit and the author that last changed it."""
+"""Maps a path to the commit and the author that last changed the path; None if unknown."""
 
 
 def with_origins(
     faults: Iterable[Fault], known: Iterable[Problem], origin: Origin
 ) -> tuple[Problem, ...]:
-    """Return a problem for each fault; a known problem keeps its commit and author."""
+    """Return a problem for each fault.
+
+    A known problem keeps its commit and author. ``origin`` finds those of a new problem.
+    """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     problems = []
     for fault in sorted({(fault.file, fault.field, fault.message) for fault in faults}):

@@ -62,14 +62,18 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot moved to a commit of this program, with that commit's state."""
+        """Return the snapshot of a commit that this process made; ``state`` is its state."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A later snapshot, and the subjects that changed since the earlier one."""
+    """A later snapshot, and what changed since the earlier one.
+
+    ``subjects`` are those whose claims changed. ``config_changed`` is true if all releases must be
+    rendered again.
+    """
 
     snapshot: Snapshot
     subjects: tuple[Subject, ...]
@@ -84,7 +88,8 @@ def load(
     ``progress`` is called with (files read, all files) of the ledger.
 
     Raises:
-        InvalidInput, StateRepoError: with every fault of every file.
+        InvalidInput: files of the configuration or the ledger are not valid.
+        StateRepoError: Git does not know the revision, or it is not of a state repo.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
@@ -117,12 +122,16 @@ def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
 def advance(
     repo: Repository, before: Snapshot, to: Oid, recorded: ConfigSource | None = None
 ) -> Advance:
-    """Return the advance of a snapshot to another commit; read only what differs.
+    """Return the advance from the snapshot ``before`` to the commit ``to``.
 
-    Invalid changes are not applied; the new snapshot's problems list them.
+    Only files that differ are read. Invalid changes are not applied; the new snapshot's problems
+    list them.
 
     Args:
-        recorded: the source of the configuration in effect at ``to``, if that is known.
+        repo: the repository.
+        before: the earlier snapshot.
+        to: the later commit.
+        recorded: the source of the configuration in effect at ``to``, if it is known.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
     state, known = before.state, LastValidConfig(None, before.config_source, ())
@@ -183,7 +192,10 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
 
 
 def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
-    """Yield the service instances whose kept replicas differ, and what they keep now."""
+    """Yield (instance, new steps) of each service instance whose kept replicas differ.
+
+    The steps are empty if the instance keeps no replicas any more.
+    """
     for path, _ in trees.differences(old, new, (kept_replicas.REPLICAS_ROOT,)):
         texts = [trees.read_text(tree, path) for tree in (old, new)]
         before, after = (kept_replicas.read(text, path) if text else None for text in texts)
@@ -194,8 +206,9 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
     """Return whether every release must be rendered to find the generated files that must change.
 
-    At a generator's newest commit, generated files match the ledger. After that commit, people may
-    have edited the files, or undone what another generator committed since ``before``.
+    If a generator made the newest commit, generated files match the ledger, so the result is false.
+    Otherwise people may have edited the files, or undone what another generator committed since
+    ``before``.
     """
     people = list(commit_log.person_commits(repo, to, before))
     if not people or people[0].id != to:
@@ -211,7 +224,10 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
 
 
 _judged: dict[object, LastValidConfig] = {}
-"""The newest results, so that a broken file is judged once and not again for each demand."""
+"""The newest results of :func:`_last_valid_config`, by its input.
+
+So an invalid file is judged only once, and not again for each demand.
+"""
 _MOST_JUDGED = 8
 
 
@@ -241,7 +257,11 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration of these files; if it changed, render sample demands with it."""
+    """Return the configuration of files, given as path → text.
+
+    If it differs from that of ``state``, also render sample demands with it. Raises InvalidInput
+    if the files are not valid, or the samples cannot be rendered.
+    """
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config = load_config(files)
@@ -251,10 +271,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Keeps the commits read after the published snapshot, until a commit is published on them.
+    """Remembers, between attempts to publish, what was read after the published snapshot.
 
-    So each attempt to publish reads only new commits. If each attempt read all commits again,
-    faster writers could always publish first.
+    So each attempt reads only the commits that are new since the last attempt. If each attempt read
+    all commits again, faster writers could always publish first.
     """
 
     def __init__(self) -> None:
@@ -262,7 +282,10 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the advance to ``tip``; raise if ``tip`` has another render version."""
+        """Return the advance from ``before`` to ``tip``.
+
+        Raises StateRepoError if ``tip`` has another render version.
+        """
         last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
         known = self._known
         if known is None or self._start != before.commit:

@@ -7,10 +7,10 @@ all files were valid. ``Configuration`` names the commit whose configuration is 
 start from these trailers. They then apply people's later changes with the same code as a running
 generator.
 
-People's changes that cannot be planned are not applied (quarantine). If a claim cannot be planned,
-for example because it names an unknown node, or if it is refused, its file stays as it is and
-its last valid version is in effect. If the new configuration is the reason, the old configuration
-stays in effect.
+People's changes that cannot be planned are not applied (quarantine). A claim may be refused, or it
+may be impossible to plan, for example because it names an unknown node. Then its file stays as it
+is, and its last valid version is in effect. If the new configuration is the reason, the old
+configuration stays in effect.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from demandops.subject import Subject
 _NONE = "none"
 _HELD_BACK = "Held-Back"
 _TO_CHECK = Fault("invalid", "", "must be checked again")
-"""A placeholder: advancing to later commits finds the real problems again."""
+"""A placeholder for a problem that is not known yet; the next advance finds the real problem."""
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
-    """Return the trailers that record the state; none if all files are in effect."""
+    """Return the trailers that record the state in effect; none if all files are in effect."""
     if not snapshot.problems:
         return []
     source = snapshot.config_source
@@ -59,9 +59,10 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Return the state to start from: :func:`start_at` of the newest commit.
+    """Return the state from which a generator starts: :func:`start_at` of the newest commit.
 
-    :func:`demandops.staterepo.load.snapshot.advance` then applies what people changed since.
+    The caller then applies later changes by people with
+    :func:`demandops.staterepo.load.snapshot.advance`.
     """
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(trees.commit_of(objects, tip).tree)
@@ -106,7 +107,7 @@ def start_at(
     if record.first("In-Force"):
         try:
             return recorded_state(repo, record, progress)
-        except (InvalidInput, StateRepoError) as error:  # the record is not a generator's
+        except (InvalidInput, StateRepoError) as error:  # no generator wrote this record
             faults.append(error)
     for ancestor in commit_log.first_parents(repo, record.commit):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in snapshots.ROOTS)
@@ -184,10 +185,10 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 class Judgement:
     """People's changes, and the faults of subjects with the new and with the old configuration.
 
-    If a subject cannot be planned with either configuration, its claims are at fault. If it cannot
-    be planned with the new one only, the new configuration is at fault. If a claim that a person
-    wrote is refused, that claim is at fault. ``refused`` has the faults of refused claims,
-    with the new configuration.
+    If a subject can be planned with neither configuration, its claims are at fault. If it can be
+    planned with the old configuration but not with the new one, the new configuration is at fault.
+    If a claim that a person wrote is refused, that claim is at fault. ``refused`` has the faults of
+    the claims that are refused with the new configuration.
     """
 
     repo: Repository
@@ -220,7 +221,7 @@ class Judgement:
         return self._without(replace(accepted, snapshot=snapshot), self.with_old)
 
     def _without(self, accepted: Advance, faults: Faults) -> Advance:
-        """Return the advance with the last valid claims of faulty subjects in effect."""
+        """Return ``accepted``, with the last valid claims in effect for subjects in ``faults``."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)
@@ -255,7 +256,12 @@ def judge(
     """Return the judgement of people's changes since ``before``.
 
     Args:
-        held_back: claim files that a record lists as not in effect; None: judge the claims.
+        repo: the repository.
+        advance: the advance to the state with all valid changes.
+        before: the snapshot before people's changes.
+        tree: the tree with the current generated files.
+        held_back: the claim files that a generator's commit records as not in effect. If it is
+            None, decide anew which claims are refused.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)

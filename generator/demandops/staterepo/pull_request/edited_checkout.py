@@ -41,7 +41,7 @@ class Base:
     newer: int = 0
     """How many commits the merge target has that the checkout lacks."""
     merged: Mapping[str, str] = field(default_factory=dict)
-    """The generated files of the merge target, if it has such commits."""
+    """The generated files of the merge target, if ``newer`` is not 0; else empty."""
 
     def releases(self) -> dict[ReleaseKey, Release]:
         """Return the releases of ``state``."""
@@ -77,9 +77,12 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
-    """Return the commit that an edit is compared with, or None if Git knows no commit.
+    """Return the commit that an edit is compared with, or None.
+
+    None means that the folder is not a Git checkout, or has no commit yet.
 
     Args:
+        folder: the checkout.
         revision: the merge target, by default ``origin/main``, else ``main``.
 
     Raises:

@@ -1,6 +1,6 @@
-"""The program ``helm``: its report on a chart, as kinds of objects or as faults.
+"""Runs the program ``helm`` on charts, and reads the output: kinds of objects, or faults.
 
-Helm keeps its files in a folder of its own. It has no access to a cluster or to chart repositories.
+Helm gets a home folder of its own. It has no access to a cluster or to chart repositories.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Helm's report on a chart with some values: API group and kind of its objects, or faults."""
+    """Helm's output for a chart: API group and kind of each rendered object, or faults."""
 
     kinds: tuple[tuple[str, str], ...] = ()
     faults: tuple[Fault, ...] = ()
@@ -47,7 +47,10 @@ class Helm:
 
     @staticmethod
     def find(home: Path) -> Helm | None:
-        """Return the program that ``HELM_BIN`` or ``PATH`` names, if there is one."""
+        """Return the program ``helm`` that ``HELM_BIN`` names or ``PATH`` has, or None.
+
+        ``home`` is the folder for helm's files.
+        """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
         return Helm(program, home) if program else None
 
@@ -60,7 +63,7 @@ class Helm:
         return found
 
     def template(self, chart: Path, values: Path, release: str, namespace: str) -> Report:
-        """Return the kinds of the objects of a release."""
+        """Render the chart for a release, and return the kinds of the objects, or a fault."""
         code, out, err = self._run(
             *("template", release, str(chart), "--include-crds", "--skip-tests"),
             *(f"--namespace={namespace}", f"--values={values}"),
@@ -99,7 +102,10 @@ def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
 
 
 def parsed_lint(out: str, chart: str) -> Report:
-    """Return what ``helm lint`` printed about a chart. Paths are below the chart's name."""
+    """Return the faults and warnings in the output of ``helm lint``.
+
+    The path of each begins with ``chart``, the name of the chart's folder.
+    """
     found: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
     for entry in re.split(r"\n(?=\[|\n)", out):
         match = _LINT.match(entry.strip())

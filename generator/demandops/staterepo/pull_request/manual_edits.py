@@ -1,8 +1,7 @@
 """Manual edits to generated files, and overrides that would have the same effect.
 
 The check refuses manual edits, because the generator's next commit would silently undo them. An
-override in ``overrides/`` stays. A person can use a suggested override unchanged, except for its
-reason.
+override in ``overrides/`` stays. A person who uses a suggested override must only write its reason.
 """
 
 from __future__ import annotations
@@ -42,9 +41,10 @@ _REASON = "Say here why; this replaces a manual edit of a generated file"
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """An override, to be merged as ``file``, that replaces a manual edit of ``instead_of``.
+    """A suggested override that replaces the manual edit of a generated file.
 
-    ``not_covered`` lists the parts of the edit that the override does not make.
+    ``instead_of`` is the path of the edited file. ``file`` is the path of the override, ``text``
+    its content. ``not_covered`` lists the parts of the edit that the override does not make.
     ``other_releases`` lists other releases that need the same override.
     """
 
@@ -69,7 +69,11 @@ def is_written_by_generator(path: str) -> bool:
 def faults_and_suggestions(
     files: Mapping[str, str], base: Base, paths: Collection[str], owner: str
 ) -> tuple[list[Fault], tuple[Suggestion, ...]]:
-    """Return a fault for each edited path, and an override with the same effect if there is one."""
+    """Return a fault for each edited path, and the suggested overrides.
+
+    An override is suggested where it has the effect of the edit, or of a part of the edit.
+    ``owner`` is the person who is named as the owner of the overrides.
+    """
     releases = {path_of(release): release for release in base.releases().values()}
     used = {path for path in files if path.startswith(f"{OVERRIDES_ROOT}/")}
     who = owner.strip()[:100] if owner.isprintable() and owner.strip() else "unknown"
@@ -135,7 +139,10 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return effects of an override that replace an edit, and the parts of the edit without one."""
+    """Return the effects of an override that replaces an edit, and the edits that it cannot make.
+
+    Each such edit is given by its place in the file.
+    """
     if after is None:
         return {"deny": True}, []
     try:
@@ -168,7 +175,10 @@ def _used(effects: dict[str, Any]) -> list[str]:
 
 
 def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
-    """Return the selector of a release; with ``whole``, of both ends of its connection."""
+    """Return an override's selector that selects a release.
+
+    For an end of a connection, ``whole`` makes it select both ends.
+    """
     if isinstance(release, ServiceRelease):
         selected = {"applications": list(release.applications), "services": [release.key.service]}
         return selected if release.key.application else selected | {"nodes": [release.node.id]}
@@ -179,7 +189,7 @@ def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
 def _service_effects(
     old: list[Any], new: list[Any], release: ServiceRelease, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return :func:`_effects` of an edit of a HelmRelease or an Application."""
+    """Return :func:`_effects` of an edit of a HelmRelease (Flux) or an Application (Argo CD)."""
     effects, not_covered = dict[str, Any](), list[str]()
     place_of_values = _VALUES.get(old[0].get("kind"), ())
     before, after = (
@@ -231,7 +241,10 @@ def _move_images(
     config: Config,
     moved: dict[str, dict[str, str]],
 ) -> None:
-    """Move the changes of registered images out of a patch of values, into ``moved``."""
+    """Move the changes of registered images out of ``patch``, into ``moved``.
+
+    ``patch`` is a merge patch of ``values``. ``moved`` maps the image's name to its new parts.
+    """
     names: dict[str, list[str]] = {}
     for name in release.service.images:
         names.setdefault(config.images[name].repository, []).append(name)
@@ -253,7 +266,10 @@ def _move_images(
 def _client_effects(
     old: list[Any], new: list[Any], config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return :func:`_effects` of an edit of plain manifests; overrides change only their images."""
+    """Return :func:`_effects` of an edit of plain manifests, as communication clients have.
+
+    An override can change only the images in such manifests.
+    """
     images, not_covered = dict[str, dict[str, str]](), list[str]()
     by_reference = {image.reference(): (name, image) for name, image in config.images.items()}
     for path, left, right in leaf_differences(old, new):
@@ -280,7 +296,10 @@ def _pin(reference: object, image: Image) -> dict[str, str] | None:
 
 
 def _merge_patch(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``; null removes."""
+    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``.
+
+    In a patch, None removes a key.
+    """
     patch: dict[str, Any] = {key: None for key in old if key not in new}
     for key, value in new.items():
         old_value = old.get(key, ABSENT)

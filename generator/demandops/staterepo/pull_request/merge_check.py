@@ -51,10 +51,11 @@ from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 class CheckResult:
     """The result of a check.
 
-    ``preview`` is None if the files are not valid. ``bookkeeping`` is None then too, and if there
-    is no valid commit to compare with. ``base`` is the commit of the comparison, if any. If
-    ``base_valid`` is False, the last valid versions of its files are used. ``newer`` counts the
-    commits that the merge target has and the checkout lacks. ``warnings`` are likely mistakes.
+    ``preview`` is None if the files are not valid. ``bookkeeping`` is None if the files are not
+    valid, or there is no valid commit to compare with. ``base`` is the commit that the edit is
+    compared with, if any. If ``base_valid`` is False, files of this commit are not valid, and their
+    last valid versions are used. ``newer`` counts the commits that the merge target has and the
+    checkout lacks. ``warnings`` are likely mistakes.
     """
 
     faults: tuple[Fault, ...]
@@ -75,18 +76,19 @@ def check(
     *,
     require_helm: bool = False,
 ) -> CheckResult:
-    """Return what a check of a folder finds: faults, rendered files, the effect of a merge.
+    """Check the files of a state repo, and return the faults and the effect of a merge.
 
     Args:
         folder: a checked-out state repo, or its files without Git.
         base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
-            with the common ancestor.
-        now: overrides that ended by then are left out; by default the current time.
-        require_helm: whether it is a fault that helm is missing.
+            with the common ancestor of HEAD and the merge target.
+        now: the time of the check, by default the current time. Overrides that ended before do
+            not apply.
+        require_helm: whether a missing helm is a fault.
 
     Raises:
         StateRepoError: the folder is not a state repo, or ``base`` is not a commit that has an
-            ancestor here.
+            ancestor in common with HEAD.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
@@ -109,7 +111,7 @@ def check(
     except InvalidInput as error:
         faults += error.faults
     else:
-        # a proposal or an upgrade is what the generator would write, so it is no manual edit
+        # a proposal or an upgrade changes files as the generator would, so it is no manual edit
         edited = [
             path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
         ]
@@ -159,7 +161,7 @@ def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
 
 
 def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
-    """Yield a warning for each topic that the merge keeps from arriving."""
+    """Yield a warning for each topic that does not arrive any more because of the merge."""
     old = start.state if start else None
     known = {(one.application, one.reason) for one in missing_inputs(old)} if old else set()
     for one in missing_inputs(state):
@@ -200,7 +202,11 @@ class _Edit:
         }
 
     def merged_into(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        """Return the generated files before the edit, with the wanted files that the target has."""
+        """Return path → text of the generated files before the merge.
+
+        These are the files before the edit. But if the merge target already has a file as
+        ``wanted`` has it, that version counts as the file before the merge.
+        """
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
             if there.get(path) == wanted.get(path):
@@ -209,7 +215,10 @@ class _Edit:
         return found
 
     def config(self) -> Config:
-        """Return the configuration."""
+        """Return the edited configuration.
+
+        Raises InvalidInput if it is not valid, or has an older render version.
+        """
         files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
         config = load(files)
         version = config.repo_settings.render_version
@@ -242,7 +251,10 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield why the generator would refuse claims that the edit adds or changes."""
+        """Yield the faults for which the generator would refuse claims of the edit.
+
+        Only claims that the edit adds or changes are checked.
+        """
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
@@ -252,7 +264,7 @@ class _Edit:
             )
 
     def rendered(self, state: State) -> dict[str, str]:
-        """Return every generated file, or raise the faults of every release."""
+        """Return path → text of every generated file, or raise the faults of every release."""
         try:
             return rendered_files(state, self.generated)
         except InvalidInput as error:

@@ -1,8 +1,8 @@
-"""The charts of a checkout, linted and rendered by helm, with the values of the releases that run.
+"""Has helm lint and render the charts of a checkout, with the values of the planned releases.
 
 Each chart is also rendered for an example demand of each application. The kinds of rendered objects
-are compared with those that the access domain allows. A chart that the edit does not change is
-rendered only for the releases whose values the edit changes, and for the examples.
+are compared with those that the access domain allows. If the edit does not change a chart, the
+chart is rendered only for the examples, and for the releases whose values the edit changes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NO_HELM = f"charts not rendered: {MISSING}; install it and put it on PATH, or na
 class RenderedCharts:
     """Which charts helm rendered, for how many releases and examples, and the faults found.
 
-    ``not_rendered`` maps the other charts to the reason.
+    ``not_rendered`` maps each chart that helm did not render to the reason.
     """
 
     rendered: tuple[str, ...] = ()
@@ -76,7 +76,10 @@ def render_charts(
 
 
 def _links(folder: str, names: list[str]) -> list[str]:
-    """Return the symbolic links of a folder: helm would follow them out of the checkout."""
+    """Return those of ``names`` that are symbolic links, which must not be copied.
+
+    Helm would follow the links out of the checkout.
+    """
     return [name for name in names if Path(folder, name).is_symlink()]
 
 
@@ -125,7 +128,7 @@ class _Run:
             return
         try:
             values = json.dumps(values_of(release, self._state.config, self._state.engine))
-        except InvalidInput:  # an override holds the file, so it has other values
+        except InvalidInput:  # an override holds the release's file, with other values
             return
         if folder not in self._sound:
             self._sound[folder] = self._prepare(name, folder) and self._lint(folder, values)
@@ -144,13 +147,16 @@ class _Run:
             self._faults.update(dict.fromkeys(self._refused(report, release)))
 
     def _prepare(self, name: str, folder: str) -> bool:
-        """Put the libraries of a chart into its folder; return whether helm may render it."""
+        """Check a chart's schemas, and copy its libraries into the chart's folder.
+
+        Return whether helm may render the chart.
+        """
         for path in chart_files.folders(folder, self._files):
             for schema in (one for one in self._files if one.startswith(f"{path}/")):
                 if schema.endswith("/values.schema.json"):
                     try:
                         values_validator.validator(self._files[schema], schema)
-                    except InvalidInput as error:  # helm would fetch what its schema refers to
+                    except InvalidInput as error:  # helm would fetch what the schema refers to
                         self._faults.update(dict.fromkeys(error.faults))
                         return False
         if reason := self._place_libraries(folder):
@@ -158,7 +164,10 @@ class _Run:
         return not reason
 
     def _place_libraries(self, folder: str) -> str:
-        """Copy a chart's libraries into ``charts/``; return why that fails, or an empty text."""
+        """Copy a chart's libraries into its folder ``charts/``.
+
+        Return the reason why a library cannot be copied, or an empty text.
+        """
         for one in chart_files.dependencies(folder, self._files):
             target = self._scratch / folder / "charts" / one.name
             if one.folder:
@@ -181,7 +190,11 @@ class _Run:
         return file
 
     def _add(self, report: Report, folder: str) -> None:
-        """Add a report, whose paths start with the name of the chart's folder."""
+        """Add the faults and warnings of a report to the result.
+
+        Paths in the report start with the name of the chart's folder. In the result, they are paths
+        in the checkout.
+        """
         above = folder.rpartition("/")[0]
         libraries = {
             f"{folder}/charts/{one.name}": one.folder
@@ -196,7 +209,10 @@ class _Run:
                 into[one.within(path)] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
-        """Return whether the rules of a release's domain allow any application with its service."""
+        """Return whether the rules of a release's domain allow an application that has its service.
+
+        A domain without rules allows every application.
+        """
         rules, services = release.domain.rules, self._state.config.services
         appdefs = [name for name, known in services.items() if release.key.service in known]
         return not rules or any(
@@ -204,7 +220,7 @@ class _Run:
         )
 
     def _refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
-        """Yield a fault for each kind that the access domain of a release may not have."""
+        """Yield a fault for each rendered kind that the release's access domain does not allow."""
         domain = release.domain
         allowed = {(one.group, one.kind) for one in domain.allowed_kinds}
         for group, kind in report.kinds:

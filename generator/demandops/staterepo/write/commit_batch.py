@@ -1,8 +1,8 @@
 """The commits of one batch, made on top of a snapshot and published together.
 
-Each demand is one commit with its ledger and rendered files. :class:`CommitBatch` holds the commits
-until they are published. If the remote has moved, the batch is dropped and its demands are
-evaluated again on the new tip.
+Each demand becomes one commit with the changed ledger and rendered files. :class:`CommitBatch`
+holds the commits until they are published. If the remote has moved, the batch is dropped and its
+demands are evaluated again on the new tip.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ _PAUSE_S = 0.02
 
 
 _Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
-"""The effect of people's changes: state, files, and claims that overrides may have changed."""
+"""The effect of people's changes: the snapshot, the files, and keys of claims.
+
+The claims are those that overrides may have changed.
+"""
 
 
 class CommitBatch:
@@ -73,9 +76,9 @@ class CommitBatch:
         self.start = start
         self.head = start
         self.frees = False
-        """Whether a demand gave room back since this was last reset."""
+        """Whether a demand freed room on a node since the caller last set this to false."""
         self.followed = ""
-        """What the commit that follows people's changes does, on one line for the log."""
+        """One line for the log about the commit that renders people's changes; empty if none."""
 
     @property
     def is_empty(self) -> bool:
@@ -96,7 +99,8 @@ class CommitBatch:
     ) -> str:
         """Commit one demand and return the commit's id.
 
-        ``proposal`` is the branch on which it awaits approval; empty if it needs none.
+        ``proposal`` is the branch on which the demand awaits approval. It is empty if the demand
+        needs no approval.
         """
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
@@ -121,18 +125,18 @@ class CommitBatch:
         return str(made)
 
     def note_settled(self, operation: str, outcome: commit_log.Settled) -> None:
-        """Record a demand that changed nothing in the message of the next commit, if there is one.
+        """Note a demand that changed nothing; the message of the next commit will record it.
 
-        The process may die before it answers. A restart must not evaluate the demand again, because
-        a later release may have changed its outcome.
+        The process may die before it answers the demand. After a restart, the generator must not
+        evaluate the demand again, because a later release could change the outcome.
         """
         self._settled.append((commit_log.settled_trailer(outcome), operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
-        """Apply people's changes: render, and commit the files that differ, if any.
+        """Apply people's changes: render them, and commit the files that differ, if any.
 
-        A claim or file that cannot be planned or rendered (its node left the inventory) stays
-        unchanged and is listed in the head's problems.
+        A claim or file may be impossible to plan or render, for example because its node left the
+        inventory. It then stays unchanged, and the problems of ``head`` list it.
         """
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
@@ -165,7 +169,10 @@ class CommitBatch:
         self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return the effect of people's changes, with the old configuration if the new fails."""
+        """Return the effect of people's changes.
+
+        If the new configuration cannot be rendered, the old configuration stays in effect.
+        """
         judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
@@ -202,9 +209,9 @@ class CommitBatch:
         keys: Iterable[ClaimKey],
         now: datetime,
     ) -> _Followed:
-        """Return the effect with started leases for the claims that a person approved.
+        """Return the effect of people's changes, with the leases of approved claims started.
 
-        A lease that started earlier could end before the approval.
+        Such a lease starts only after the approval. Otherwise it could end before the approval.
         """
         ledger, files = state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
@@ -214,12 +221,15 @@ class CommitBatch:
             started = replace(claim, lease=claim.lease.started(now, before))
             ledger = ledger.replace(claim.key, started)
             files[path] = claim_file.text_of(started)
-        # a lease does not affect a release, so nothing is counted anew
+        # a lease does not affect a release, so the usage of nodes need not be counted again
         snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
         return snapshot, replace(change, files=files), tuple(keys)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
-        """Return the problem report, if it changed."""
+        """Return path → text of the problem report if it changed, else an empty mapping.
+
+        The text is None if there are no problems any more.
+        """
         current = self.read(problem_report.PATH)
         origin = authorship.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
         wanted = problem_report.write(
@@ -230,7 +240,8 @@ class CommitBatch:
     def end_override(self, override: Override, now: datetime) -> None:
         """Commit the end of an expired override, with its effect on claims and releases.
 
-        Raises Refused or InvalidInput if the state without it cannot be planned or rendered.
+        Raises Refused or InvalidInput if the state without the override cannot be planned or
+        rendered.
         """
         applied = end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
@@ -323,7 +334,10 @@ class CommitBatch:
         return made
 
     def publish(self) -> bool:
-        """Publish the commits; return false if the repo moved. Raises RemoteAway or PushDenied."""
+        """Publish the commits and return true; return false if the state repo got other commits.
+
+        Raises RemoteAway or PushDenied if the state repo cannot be written.
+        """
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)

@@ -1,12 +1,12 @@
-"""The journal: every accepted demand that is not yet published, on disk, so a crash loses none.
+"""The journal: a file with every accepted demand that is not yet published, so a crash loses none.
 
-It has one JSON line for each demand received and one for each demand done. A demand is written and
-fsynced before it is evaluated. After a restart, demands that are not done are evaluated again;
-their operation ids show whether a commit was already published.
+The journal has one JSON line for each demand received and one for each demand done. A demand is
+written and fsynced before it is evaluated. After a restart, demands that are not done are evaluated
+again; their operation ids show whether a commit was already published.
 
-The last key of a line is a digest of the line and of the digest before it. So a reader
-detects a changed, missing or moved line (docs/decisions/0020-journal.md). It also reads journals of
-the first version, which have no digests.
+The last key of a line is a digest of the line and of the previous line's digest. So a reader
+detects a changed, missing or moved line (docs/decisions/0020-journal.md). Journals of the first
+version have no digests, and can still be read.
 """
 
 from __future__ import annotations
@@ -43,11 +43,12 @@ class DamagedJournal(StateRepoError):
 
 @dataclass(frozen=True, slots=True)
 class ProposalRecord:
-    """The journal's record of a proposal, enough to resume it.
+    """The journal's record of a proposal: what a restarted process needs to continue it.
 
-    ``commits`` lists the commits at which the branch may be, newest last; ``base`` is the commit of
-    main under the newest one. ``pushed``: the branch has existed. ``link``: the address of its
-    merge request. ``withdrawn``: the reason to delete the branch, or empty.
+    ``commits`` lists the commits at which the branch may be, newest last. ``base`` is the commit of
+    main on which the newest of them was made. ``pushed`` is true if the branch has ever existed.
+    ``link`` is the address of its merge request. ``withdrawn`` is the reason to delete the branch,
+    or empty.
     """
 
     branch: str
@@ -72,16 +73,19 @@ class JournalEntry:
     proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
-        """Return the entry's content, without copying the goal, which may be deep."""
+        """Return the entry as a mapping of its fields.
+
+        The goal is not copied, because it may be deeply nested.
+        """
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         del record["proposal"]
         return record | ({"proposal": asdict(self.proposal)} if self.proposal else {})
 
 
 class Journal:
-    """The journal of one process. Not thread-safe: the caller locks.
+    """The journal of one process. It is not thread-safe: the caller must hold a lock.
 
-    It rewrites the file when its size has doubled since the last rewrite and exceeds 1 MiB.
+    The file is rewritten when its size exceeds 1 MiB and has doubled since the last rewrite.
     """
 
     def __init__(self, path: Path) -> None:
@@ -94,10 +98,9 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise the error of an earlier write that left the file in an unknown state.
+        """Raise Unsound if an earlier write left the file in an unknown state; else do nothing.
 
-        Raises:
-            Unsound: every later write raises it too.
+        Every later write then raises the same error.
         """
         if self._unsound is not None:
             raise self._unsound
@@ -118,8 +121,8 @@ class Journal:
         """Remove demands that are published, refused or withdrawn.
 
         If ``durably``, the removal is fsynced; a failure raises StateRepoError and keeps the
-        demands. Otherwise the next :meth:`append` makes the removal durable. Until then, a replay
-        is harmless.
+        demands. Otherwise the next :meth:`append` makes the removal durable. If the process dies
+        before that, the demands are evaluated again after a restart, which is harmless.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]
         records = [{"done": operation} for operation in done]
@@ -155,7 +158,7 @@ class Journal:
             self._require_known(error)
             try:
                 self._file.truncate(self._size)
-            except OSError:  # a restart could find demands that are refused here
+            except OSError:  # a restart could read demands that this process refuses
                 self._unsound = Unsound(
                     f"the journal {self._path} cannot be written or cut back: {error.strerror}; "
                     "check its disk, then start again"
@@ -192,7 +195,7 @@ class Journal:
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
     def _require_known(self, error: OSError) -> None:
-        """Raise Unsound if nobody knows what is on the disk after an error."""
+        """Raise Unsound if ``error`` leaves unknown what is on the disk; else do nothing."""
         told = disk_error(error, f"the journal {self._path}")
         if isinstance(told, Unsound):
             self._unsound = told
@@ -218,7 +221,8 @@ def read(path: Path) -> dict[str, JournalEntry]:
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal.
 
-    An incomplete last line is dropped: it was being written at a crash and never acknowledged.
+    An incomplete last line is dropped: a crash interrupted its writing, so its demand was never
+    acknowledged.
     """
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
@@ -230,7 +234,7 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
             raise DamagedJournal(path, number) from None
     with suppress(ValueError):
         _apply(last[:-1], chain, {})
-        raise DamagedJournal(path, len(lines) + 1)  # only its line break was changed
+        raise DamagedJournal(path, len(lines) + 1)  # only the line break of this line was changed
     with suppress(ValueError):
         _apply(last, chain, pending)
     return pending
@@ -256,7 +260,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
-    """Return the lines for records, chained to the digest ``chain``, and the last digest."""
+    """Return the journal's lines for records, and the digest of the last line.
+
+    ``chain`` is the digest of the line before them.
+    """
     lines = []
     for record in records:
         body = json.dumps(record, ensure_ascii=True)
@@ -270,9 +277,10 @@ def _digest(body: bytes, chain: str) -> str:
 
 
 def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
-    """Apply a line to the pending demands and return its digest; raise ValueError if it is damaged.
+    """Apply a line to ``pending`` and return the line's digest; raise ValueError if it is damaged.
 
-    ``chain`` is the digest before the line; None in a journal of the first version.
+    ``chain`` is the digest of the previous line. In a journal of the first version, ``chain`` and
+    the result are None.
     """
     if chain is not None:
         found = _SEALED.fullmatch(line)

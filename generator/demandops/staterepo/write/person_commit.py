@@ -33,7 +33,7 @@ Files = Mapping[str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Author:
-    """The person who commits, the time, and the words of the message."""
+    """The person who commits, the time, and summary and reason for the message."""
 
     person: Person
     now: datetime
@@ -48,7 +48,7 @@ class Author:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A commit on main, or on a branch; ``link`` is the merge request's address."""
+    """A published commit, its branch, and the address of its merge request, or an empty text."""
 
     commit: str
     branch: str
@@ -62,7 +62,8 @@ def commit_to_main(
 
     Args:
         repository: the state repo.
-        make: returns the files, given a reader of main; called again if main has moved.
+        make: returns the files to commit. It gets a reader of the files on main, and is called
+            again if main has moved.
         author: the person, the time and the message.
 
     Raises:

@@ -48,7 +48,7 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The commits of main and of the proposals' branches, by name."""
+    """The commit of main, and branch → commit of the proposals' branches."""
 
     main: str
     branches: dict[str, str]
@@ -62,7 +62,7 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        """Return the current commits of the branches, or raise RemoteAway."""
+        """Return the current commits of main and of the branches, or raise RemoteAway."""
         if self._remote is None:
             repo = Repository(self._repository.objects.path)
             names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
@@ -73,17 +73,22 @@ class ProposalBranches:
         return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
 
     def exists(self, branch: str) -> bool:
-        """Return whether there is a branch of any name, or raise RemoteAway."""
+        """Return whether ``branch`` exists, or raise RemoteAway.
+
+        Its name need not begin with ``demand/``.
+        """
         reference = f"{_HEADS}{branch}"
         if self._remote is None:
             return reference in self._repository.objects.references
         return reference in self._remote.list_references(reference)
 
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
-        """Make a branch point to ``commit``, durably; return the link that the server printed.
+        """Make a branch point to ``commit``, durably.
+
+        Return the link that the server printed, or an empty text.
 
         Args:
-            branch: its name.
+            branch: the branch's name.
             commit: a commit in this repository.
             expected: the branch's commit now; empty if the branch must not exist.
             options: push options; left out if the server supports none.
@@ -155,7 +160,7 @@ class ProposalBranches:
             tip: the current commit of main.
             commit: the proposal, on top of ``base``.
             base: the commit of main that the proposal was made on.
-            files: the files that the demands write on the current main.
+            files: path → text of the files that the demands would change on the current main.
         """
         objects = self._repository.objects
         try:
@@ -179,7 +184,10 @@ def _link(output: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
-    """A proposal that awaits approval, described by its commits."""
+    """A proposal that awaits approval, with data from the messages of its commits.
+
+    ``commit`` is the newest commit. ``since`` is the time when the first demand was received.
+    """
 
     branch: str
     commit: str
@@ -191,7 +199,7 @@ class PendingProposal:
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
-    """Yield the proposals that are not merged, by branch, or raise RemoteAway."""
+    """Yield the proposals that are not merged, sorted by branch, or raise RemoteAway."""
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     space = f"{repository.branches}{PREFIX}"

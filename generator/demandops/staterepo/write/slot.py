@@ -56,8 +56,8 @@ class Slot:
     def _adopt_orphans(self, root: Path) -> None:
         """Take over the journals of dead processes.
 
-        An entry is written to this journal before it is removed from the old one. A crash in
-        between leaves two entries, which count once, because they have the same operation id.
+        Each entry is written to this process's journal before the old journal is removed. A crash
+        in between leaves the entry in both. It still counts once, by its operation id.
         """
         for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
             lock = _lock(journal.parent) if journal.parent != self.folder else None

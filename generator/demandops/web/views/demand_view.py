@@ -1,4 +1,4 @@
-"""One demand: what it holds, and what its release would change."""
+"""The view of one demand: what it holds, and what would change if it were released."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from demandops.web.situation import Situation
 
 @dataclass(frozen=True, slots=True)
 class Consequence:
-    """What the release of a demand would change, and how to release it.
+    """What would change if a demand were released, and how to release it.
 
-    ``file`` is a demand for ``demandops request``; empty if ``how`` names another way.
-    ``approval`` are the rules that require a person's approval.
+    ``how`` is the way in words. ``file`` is the text of a file for ``demandops request``; it is
+    empty if ``how`` is another way. ``approval`` names the rules that require a person's approval.
+    ``refused`` is the reason why the generator would refuse, or empty.
     """
 
     releases: tuple[ReleaseChange, ...]
@@ -44,7 +45,7 @@ class ExplainedDemand:
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand with its claims, and what its release would change.
+    """Return a demand with its claims, and what would change if it were released.
 
     Raises:
         StateRepoError: if the demand holds nothing.

@@ -17,7 +17,7 @@ _MOST_PARTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A view, and its parameters."""
+    """The path of a view, and the parameters to show it with."""
 
     path: str
     params: Mapping[str, str] = field(default_factory=dict)
@@ -25,7 +25,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A text, and the view that it links to, if any."""
+    """A text, and its link to a view, if any."""
 
     text: str
     link: Link | None = None
@@ -38,7 +38,8 @@ Text: TypeAlias = "str | int | Part"
 class Cell:
     """The content of one field of a row: texts, or a time.
 
-    ``tone`` is the cell's color. ``order`` is the sort key, by default the first text.
+    ``tone`` is the cell's color. ``order`` is the sort key; by default it is the time or the first
+    text.
     """
 
     parts: tuple[Part, ...] = ()
@@ -48,7 +49,7 @@ class Cell:
 
     @property
     def shown(self) -> tuple[Part, ...]:
-        """The first texts, as many as a row shows."""
+        """The texts that the row shows: the first few."""
         return self.parts[:_MOST_PARTS]
 
     @property
@@ -77,14 +78,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """One row: its cells, and texts that filters look at too, by name."""
+    """One row: its cells by column, and further texts by name that only filters search."""
 
     cells: Mapping[str, Cell]
     hidden: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
-        """The row's texts by name, in the case that filters compare."""
+        """Name → texts of the row, all in lower case, because filters ignore case."""
         found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
         for key, texts in self.hidden.items():
             found[key] = (*found.get(key, ()), *texts)
@@ -92,15 +93,16 @@ class Row:
 
     @cached_property
     def all_texts(self) -> str:
-        """All texts of the row, each on a line."""
+        """All texts of the row in lower case, each on its own line."""
         return "\n".join(text for texts in self.texts.values() for text in texts)
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One page of a list, as it is filtered and sorted.
+    """One page of a filtered and sorted list.
 
-    ``sort`` is the key of a column, with ``-`` in front for the reverse order.
+    ``total`` counts all rows of the list, ``matching`` the rows that match the filter. ``sort`` is
+    the key of a column, with ``-`` in front for the reverse order.
     """
 
     columns: tuple[Column, ...]
@@ -112,7 +114,7 @@ class Table:
 
     @property
     def pages(self) -> int:
-        """How many pages there are."""
+        """The number of pages of the filtered list."""
         return max(1, -(-self.matching // PAGE))
 
 
@@ -123,15 +125,16 @@ def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell
 
 
 class Filter:
-    """A search text for rows: all its words must occur.
+    """A search text for rows: a row matches if it contains all words of the text.
 
-    ``node:edge`` looks at one field only; ``node=edge`` wants exactly this text. Quotes join words.
+    The word ``node:edge`` matches if the field ``node`` contains ``edge``; ``node=edge`` matches if
+    a text of the field is exactly ``edge``. Quotes join words.
     """
 
     def __init__(self, text: str) -> None:
         try:
             words = shlex.split(text)
-        except ValueError:  # a quote that is not closed yet
+        except ValueError:  # the text has a quote that is not closed
             words = text.split()
         self._words = [word.casefold() for word in words]
 
@@ -154,14 +157,17 @@ def _has(row: Row, word: str) -> bool:
 
 
 def exactly(key: str, value: str) -> str:
-    """Return the filter for one exact value."""
+    """Return the filter text that selects rows with exactly this value in the field ``key``."""
     return shlex.quote(f"{key}={value}")
 
 
 def table(
     columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
 ) -> Table:
-    """Return a page of the rows that match; an unknown ``sort`` or ``page`` means the first."""
+    """Return a page of the rows that match the filter ``wanted``.
+
+    An unknown ``sort`` means the first column. A page number out of range means the nearest page.
+    """
     every = list(rows)
     found = [row for row in every if wanted.matches(row)]
     key = sort.removeprefix("-")

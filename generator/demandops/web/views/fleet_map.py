@@ -1,6 +1,7 @@
-"""The map: nodes by position, or by cluster and type; services on them, connections between them.
+"""The map: nodes with their services, and the connections between nodes.
 
-The server computes the layout, so the same state gives the same picture; the browser only draws it.
+Nodes are placed by position, or by cluster and type. The server computes the layout, so the same
+state gives the same picture; the browser only draws it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _MOST_LINES = 300
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The connections between two nodes."""
+    """The connections between two nodes, drawn as one line."""
 
     path: str
     tone: str
@@ -53,10 +54,12 @@ class Mass:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The whole map; ``is_dimmed`` says that a filter lights only a part of it.
+    """The whole map.
 
-    ``nodes`` and ``lines`` are drawn one by one, ``many_nodes`` and ``many_lines`` together.
-    ``only_lit`` says whether nodes that the filter does not light are left out.
+    ``nodes`` and ``lines`` are drawn one by one, with details. ``many_nodes`` and ``many_lines``
+    are drawn as one shape for each color. ``is_dimmed`` is true if a filter highlights a part of
+    the map. ``only_lit`` is true if only highlighted nodes are drawn. ``lit`` counts the
+    highlighted nodes, ``total`` all nodes.
     """
 
     width: float
@@ -87,12 +90,13 @@ class _Content:
 
 
 def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
-    """Return the map.
+    """Return the map of a situation.
 
     Args:
         now: the situation.
-        wanted: lights the services, connections and nodes that match.
-        layout: ``place`` or ``cluster``; any other means ``place``, if most nodes have a position.
+        wanted: the filter; services, connections and nodes that match are highlighted.
+        layout: ``place`` or ``cluster``. Any other value, or ``place`` without a node that has a
+            position, means ``place`` if most nodes have a position, else ``cluster``.
     """
     config = now.moment.config
     nodes = list(config.nodes.values())
@@ -139,7 +143,10 @@ _Drawn = TypeVar("_Drawn", "NodeCard", "Line")
 def _apart(
     drawn: list[_Drawn], is_special: Callable[[_Drawn], bool], most: int
 ) -> tuple[list[_Drawn], list[_Drawn]]:
-    """Return the parts to draw together and those to draw one by one, at most ``most``."""
+    """Return the parts to draw together, and the parts to draw one by one.
+
+    At most ``most`` parts are drawn one by one: all, else the special ones, else none.
+    """
     if len(drawn) <= most:
         return [], drawn
     special = [one for one in drawn if is_special(one)]
@@ -162,7 +169,7 @@ def _square(card: NodeCard) -> str:
 def _lit_nodes(
     now: Situation, wanted: Filter, nodes: Iterable[Node], content: Mapping[str, _Content]
 ) -> set[str]:
-    """Return the nodes that match a filter, or that have a service or connection that matches."""
+    """Return the ids of nodes that match, or that have a service or connection that matches."""
     if not wanted:
         return set()
     found = {id for id, each in content.items() if any(mark.is_lit for mark in each.marks)}
@@ -222,7 +229,10 @@ def _short(text: str, most: int) -> str:
 
 
 def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
-    """Return a line for each pair of nodes with connections; lit ones come last, on top."""
+    """Return a line for each pair of nodes with connections.
+
+    Highlighted lines come last, so they are drawn on top of the others.
+    """
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows_of(now, "connections"):
         ends = row.hidden["node"]
@@ -242,7 +252,7 @@ def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> lis
 
 
 def _curve(one: NodeCard, other: NodeCard) -> str:
-    """Return the path of a line from one card to another."""
+    """Return the SVG path of a line from one card to another."""
     if one.y + one.height <= other.y:
         start, end, bend = one.y + one.height, other.y, 1.0
     elif other.y + other.height <= one.y:

@@ -14,14 +14,14 @@ WORDS = {
     "unknown": "none",
     "healthy": "good",
 }
-"""Each word and its tone, the worst first."""
+"""Word for a health → its color on the page, from the worst to the best health."""
 
 PLACES = {word: float(place) for place, word in enumerate(WORDS)}
-"""The place of each word in the order of ``WORDS``."""
+"""Word → its index in ``WORDS``; a lower index means worse health."""
 
 
 def word_of(status: ReleaseStatus) -> str:
-    """Return the word for a status."""
+    """Return the word for the health of a release."""
     if status.state == "unknown":
         return "unknown"
     if status.health.failing:
@@ -30,7 +30,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 
 def since_of(status: ReleaseStatus) -> datetime | None:
-    """Return the time since which a release has its state, if the cluster reports it."""
+    """Return since when a release has its state; None if the cluster does not report the time."""
     try:
         return datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
@@ -38,5 +38,5 @@ def since_of(status: ReleaseStatus) -> datetime | None:
 
 
 def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
-    """Return the word for several releases; ``unknown`` if there are none."""
+    """Return the word for the worst health of several releases; ``unknown`` without a release."""
     return min(map(word_of, statuses), key=PLACES.__getitem__, default="unknown")

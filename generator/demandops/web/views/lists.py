@@ -26,8 +26,8 @@ Parts: TypeAlias = "tuple[Any, ...]"
 class ListKind:
     """A kind of list: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields each entry's id and the parts from which ``row`` makes the row. A row is made
-    anew only if a part differs.
+    ``entries`` yields the id and the parts of each entry. ``row`` makes a row from the parts; it is
+    called again only if a part of the entry has changed.
     """
 
     name: str
@@ -39,22 +39,22 @@ class ListKind:
 
 
 def release_part(name: str) -> Part:
-    """Return a release's name with a link to its view."""
+    """Return a release's name with a link to the view of the release."""
     return Part(name, Link("release", {"name": name}))
 
 
 def demand_part(id: str) -> Part:
-    """Return a demand's id with a link to its view."""
+    """Return a demand's id with a link to the view of the demand."""
     return Part(id, Link("demand", {"id": id}))
 
 
 def health_cell(word: str) -> Cell:
-    """Return the cell of a health; the worst sorts first."""
+    """Return the cell for a health word; cells are sorted from the worst to the best health."""
     return cell(word, tone=WORDS[word], order=PLACES[word])
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return values, each with a link to the view that is filtered by it."""
+    """Return values as texts; each links to a view filtered by this value in the field ``key``."""
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 
@@ -117,7 +117,7 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
 
 
 def clients_of(moment: Moment) -> dict[str, list[str]]:
-    """Return the names of the releases that carry each connection, by its id."""
+    """Return id of a connection → the names of the releases that carry it."""
     found: dict[str, list[str]] = {}
     for name, release in moment.releases.items():
         if not isinstance(release, ServiceRelease):
@@ -194,7 +194,7 @@ def _columns(*named: str) -> tuple[Column, ...]:
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; reuse those of an earlier moment that are the same."""
+    """Return the rows of a list; reuse the rows of an earlier moment whose parts are unchanged."""
     moment, kind = now.moment, LISTS[name]
     known = moment.rows.get(name, KnownRows(None, {}))
     if known.made_for is not now.statuses:

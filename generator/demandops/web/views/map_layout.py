@@ -1,4 +1,4 @@
-"""Where the map's nodes are drawn: at their positions, or by cluster and type of node."""
+"""The layout of the map: nodes are drawn at their positions, or by cluster and type."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TYPES = ("cloud", "edge", "station", "vehicle")
 
 @dataclass(frozen=True, slots=True)
 class ServiceMark:
-    """A service on a node."""
+    """A service as it is drawn on the card of its node."""
 
     name: str
     text: str
@@ -27,7 +27,11 @@ class ServiceMark:
 
 @dataclass(frozen=True, slots=True)
 class NodeCard:
-    """A node as it is drawn; ``services`` is empty if there is no room for them."""
+    """A node as it is drawn.
+
+    ``count`` is the number of all services. ``services`` lists the services that the card shows;
+    it is empty if there is no room. ``more`` counts the services that such a list leaves out.
+    """
 
     id: str
     type: str
@@ -46,13 +50,13 @@ class NodeCard:
 
     @property
     def middle(self) -> float:
-        """The middle, from left to right."""
+        """The x coordinate of the card's center."""
         return self.x + self.width / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A cluster as it is drawn."""
+    """A cluster as it is drawn: a box around the cards of its nodes."""
 
     name: str
     x: float
@@ -64,9 +68,9 @@ class Box:
 def by_cluster(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
-    """Return the cards and boxes, one for each cluster, and the height.
+    """Return id → card in its place, one box for each cluster, and the height of the map.
 
-    A box has a group of rows for each type of node.
+    Each box has a group of rows of cards for each type of node.
     """
     clusters: dict[str, dict[str, list[NodeCard]]] = {}
     for node in sorted(nodes, key=lambda one: one.id):
@@ -87,7 +91,7 @@ def by_cluster(
 def _box(
     groups: Mapping[str, list[NodeCard]], *, is_alone: bool
 ) -> tuple[list[NodeCard], float, float]:
-    """Return the cards of a cluster in their places within its box, and the box's size."""
+    """Return the cards of a cluster placed relative to its box, and the box's width and height."""
     first = next(iter(next(iter(groups.values()))))
     gap = 6.0 if first.width < 50 else _GAP
     room = 34.0 if first.services or first.width > 200 else gap
@@ -117,7 +121,11 @@ def _box(
 def by_place(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], float]:
-    """Return the cards, those with a position there, north up, the others below; and the height."""
+    """Return id → card in its place, and the height of the map.
+
+    A node that has a position is placed there, with north at the top. The nodes without a position
+    are in rows below.
+    """
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
     widest = max(cards[id].width for id in spots)
@@ -143,7 +151,7 @@ def by_place(
 
 
 def _pushed_down(card: NodeCard, others: Iterable[NodeCard]) -> NodeCard:
-    """Return the card, moved down until it covers no other."""
+    """Return the card, moved down far enough not to overlap the others."""
     for other in sorted(others, key=lambda one: one.y):
         apart = (
             card.x + card.width + 4 <= other.x

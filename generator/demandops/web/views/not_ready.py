@@ -1,4 +1,4 @@
-"""The applications that are not ready, and the causes: since when, and who can fix them."""
+"""The applications that are not ready, and the causes: since when they exist, who can fix them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _MOST_LISTED = 3
 class Cause:
     """Something that keeps applications from being ready.
 
-    ``told`` is the exact text of the cluster, a file's check or a person. ``releases`` cannot run
-    because of the cause.
+    ``told`` is the original text: a cluster's message, a fault in a file, or a person's reason.
+    ``releases`` names the releases that cannot run because of the cause.
     """
 
     kind: Kind
@@ -50,7 +50,7 @@ class Cause:
         return KINDS[self.kind]
 
     def row(self) -> Row:
-        """Return the cause as a row, by which filters find it."""
+        """Return the cause as a row, to which filters can be applied."""
         texts = {
             "release": self.releases,
             "application": self.applications,
@@ -62,7 +62,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """An application, its state in a word, and the causes that keep it from being ready."""
+    """An application, one word for its state, and the causes that keep it from being ready."""
 
     application: str
     word: str
@@ -77,9 +77,15 @@ class Ready:
 def causes(
     now: Situation, wanted: Filter, last_change: LastChange, pending: Collection[str] = ()
 ) -> list[Cause]:
-    """Return every cause that matches, the worst and oldest first.
+    """Return every cause that matches the filter ``wanted``.
 
-    ``pending`` are the generated files that a generator has yet to write or remove.
+    Causes are sorted by kind, from the worst to the mildest, and then by age, the oldest first.
+
+    Args:
+        now: the situation.
+        wanted: the filter.
+        last_change: returns the newest commit that changed a file.
+        pending: the generated files that a generator has yet to write or remove.
     """
     found = [
         *_unread(now),
@@ -99,7 +105,7 @@ def causes(
 
 
 def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list[Ready]:
-    """Return the applications that match, those that are not ready first."""
+    """Return the applications that match a filter; those that are not ready come first."""
     by_application: dict[str, list[Cause]] = {}
     for cause in found:
         for application in cause.applications:
@@ -182,7 +188,10 @@ def _suspended(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
 
 
 def _denied(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each service that an override denies, unless it suspends whole claims."""
+    """Yield a cause for each release that an override denies.
+
+    :func:`_suspended` yields the causes for claims that an override suspends as a whole.
+    """
     ledger = moment.active.ledger
     for release, override in moment.denied:
         claims = release_causes.claims_behind(ledger, release)
@@ -264,7 +273,7 @@ def _waits(waiting: WaitingDemand) -> Cause:
 
 
 def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each group of unhealthy releases that share a reason."""
+    """Yield a cause for each group of unhealthy releases with one state, reason and cluster."""
     together: dict[tuple[str, str, str, str], list[str]] = {}
     for name, release in now.moment.releases.items():
         status = now.status(name)
@@ -332,7 +341,7 @@ def _affected(moment: Moment, names: list[str]) -> dict[str, tuple[str, ...]]:
 
 
 def _applications_with(moment: Moment, claims: Iterable[Claim]) -> Iterator[str]:
-    """Yield the applications of the demands that have these claims."""
+    """Yield the ids of all applications of the demands to which these claims belong."""
     for demand in dict.fromkeys(claim.demand for claim in claims):
         held = moment.claims_of_demands.get(demand, ())
         yield from (one.subject.id for one in held if one.is_on_application)

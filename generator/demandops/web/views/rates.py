@@ -1,4 +1,4 @@
-"""Rates and latencies: how many demands come, and how long it takes until releases run."""
+"""Plots of rates and latencies: how many demands arrive, and how long commits and releases take."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BINS = 48
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One bar; its label names time and value."""
+    """One bar of a plot; the label states its time and value."""
 
     x: float
     y: float
@@ -29,7 +29,7 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot: bars, the highest value on its axis, and its figures as a table."""
+    """A plot: its bars, the highest value of the axis as text, and the values as a table."""
 
     title: str
     unit: str
@@ -44,7 +44,7 @@ class Plot:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A value at a time."""
+    """A measured value, and the time at which it was measured."""
 
     time: datetime
     value: float
@@ -57,7 +57,10 @@ _RELEASED = {"shutdown", "release", "expire", "decommission"}
 def plots(
     commits: Sequence[Commit], health: Sequence[HealthChange], now: datetime, span: str
 ) -> list[Plot]:
-    """Return the plots of a span (a key of ``SPANS``)."""
+    """Return the plots of a span of time that ends at ``now``.
+
+    ``span`` is a key of ``SPANS``. Any other key means the time since the oldest commit.
+    """
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
     start = now - timedelta(seconds=seconds) if seconds else oldest
@@ -94,7 +97,7 @@ def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
 
 
 class _Maker:
-    """Makes plots of one span of time."""
+    """Makes plots of one span of time, which it divides into bins of equal length."""
 
     def __init__(self, start: datetime, span_s: float) -> None:
         self._start, self._bin_s = start, span_s / _BINS

@@ -1,4 +1,4 @@
-"""One release: why it runs, its file, what changed in it, its history, and its status."""
+"""The view of one release: why it runs, its file, the last change, its history and status."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_CHANGES = 20
 
 @dataclass(frozen=True, slots=True)
 class DiffLine:
-    """A line of a difference; ``sign`` is ``+``, ``-``, ``@`` or empty."""
+    """A line of a diff; ``sign`` is ``+``, ``-``, ``@`` (the head of a section) or empty."""
 
     sign: str
     text: str
@@ -34,10 +34,11 @@ class DiffLine:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A release that runs, was denied, or ran before; ``release`` is ``None`` if it does not run.
+    """A release that runs, that an override denies, or that ran before.
 
-    ``difference`` is the newest change of the release's file. The page shows an override that
-    would stop the release; ``stop_with_it`` are the other releases that the override would stop.
+    ``release`` is None if the release does not run. ``difference`` is the diff of the newest change
+    of the release's file. The page proposes an override that stops the release; ``stop_with_it``
+    names the other releases that this override would stop too.
     """
 
     name: str
@@ -56,7 +57,7 @@ class Explained:
 
     @property
     def word(self) -> str:
-        """The release's state in one word."""
+        """The release's health in one word, or ``stopped``."""
         return word_of(self.status) if self.release else "stopped"
 
     @property
@@ -66,7 +67,7 @@ class Explained:
 
     @property
     def since(self) -> datetime | None:
-        """The time since which the release has its state, if the cluster reports it."""
+        """Since when the release has its state; None if the cluster does not report the time."""
         return since_of(self.status)
 
     @property
@@ -111,7 +112,11 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
 
 
 def _others_stopped(moment: Moment, release: Release) -> Iterable[str]:
-    """Yield what else stops if a release's service on the node, or its connections, are denied."""
+    """Yield the names of the other releases that stop with ``release``.
+
+    The override to stop ``release`` denies its service on its node or, for a client of connections,
+    all its connections.
+    """
     for name, other in moment.releases.items():
         if name == release.name:
             continue

@@ -1,4 +1,4 @@
-"""Who can fix a release that is not ready, as far as its files and its cluster show."""
+"""Who can fix a release that is not ready, as far as the files and the cluster show."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ KINDS: dict[str, str] = {
     "waiting": "busy",
     "starting": "busy",
 }
-"""The kinds of causes, in the order of the view, and their colors."""
+"""Kind of a cause → its color, in the order in which the view lists the kinds."""
 
 LastChange = Callable[[str], "LogEntry | None"]
-"""Returns the newest commit that changed a file, if there is one."""
+"""A function that returns the newest commit that changed a file or folder; None without one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,11 @@ def remedy_of(
     reason: str,
     last_change: LastChange,
 ) -> Remedy:
-    """Return who can fix a release, as far as its configuration and its cluster show."""
+    """Return who can fix a release, and how, as far as its configuration and its cluster show.
+
+    ``object`` and ``reason`` are the Kubernetes object that is not ready, and the reason that the
+    cluster reports.
+    """
     cluster, (word, _, name) = release.node.cluster, object.partition(" ")
     namespace, _, short = name.partition("/")
     describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]
@@ -103,7 +107,7 @@ def _of_images(release: Release, config: Config, command: str, last_change: Last
 
 
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
-    """Return which people changed files or folders last."""
+    """Return a text that names the people who last changed files or folders; empty without any."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
     return f" ({', '.join(people)} changed it last)" if people else ""

@@ -1,4 +1,4 @@
-"""One time line of demands, overrides, people's commits and health."""
+"""The time line, with the events of demands, overrides, people's commits and health."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LANES = {
     "people": "People and generator",
     "health": "Health",
 }
-"""The lanes of the time line, from top to bottom, and their titles."""
+"""Name of a lane of the time line → its title, from top to bottom."""
 
 SPANS = {
     "15min": 900,
@@ -30,7 +30,7 @@ SPANS = {
     "30d": 30 * 86400,
     "all": 0,
 }
-"""The spans of time that can be shown, in seconds; 0 for everything that is known."""
+"""Span of time that a person can choose → its seconds; 0 means all known events."""
 
 WIDTH = 1000
 _BINS = 60
@@ -43,7 +43,7 @@ _BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommi
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened; ``commit`` is empty for a change of health."""
+    """An event of the time line: a commit, or a change of health without a commit."""
 
     lane: str
     time: datetime
@@ -55,7 +55,7 @@ class Event:
     tone: str = ""
 
     def row(self) -> Row:
-        """Return the event as a row, by which filters find it."""
+        """Return the event as a row, to which filters can be applied."""
         return Row(
             {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
             {"who": [self.who], "commit": [self.commit], "release": [self.release]},
@@ -78,7 +78,7 @@ class Dot:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A time below the line."""
+    """A mark with a label for a time, below the time line."""
 
     x: float
     label: str
@@ -86,7 +86,10 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """The time line as a picture; ``chosen`` is where the chosen moment is, if it is shown."""
+    """The picture of the time line.
+
+    ``chosen`` is the x coordinate of the chosen moment; None if the picture does not show it.
+    """
 
     span: str
     dots: tuple[Dot, ...]
@@ -95,13 +98,13 @@ class Strip:
 
 
 def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
-    """Return all events, newest first."""
+    """Return the events of all commits and changes of health, newest first."""
     found = [*map(of_commit, commits), *map(_of_health, health)]
     return sorted(found, key=lambda one: one.time, reverse=True)
 
 
 def of_commit(commit: Commit) -> Event:
-    """Return the event of a commit."""
+    """Return a commit as an event of the time line."""
     entry = commit.entry
     word = entry.first("Operation") or "by hand"
     lane = "people"
@@ -121,7 +124,7 @@ def _of_health(change: HealthChange) -> Event:
 
 
 def matching(found: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    """Return the events of a lane, or of all, that match."""
+    """Return the events that match; only those of a lane, unless ``lane`` is empty."""
     return [
         one for one in found if lane in ("", one.lane) and (not wanted or wanted.matches(one.row()))
     ]
@@ -130,13 +133,13 @@ def matching(found: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
 def strip(
     found: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
 ) -> Strip:
-    """Return the picture of events, newest first.
+    """Return the picture of the time line.
 
     Args:
-        found: the events.
-        now: the end of the line.
-        span: a key of ``SPANS``; any other: the shortest one with some events.
-        chosen: time and commit of the chosen moment.
+        found: the events, newest first.
+        now: the time at the end of the line.
+        span: a key of ``SPANS``; any other value means the shortest span that has several events.
+        chosen: the time and the commit of the chosen moment; None if it is the present.
     """
     if span not in SPANS:
         span = _span_with_some(found, now)
