@@ -1,4 +1,4 @@
-"""The command line (§7 of the design): text, JSON and exit codes of every command.
+"""The command line: text, JSON and exit codes of every command.
 
 Exit codes: 0 done, 1 a fault that the user can fix, 2 wrong usage, 3 a fault of the program.
 """
