@@ -1,4 +1,7 @@
-"""The bookkeeping over ROS 2, as the command line's JSON: on a service and on a latched topic."""
+"""Offers the bookkeeping over ROS 2, by a ROS service and on a latched topic.
+
+Both carry the JSON that ``demandops bookkeeping --output json`` prints.
+"""
 
 from __future__ import annotations
 

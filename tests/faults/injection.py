@@ -83,7 +83,7 @@ class Site:
 
     @property
     def of_class(self) -> tuple[str, str, str, bool]:
-        """What the call has in common with the other calls of its class."""
+        """Its role, kind, class of file, and whether it creates: equal for calls to treat alike."""
         return self.role, self.kind, self.file, self.creates
 
     @property

@@ -1,4 +1,7 @@
-"""Versions on demand from the command line: the output of commands, approval, a moved channel."""
+"""Demands that ask for a version, by the command line.
+
+Tested are the output of commands, approval of an update, and a channel that names a new version.
+"""
 
 from __future__ import annotations
 

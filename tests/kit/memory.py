@@ -113,7 +113,7 @@ class MemoryRepo:
         ]
 
     def forget_shutdowns(self) -> None:
-        """Forget the recent shutdowns."""
+        """Remove the recent shutdowns, so that a shutdown that is sent again is a new one."""
         shutdowns = self.state.ledger.shutdowns
         self.state = replace(
             self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())

@@ -17,6 +17,7 @@ from demandops.config.config import Config
 from demandops.decision import Decision
 from demandops.demand import chosen_domain, separate_instance
 from demandops.demand.lease import Lease
+from demandops.errors import InvalidInput
 from demandops.ledger import claim_file
 from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.plan import scale_down
@@ -73,9 +74,19 @@ def test_a_seed_decides_all_and_the_told_command_plays_it_again(tmp_path: Path) 
 def acknowledge_before_publishing(patch: Patch) -> None:
     publish = Worker._publish_commits
 
-    def early(worker: Worker, commits: CommitBatch, results: list[Any]) -> bool:
+    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
         worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
-        return publish(worker, commits, results)
+        return publish(worker, commits, results, certain)
+
+    patch(Worker, "_publish_commits", early)
+
+
+def refuse_before_publishing(patch: Patch) -> None:
+    publish = Worker._publish_commits
+
+    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
+        worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
+        return publish(worker, commits, results, certain)
 
     patch(Worker, "_publish_commits", early)
 
@@ -227,12 +238,13 @@ def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
 
 FAULTS: dict[Callable[[Patch], None], int] = {
     acknowledge_before_publishing: 3,
+    refuse_before_publishing: 105,
     forget_the_journal: 3,
     leave_the_journal_in_memory: 15,
     skip_the_search_for_operations: 3,
     take_a_repeat_for_another_shutdown: 16,
     end_leases_by_the_wall_clock: 10,
-    follow_nothing: 9,
+    follow_nothing: 0,
     push_on_any_tip: 8,
     lose_renewals: 7,
     book_again_what_was_approved: 9,
@@ -249,7 +261,7 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     share_one_instance: 1,
     move_instances_with_the_channel: 4,
     take_the_first_domain: 1,
-    forget_what_is_booked_in_a_domain: 20,
+    forget_what_is_booked_in_a_domain: 26,
 }
 """Each planted fault, with a seed that found it at once when this was written.
 

@@ -64,7 +64,10 @@ def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("command", CHANGING[:-1])
 def test_no_name_is_cut_where_something_changes(command: str, patch: pytest.MonkeyPatch) -> None:
-    """All words also occur at 1000 columns. ``watch`` is left out: it fits the height."""
+    """No word is cut: each one also occurs in the output at 1000 columns.
+
+    ``watch`` is left out, because it cuts its output to the height of the terminal.
+    """
     whole = {*words(printed(command, patch, columns=1000))}
     assert {*words(file_of(command).read_text())} <= whole
 

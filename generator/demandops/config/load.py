@@ -132,7 +132,10 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services, with ``runs_at`` set for services that run once for each cluster."""
+    """Return the services. For one that runs once for each cluster, add which node it runs at.
+
+    ``runs_at`` maps the id of each node to the node of its cluster at which the service runs.
+    """
     found = dict(services)
     for name, service in services.items():
         if service.nodes:

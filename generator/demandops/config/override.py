@@ -52,17 +52,17 @@ def parse_time(text: str) -> datetime:
         ValueError: if the text is not such a time.
     """
     match = _MOMENT.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
+        )
+    day, clock, fraction, zone = match.groups()
+    zone = "+00:00" if zone in "Zz" else zone
     try:
-        if match is None:
-            raise ValueError
-        day, clock, fraction, zone = match.groups()
-        zone = "+00:00" if zone in "Zz" else zone
         moment = datetime.fromisoformat(f"{day}T{clock}.{(fraction or '0').ljust(6, '0')}{zone}")
         return moment.astimezone(timezone.utc)
     except (ValueError, OverflowError):
-        raise ValueError(
-            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
-        ) from None
+        raise ValueError(f"{quoted(text)} does not exist; correct the day or the clock") from None
 
 
 def format_time(moment: datetime) -> str:

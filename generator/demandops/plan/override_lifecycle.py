@@ -98,7 +98,7 @@ def update_claims(
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the changes to the ledger that end an override, with the override's marker."""
+    """Return the changes to the ledger that end an override, among them the record of its end."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}

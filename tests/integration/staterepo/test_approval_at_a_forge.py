@@ -1,4 +1,4 @@
-"""The generator opens pull requests at a forge, where a person's merge or refusal decides too.
+"""The generator opens a pull request for each proposal; to merge or close it there decides it.
 
 The forge is a small server on the loopback that handles pull requests as GitHub's API does.
 """

@@ -214,7 +214,7 @@ class TestValues:
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
-        """Values are rendered as JSON, so the quotes become part of the text, which is refused."""
+        """A value is rendered in quotes, as JSON. Behind other text, they would be part of it."""
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(

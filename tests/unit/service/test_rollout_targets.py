@@ -1,4 +1,4 @@
-"""The objects of Flux or Argo CD by which the generator follows what a demand needs."""
+"""The objects of Flux or Argo CD that the generator watches to see how far a demand got."""
 
 from __future__ import annotations
 

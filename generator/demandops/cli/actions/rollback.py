@@ -61,9 +61,10 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Restore the ledger of an earlier commit, by a new commit.
+    """Restore the claims of an earlier commit, by a new commit.
 
-    Claims that were released since then are booked again, with the current configuration. A lease
+    Claims that were released since then are booked again, with the current configuration. Claims
+    that were booked since then prevent the rollback, unless you give --drop-newer. A lease
     starts again with its full term. REV is a commit; TIME means the newest commit at or before it.
     At a terminal, the command shows the consequences first and asks.
 

@@ -91,7 +91,7 @@ class ResourceEntry:
 
 @dataclass(frozen=True, slots=True)
 class DemandEntry:
-    """One demand that holds claims. ``action`` is the ROS action that carries such demands."""
+    """One demand that holds claims. ``action`` is the ROS action that this demand came by."""
 
     action: Literal["Demand", "DeploymentRequest"]
     request: str

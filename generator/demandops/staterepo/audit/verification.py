@@ -49,7 +49,7 @@ class Verdict:
     compared, or empty. ``fault`` is the error of rendering the commit again, or empty.
     ``differing`` lists the generated files that differ from the rendered ones. ``touched`` lists
     the files that the commit changed, but may not change. ``signature`` is the reason why a
-    required signature is not valid, or empty. ``signer`` is the name with a valid signature.
+    required signature is not valid, or empty. ``signer`` names who signed the commit, or is empty.
     """
 
     commit: str

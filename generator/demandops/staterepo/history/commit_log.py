@@ -132,9 +132,9 @@ def person_commits(
 def _told_apart(
     repo: Repository, tip: str | Oid, until: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return the pairs of :func:`commits`, with the signatures checked.
+    """Return what :func:`commits` yields, after a check of the signatures.
 
-    ``by_generator`` is false if a required signature is missing or not valid.
+    ``LogEntry.by_generator`` is false if the commit lacks a valid signature that is required.
     """
     found = list(commits(repo, tip, until))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])

@@ -49,13 +49,13 @@ from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """The result of a check.
+    """The result of checking a checkout before it is merged.
 
-    ``preview`` is None if the files are not valid. ``bookkeeping`` is None if the files are not
-    valid, or there is no valid commit to compare with. ``base`` is the commit that the edit is
-    compared with, if any. If ``base_valid`` is False, files of this commit are not valid, and their
-    last valid versions are used. ``newer`` counts the commits that the merge target has and the
-    checkout lacks. ``warnings`` are likely mistakes.
+    ``base`` is the commit that the checkout is compared with, if any. If ``base_valid`` is False,
+    that commit has files that are not valid, and their last valid versions are compared instead.
+    ``preview`` and ``bookkeeping`` show what the merge changes. Both are None if a file of the
+    checkout is not valid; ``bookkeeping`` is also None if nothing can be compared. ``newer`` counts
+    the commits that the merge target has and the checkout lacks. ``warnings`` are likely mistakes.
     """
 
     faults: tuple[Fault, ...]
