@@ -85,7 +85,7 @@ class Row:
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
-        """Name of a column or hidden field → its texts, in lower case because filters ignore case."""
+        """Name of a column or hidden field → its texts; lower case, because filters ignore case."""
         found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
         for key, texts in self.hidden.items():
             found[key] = (*found.get(key, ()), *texts)
