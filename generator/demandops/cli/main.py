@@ -46,7 +46,7 @@ COMMANDS = {
     "reject": ("actions", "Turn a proposed demand down: delete its branch."),
     "request": ("actions", "Book demand requests from files."),
     "resume": ("actions", "Run suspended applications and connections again."),
-    "rollback": ("actions", "Restore the ledger of an earlier commit, by a new commit."),
+    "rollback": ("actions", "Restore the claims of an earlier commit, by a new commit."),
     "schema": ("repo", "Print the JSON Schema of a kind of file."),
     "serve": ("demandops_ros", "Run the ROS 2 node that accepts demands."),
     "status": ("views", "Show the state of each release on its cluster."),
