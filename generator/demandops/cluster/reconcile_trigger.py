@@ -2,16 +2,25 @@
 
 Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure,
 and the controller fetches at its next interval.
+
+Flux is woken only while it is idle. If kustomize-controller ends one reconciliation and begins the
+next at once, it may read the object's status of before (seen with 1.9). It then forgets what the
+last reconciliation created, so it never removes that.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from math import inf
 from typing import Any
 
 from demandops.cluster import controller_webhook
 from demandops.cluster.clusters_file import ClusterAccess, NoAccess
+from demandops.cluster.health.flux import REQUESTED_AT, Flux
+from demandops.cluster.health.release_health import ClusterDomain, ObjectSelector
+from demandops.cluster.object_cache import ObjectCache
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
@@ -26,14 +35,42 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""The least number of seconds between two fetches. Two fetches within a second can make Flux's
-source-controller corrupt an artifact."""
-_REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
+"""The least number of seconds from a fetch, and from the end of what Flux does with it, to the next
+fetch. Two fetches within a second can make Flux's source-controller corrupt an artifact."""
+_LONGEST_WAIT_S = 60.0
+"""After this many seconds, Flux is woken although it is not idle."""
 _REFRESH = "argocd.argoproj.io/refresh"
 
 
 ChangesSince = Callable[[str], tuple[str, list[str] | None]]
 """Returns the newest published commit and, if known, the paths changed since the given commit."""
+
+
+@dataclass(eq=False)
+class _Wake:
+    """A call that makes the controller of one or more domains fetch; when it is due.
+
+    Times are seconds of the monotonic clock.
+    """
+
+    cluster: str
+    domains: tuple[AccessDomain, ...]
+    pushed: float | None = None
+    """When the first push came that the controller has not been told of."""
+    next_try: float = -inf
+    pause: float = _FIRST_RETRY_S
+    idle_from: float = -inf
+    """Since when the controller is known to be idle; infinity while it is busy."""
+    handled: dict[str, str] = field(default_factory=dict)
+    """Domain → the request that its source had handled before the last call."""
+
+    @property
+    def due(self) -> float:
+        """When to make the call; infinity if there is nothing to tell."""
+        if self.pushed is None:
+            return inf
+        free = min(self.idle_from + _SPACING_S, self.pushed + _LONGEST_WAIT_S)
+        return max(self.next_try, free)
 
 
 class ReconcileTrigger:
@@ -54,65 +91,120 @@ class ReconcileTrigger:
         self._clusters = {name: access for name, access in clusters.items() if access.wake}
         self._config: Config | None = None
         self._apis: dict[str, Any] = {}
-        self._due = runtime.event()
-        self._stop = runtime.event()
+        self._wakes: dict[tuple[str, ...], _Wake] = {}
+        self._pushed = False
+        self._changed = runtime.event()
+        self._stopping = False
+        self._caches = {
+            name: ObjectCache(name, access, self._changed.set, runtime)
+            for name, access in self._clusters.items()
+            if access.kubeconfig
+        }
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
         """Request a wake after a push; return at once."""
         self._config = config
-        self._due.set()
+        self._pushed = True
+        self._changed.set()
 
     def close(self) -> None:
         """Wake the clusters for the last push, if that is still due, and stop."""
-        self._stop.set()
-        self._due.set()  # makes the thread run once more
+        self._stopping = True
+        self._changed.set()
         self._thread.join(2 * _TIMEOUT_S)
+        for cache in self._caches.values():
+            cache.close()
 
     def _run(self) -> None:
-        missed: set[str] = set()
-        pause: float | None = None
-        woken_at = -_SPACING_S
         while True:
-            fresh = self._due.wait(pause)
-            self._due.clear()
-            # wait, because pushes come in bursts
-            self._stop.wait(max(0.0, woken_at + _SPACING_S - self._runtime.monotonic()))
-            woken_at, stopping = self._runtime.monotonic(), self._stop.is_set()
-            if fresh:
-                missed, pause = set(self._clusters), _FIRST_RETRY_S
-            elif pause is not None:
-                pause *= 2
-            missed = self._wake_all(missed, logged=not fresh)
+            self._changed.wait(self._seconds_until_due())
+            self._changed.clear()
+            stopping = self._stopping
+            if self._pushed and self._config is not None:
+                self._pushed = False
+                self._note_push(self._config)
+            for wake in self._wakes.values():
+                self._note_idle(wake)
+                if wake.due <= self._runtime.monotonic() or (stopping and wake.pushed is not None):
+                    self._try(wake)
             if stopping:
                 return
-            if not missed or pause is None or pause > _LONGEST_RETRY_S:
-                missed, pause = set(), None
 
-    def _wake_all(self, names: Iterable[str], logged: bool) -> set[str]:
-        """Wake clusters; return the names of those that could not be woken.
+    def _seconds_until_due(self) -> float | None:
+        due = min((wake.due for wake in self._wakes.values()), default=inf)
+        return None if due == inf else max(0.0, due - self._runtime.monotonic())
 
-        Failures are logged unless ``logged`` is true, which means that they are in the log already.
+    def _note_push(self, config: Config) -> None:
+        now, before = self._runtime.monotonic(), self._wakes
+        self._wakes = {}
+        for cluster in sorted(self._clusters):
+            for domains in self._woken_together(cluster, config):
+                key = (cluster, *(domain.name for domain in domains))
+                wake = self._wakes[key] = before.get(key) or _Wake(cluster, domains)
+                wake.domains = domains
+                wake.pushed = now if wake.pushed is None else wake.pushed
+                wake.next_try, wake.pause = now, _FIRST_RETRY_S
+            if cluster in self._caches and config.repo_settings.gitops == "flux":
+                self._caches[cluster].watch(_followed(_domains(cluster, config)))
+
+    def _woken_together(self, cluster: str, config: Config) -> list[tuple[AccessDomain, ...]]:
+        """Return the domains of a cluster, grouped by the call that wakes them.
+
+        A webhook wakes all domains by one call, the API each by a call of its own.
         """
-        missed = set()
-        for name in sorted(names):
-            if self._config is None:
-                break
-            try:
-                self._wake(name, self._clusters[name], self._config)
-            except Exception as error:
-                missed.add(name)
-                self._apis.pop(name, None)
-                if not logged:
-                    log.warning(
-                        "cluster '%s' was not woken (%s); retrying for a minute, otherwise it "
-                        "fetches at its next interval",
-                        name,
-                        _reason(error),
-                    )
-        return missed
+        access, domains = self._clusters[cluster], _domains(cluster, config)
+        argocd = config.repo_settings.gitops == "argocd"
+        if (access.webhook if argocd else access.receiver) or not access.kubeconfig:
+            return [tuple(domains)]
+        return [(domain,) for domain in domains]
 
-    def _wake(self, name: str, access: ClusterAccess, config: Config) -> None:
+    def _note_idle(self, wake: _Wake) -> None:
+        if self._is_busy(wake):
+            wake.idle_from = inf
+        elif wake.idle_from == inf:
+            wake.idle_from = self._runtime.monotonic()
+
+    def _is_busy(self, wake: _Wake) -> bool:
+        """Return whether Flux is busy with an earlier fetch; False if that cannot be read."""
+        cache = self._caches.get(wake.cluster)
+        if cache is None or cache.why_unknown(_followed(wake.domains)):
+            return False
+        objects = cache.objects()
+        return not all(
+            Flux().is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
+            for domain in wake.domains
+        )
+
+    def _try(self, wake: _Wake) -> None:
+        """Make the call; if it fails, log that once and plan the next attempt, or none."""
+        assert self._config is not None  # noqa: S101 - only a push makes wakes
+        objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}
+        wake.handled = {
+            domain.name: Flux().handled_request(_on_cluster(wake, domain), objects)
+            for domain in wake.domains
+        }
+        wake.idle_from = inf
+        try:
+            self._call(wake, self._clusters[wake.cluster], self._config)
+            wake.pushed = None
+        except Exception as error:
+            self._apis.pop(wake.cluster, None)
+            wake.handled = {}
+            if wake.pause == _FIRST_RETRY_S:
+                log.warning(
+                    "cluster '%s' was not woken (%s); retrying for a minute, otherwise it "
+                    "fetches at its next interval",
+                    wake.cluster,
+                    _reason(error),
+                )
+            if wake.pause > _LONGEST_RETRY_S:
+                wake.pushed = None
+            wake.next_try = self._runtime.monotonic() + wake.pause
+            wake.pause *= 2
+
+    def _call(self, wake: _Wake, access: ClusterAccess, config: Config) -> None:
+        name = wake.cluster
         argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
         if argocd and access.webhook:
             before = self._reported.get(name, "")
@@ -121,7 +213,7 @@ class ReconcileTrigger:
                 # Name a file in each domain's folder too: Argo CD refreshes only Applications
                 # with changed files, and only a refreshed one reports the new commit.
                 paths = [path for path in paths if _concerns(path, name)]
-                folders = [domain_folder(name, domain) for domain in _domains(name, config)]
+                folders = [domain_folder(name, domain) for domain in wake.domains]
                 paths += [f"{folder}/_domain.yaml" for folder in folders]
             controller_webhook.call_argocd(
                 access.webhook, access.secret(), argocd.url, before, commit, paths
@@ -133,7 +225,7 @@ class ReconcileTrigger:
             if name not in self._apis:
                 self._apis[name] = access.api()
             now = self._runtime.now().isoformat()
-            for domain in _domains(name, config):
+            for domain in wake.domains:
                 self._apis[name].patch_namespaced_custom_object(
                     **_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
                 )
@@ -142,14 +234,24 @@ class ReconcileTrigger:
             raise NoAccess(f"it has neither a kubeconfig nor a {missing}")
 
 
+def _followed(domains: tuple[AccessDomain, ...]) -> list[ObjectSelector]:
+    """Return the objects that show whether Flux is busy."""
+    kinds = ("GitRepository", "Kustomization")
+    return [ObjectSelector(kind, domain.namespace) for domain in domains for kind in kinds]
+
+
+def _on_cluster(wake: _Wake, domain: AccessDomain) -> ClusterDomain:
+    return ClusterDomain(wake.cluster, domain.name, domain.namespace)
+
+
 def _reason(error: Exception) -> str:
     """Return why a cluster was not woken; the text has no URLs or secrets."""
     told = isinstance(error, NoAccess | NoAnswer | InvalidInput)
     return str(error) if told else type(error).__name__
 
 
-def _domains(cluster: str, config: Config) -> list[AccessDomain]:
-    return [domain for name, domain in domains_in_use(config) if name == cluster]
+def _domains(cluster: str, config: Config) -> tuple[AccessDomain, ...]:
+    return tuple(domain for name, domain in domains_in_use(config) if name == cluster)
 
 
 def _concerns(path: str, cluster: str) -> bool:
@@ -170,7 +272,7 @@ def _refresh_patch(domain: AccessDomain, repository: RepoSettings, now: str) -> 
     else:
         group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
         namespace, name = domain.namespace, repository.source
-        annotation = {_REQUESTED_AT: now}
+        annotation = {REQUESTED_AT: now}
     return {
         "group": group,
         "version": version,

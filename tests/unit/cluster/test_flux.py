@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from demandops.cluster.health import health_reader
+from demandops.cluster.health.flux import REQUESTED_AT, Flux
 from demandops.cluster.health.release_health import (
     ClusterDomain,
     Health,
@@ -155,3 +156,50 @@ def test_numbers_that_the_api_gives_as_null_are_those_that_it_leaves_out() -> No
     found["metadata"]["generation"] = found["spec"]["replicas"] = None
     health = deployment_health(found)
     assert (health.state, health.reason) == ("reconciled", "0 of 1 replicas are available")
+
+
+def source(fetched: str, asked: str, handled: str, **spec: Any) -> dict[str, Any]:
+    status = {"artifact": {"revision": f"main@sha1:{fetched}"}, "lastHandledReconcileAt": handled}
+    return {"metadata": {"annotations": {REQUESTED_AT: asked}}, "spec": spec, "status": status}
+
+
+APPLIED = condition("Ready", "True", "applied")
+APPLYING = condition("Ready", "Unknown", "building manifests")
+REFUSED = condition("Ready", "False", "no such kind")
+
+
+@pytest.mark.parametrize(
+    ("fetches", "applies", "idle"),
+    [
+        (None, None, True),
+        (source("b", "2", "2"), kustomization("b", "b", APPLIED), True),
+        (source("b", "2", "2"), kustomization("a", "b", REFUSED), True),
+        (source("a", "2", "1"), kustomization("a", "a", APPLIED), False),
+        (source("a", "1", "1"), kustomization("a", "a", APPLIED), False),
+        (source("b", "2", "2"), kustomization("a", "a", APPLIED), False),
+        (source("b", "2", "2"), kustomization("a", "a", APPLYING), False),
+        (source("b", "2", "2"), kustomization("b", "b", APPLYING), False),
+        (source("b", "2", "2"), kustomization("", ""), False),
+        (source("b", "2", "1", suspend=True), kustomization("a", "a", APPLIED), True),
+    ],
+    ids=[
+        "not there", "applied", "refused", "asked", "not seen yet", "fetched", "begun", "ending",
+        "new", "suspended",
+    ],
+)  # fmt: skip
+def test_a_domain_is_idle_once_the_last_fetch_is_applied(
+    fetches: dict[str, Any] | None, applies: dict[str, Any] | None, idle: bool
+) -> None:
+    objects = {("GitRepository", "ns", "demandops"): fetches} if fetches else {}
+    objects |= {("Kustomization", "ns", "perception"): applies} if applies else {}
+    assert Flux().is_idle(PLACE, objects, before="1") is idle
+
+
+def test_a_domain_that_was_never_asked_to_fetch_is_idle() -> None:
+    never = {"metadata": {}, "status": {"artifact": {"revision": "main@sha1:a"}}}
+    objects = {
+        ("GitRepository", "ns", "demandops"): never,
+        ("Kustomization", "ns", "perception"): kustomization("a", "a", APPLIED),
+    }
+    assert Flux().is_idle(PLACE, objects, before=None)
+    assert Flux().handled_request(PLACE, objects) == ""

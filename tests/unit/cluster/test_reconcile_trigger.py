@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from demandops.cluster import clusters_file
+from demandops.cluster.health.flux import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 from demandops.errors import InvalidInput
 
+from tests.kit.clock import Clock
+from tests.kit.generator import wait_until
 from tests.kit.golden import start
 from tests.kit.http import Answer, Call, kubeconfig, serving
 
@@ -81,18 +87,50 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
         yield f"{server.url}/hook/abc", heard
 
 
+@dataclass
+class Api:
+    """A server that accepts every patch. Its Flux fetches and applies when the test says so."""
+
+    kubeconfig: Path = Path()
+    patches: list[tuple[str, bytes]] = field(default_factory=list)
+    asked: str = ""
+    handled: str = ""
+    fetched: str = "a"
+    applied: str = "a"
+
+    def answer(self, call: Call) -> Answer:
+        if call.method == "PATCH":
+            self.patches.append((call.path, call.body))
+            annotations = call.json()["metadata"]["annotations"]
+            self.asked = annotations.get(REQUESTED_AT, "")
+            return Answer.json({})
+        if "watch=True" in call.path:
+            time.sleep(0.01)  # a watch that ends at once is begun again at once
+            return Answer()
+        item = self._source() if "gitrepositories" in call.path else self._kustomization()
+        return Answer.json({"metadata": {"resourceVersion": "1"}, "items": [item]})
+
+    def _source(self) -> dict[str, Any]:
+        metadata = {"name": "demandops", "annotations": {REQUESTED_AT: self.asked}}
+        artifact = {"revision": f"main@sha1:{self.fetched}"}
+        status = {"lastHandledReconcileAt": self.handled, "artifact": artifact}
+        return {"metadata": metadata, "status": status}
+
+    def _kustomization(self) -> dict[str, Any]:
+        status = {
+            "lastAttemptedRevision": f"main@sha1:{self.applied}",
+            "conditions": [{"type": "Ready", "status": "True"}],
+        }
+        spec = {"sourceRef": {"name": "demandops"}}
+        return {"metadata": {"name": "perception"}, "spec": spec, "status": status}
+
+
 @pytest.fixture
-def api(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, bytes]]]]:
-    """A kubeconfig of a server that accepts every patch, and the list of the patches."""
-    heard: list[tuple[str, bytes]] = []
-
-    def answer(call: Call) -> Answer:
-        assert call.method == "PATCH"
-        heard.append((call.path, call.body))
-        return Answer.json({})
-
-    with serving(answer) as server:
-        yield kubeconfig(tmp_path, server.url), heard
+def api(tmp_path: Path) -> Iterator[Api]:
+    found = Api()
+    with serving(found.answer) as server:
+        found.kubeconfig = kubeconfig(tmp_path, server.url)
+        yield found
 
 
 @pytest.mark.parametrize(
@@ -111,12 +149,39 @@ def api(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, bytes]]]]:
     ],
 )
 def test_the_object_that_fetches_is_annotated(
-    api: tuple[Path, list[tuple[str, bytes]]], case: str, path: str, annotation: bytes
+    api: Api, case: str, path: str, annotation: bytes
 ) -> None:
-    kubeconfig, heard = api
-    trigger(case, clusters_file.ClusterAccess(kubeconfig=kubeconfig))
-    assert {asked for asked, _ in heard} == {path}
-    assert annotation in heard[0][1]
+    trigger(case, clusters_file.ClusterAccess(kubeconfig=api.kubeconfig))
+    assert {asked for asked, _ in api.patches} == {path}
+    assert annotation in api.patches[0][1]
+
+
+@pytest.mark.parametrize("step", ["handles", "fetches", "applies"])
+def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(api: Api, step: str) -> None:
+    state, _ = start("experiment")
+    clock = Clock()
+    access = {"c-its": clusters_file.ClusterAccess(kubeconfig=api.kubeconfig)}
+    waker = ReconcileTrigger(access, lambda since: ("", None), clock)
+    waker(state.config)
+    wait_until(lambda: len(api.patches) == 1, "the first call")
+    if step != "handles":
+        api.handled, api.fetched = api.asked, "b"
+    waker(state.config)
+    time.sleep(0.1)
+    clock.pass_(30)
+    waker(state.config)
+    time.sleep(0.2)
+    assert len(api.patches) == 1  # half a minute later it is still busy with the first fetch
+    if step == "applies":
+        api.applied = "b"
+        time.sleep(0.2)
+        assert len(api.patches) == 1  # it has just become idle
+        clock.pass_(1)
+    else:
+        clock.pass_(30)
+    waker(state.config)
+    wait_until(lambda: len(api.patches) == 2, "the second call")
+    waker.close()
 
 
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:

@@ -22,6 +22,8 @@ from demandops.cluster.health.release_health import (
     worst,
 )
 
+REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
+"""The annotation that makes a controller reconcile an object now."""
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 """The label that helm-controller sets on everything that it installs."""
 
@@ -52,10 +54,10 @@ class Flux(HealthReader):
         ready = condition(status, "Ready")
         if ready.get("status") == "False" and attempted and history.includes(attempted, commit):
             return Health("waiting", str(ready.get("message", "")), name, failing=True)
-        source = objects.get(("GitRepository", domain.namespace, _source(kustomization)))
-        fetched = condition((source or {}).get("status") or {}, "Ready")
+        source = self._source(domain, objects) or {}
+        fetched = condition(source.get("status") or {}, "Ready")
         if fetched.get("status") == "False":
-            at = f"GitRepository {domain.namespace}/{_source(kustomization)}"
+            at = f"GitRepository {domain.namespace}/{_source_name(kustomization)}"
             return Health("waiting", str(fetched.get("message", "")), at, failing=True)
         return Health("waiting", "has not applied the commit yet", name)
 
@@ -67,6 +69,37 @@ class Flux(HealthReader):
         """Return the commit that a domain's Kustomization has applied; empty if it is not known."""
         kustomization = objects.get(self.follower(domain)) or {}
         return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
+
+    def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
+        """Return the last request to fetch that a domain's source has handled; empty if none."""
+        return _handled(self._source(domain, objects) or {})
+
+    def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
+        """Return whether a domain has handled its last fetch.
+
+        Args:
+            domain: the domain.
+            objects: the objects that are known.
+            before: what :meth:`handled_request` gave before the last request to fetch; None if
+                there was none.
+        """
+        kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
+        if kustomization is None or source is None:
+            return True
+        if any((each.get("spec") or {}).get("suspend") for each in (kustomization, source)):
+            return True
+        asked = (source["metadata"].get("annotations") or {}).get(REQUESTED_AT, "")
+        handled = _handled(source)
+        if handled == before or handled != asked:
+            return False
+        status = kustomization.get("status") or {}
+        fetched = ((source.get("status") or {}).get("artifact") or {}).get("revision")
+        ended = condition(status, "Ready").get("status") in ("True", "False")
+        return ended and status.get("lastAttemptedRevision") == fetched
+
+    def _source(self, domain: ClusterDomain, objects: Objects) -> Object | None:
+        kustomization = objects.get(self.follower(domain)) or {}
+        return objects.get(("GitRepository", domain.namespace, _source_name(kustomization)))
 
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
@@ -89,10 +122,14 @@ class Flux(HealthReader):
         return (deployment["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
 
 
-def _source(kustomization: Object) -> str:
+def _source_name(kustomization: Object) -> str:
     return str(((kustomization.get("spec") or {}).get("sourceRef") or {}).get("name", ""))
 
 
 def _commit(revision: object) -> str:
     """Return the commit of a Flux revision (``main@sha1:…``)."""
     return str(revision or "").rpartition(":")[2]
+
+
+def _handled(source: Object) -> str:
+    return str((source.get("status") or {}).get("lastHandledReconcileAt", ""))
