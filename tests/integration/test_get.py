@@ -419,3 +419,36 @@ class TestStatus:
             assert demandops("request", EXPERIMENT[2], "--state-repo", fleet.path).code == 0
             (old,) = demandops(*asked, "-o", "json").json()["old_bootstraps"]
             assert (old["cluster"], old["domains"]) == ("c-its", ["perception"])
+
+    def test_an_object_that_belongs_to_no_release_is_named(
+        self, demandops: Run, fleet: GitRepo, tmp_path: Path
+    ) -> None:
+        flux = {f"kustomize.toolkit.fluxcd.io/{key}": "perception" for key in ("name", "namespace")}
+        file = tmp_path / "clusters.yaml"
+        asked = ("status", "--state-repo", fleet.path, "--clusters", file)
+        with kube_api() as api:
+            file.write_text(
+                "apiVersion: demandops/v1\nkind: ClusterAccess\n"
+                f"clusters: {{c-its: {{kubeconfig: {kubeconfig(tmp_path, api.url)}}}}}\n"
+            )
+            api.put("deployments", "perception", "mqtt-gone", {}, metadata={"labels": flux})
+            api.put("deployments", "perception", "of-a-person", {})
+            api.put("helmreleases", "perception", FUSION, {}, metadata={"labels": flux})
+            assert demandops(*asked, "-o", "json").json()["orphans"] == []  # not applied yet
+            api.flux("perception", "perception", fleet.tip)
+            (orphan,) = demandops(*asked, "-o", "json").json()["orphans"]
+            ran = demandops(*asked)
+        command = "kubectl -n perception delete --ignore-not-found "
+        command += "deployment/mqtt-gone configmap/mqtt-gone"
+        assert orphan == {
+            "cluster": "c-its",
+            "kind": "Deployment",
+            "namespace": "perception",
+            "name": "mqtt-gone",
+            "command": command,
+        }
+        assert (
+            "Deployment perception/mqtt-gone on cluster 'c-its' belongs to no release any more; an "
+            f"administrator of the cluster deletes it: {command}\n"
+        ) in ran.out
+        assert "objects that belong to no release: 1" in ran.err and ran.code == 1

@@ -10,6 +10,7 @@ from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, Target
 from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.orphans import Orphan, orphans
 from demandops.cluster.release_status import ReleaseStatus, statuses
 from demandops.runtime import Runtime
 from demandops.staterepo.git.repository import StateRepository
@@ -73,6 +74,17 @@ class ClusterWatch:
         """
         self._watch(domains)
         return tuple(old_bootstraps(domains, self._caches, read))
+
+    def orphans(
+        self,
+        domains: Collection[ClusterDomain],
+        targets: Iterable[Target],
+        commit: str,
+        repository: StateRepository,
+    ) -> tuple[Orphan, ...]:
+        """Return the objects on clusters that belong to no release of a commit."""
+        self._watch(domains)
+        return tuple(orphans(domains, targets, commit, self._caches, repository))
 
     def _watch(self, domains: Iterable[ClusterDomain]) -> None:
         for domain in dict.fromkeys(domains):

@@ -14,6 +14,7 @@ from itertools import islice
 
 from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.clusters_file import ClusterAccess
+from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.errors import DemandOpsError
 from demandops.quoting import one_line
@@ -185,12 +186,14 @@ class Follower:
         self._read_history(moment.commit)
         statuses: Mapping[str, ReleaseStatus] = {}
         old: tuple[OldBootstrap, ...] = ()
+        left: tuple[Orphan, ...] = ()
         if self._watch.clusters:
             wanted = [target for _, target in moment.targets]
             repository = self._reader.repository
             statuses = self._watch.statuses(wanted, moment.commit, repository)
             domains = rollout_targets.domains_of_state(moment.state)
             old = self._watch.old_bootstraps(domains, self._reader.file_reader(moment.commit))
+            left = self._watch.orphans(domains, wanted, moment.commit, repository)
         return Situation(
             moment,
             self._runtime.now(),
@@ -198,6 +201,7 @@ class Follower:
             watched=self._watch.clusters,
             proposals=tuple(pending_proposals(self._reader.repository)),
             old_bootstraps=old,
+            orphans=left,
         )
 
     def _read_history(self, tip: str) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.health.release_health import Health, Target
+from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.config.config import Config
 from demandops.config.override import Override
@@ -252,7 +253,8 @@ class Situation:
 
     ``statuses`` maps names of releases to their status; it is empty for an earlier moment.
     ``watched`` names the clusters that are watched. ``old_bootstraps`` lists the clusters without
-    the current bootstrap file. ``unread`` is the reason why a newer state cannot be read, or empty.
+    the current bootstrap file, ``orphans`` the objects on clusters that belong to no release.
+    ``unread`` is the reason why a newer state cannot be read, or empty.
     """
 
     moment: Moment
@@ -263,6 +265,7 @@ class Situation:
     proposals: tuple[PendingProposal, ...] = ()
     unread: str = ""
     old_bootstraps: tuple[OldBootstrap, ...] = ()
+    orphans: tuple[Orphan, ...] = ()
 
     def status(self, release: str) -> ReleaseStatus:
         """Return the status of a release; unknown if no cluster reports it."""

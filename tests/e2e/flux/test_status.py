@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+
 import pytest
 
+from tests.e2e.common import expected
 from tests.e2e.common.answers import Answers, World, limited_world
+from tests.e2e.common.expected import WITHOUT_DEMANDS, target_end
+from tests.e2e.common.staterepo import environment
 from tests.e2e.rig.cluster import Rig
 
 from .conftest import MakeWorld
@@ -17,3 +25,32 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 class TestFlux(Answers):
     """The tests of `Answers` with Flux."""
+
+    def test_what_flux_forgot_is_named_and_its_command_deletes_it(self, world: World) -> None:
+        domain, name = world.domain, target_end("station00")
+        world.follow(world.demand(expected.demand(1)), expected.after(1))
+        forgotten = domain.get("Deployment", name)
+        kept = ("name", "namespace", "labels")
+        metadata = {key: forgotten["metadata"][key] for key in kept} | {"name": "forgotten"}
+        domain.kube.apply(
+            {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": metadata}
+            | {"spec": forgotten["spec"]}
+        )
+        (orphan,) = orphans(world)
+        assert (orphan["kind"], orphan["name"]) == ("Deployment", "forgotten")
+        administrator = os.environ | {"KUBECONFIG": str(world.rig.kubeconfig)}
+        subprocess.run(orphan["command"].split(), env=administrator, check=True)
+        assert orphans(world) == []
+        world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
+
+
+def orphans(world: World) -> list[dict[str, str]]:
+    """Return the orphans that `status` lists; its exit code is 1 if there are some."""
+    command = [sys.executable, "-m", "demandops.cli.main", "status", "--output", "json"]
+    command += ["--state-repo", world.push_url, "--clusters", str(world.folder / "clusters.yaml")]
+    done = subprocess.run(
+        command, env=environment(world.folder), capture_output=True, text=True, check=False
+    )
+    found: list[dict[str, str]] = json.loads(done.stdout)["orphans"]
+    assert done.returncode == (1 if found else 0), done.stderr
+    return found

@@ -2,20 +2,46 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from tests.e2e.common import expected
 from tests.e2e.common.access import access_file, limited
-from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
+from tests.e2e.common.expected import CLUSTER, STEPS, WITHOUT_DEMANDS
 from tests.e2e.common.timing import Table
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
 from .conftest import MakeWorld
+from .view import SOURCE, Domain
+from .world import World
 
-WAKER = {
-    "apiGroups": ["source.toolkit.fluxcd.io"],
-    "resources": ["gitrepositories"],
-    "verbs": ["patch"],
-}
+READ = ["get", "list", "watch"]
+RIGHTS = [
+    {
+        "apiGroups": ["source.toolkit.fluxcd.io"],
+        "resources": ["gitrepositories"],
+        "verbs": [*READ, "patch"],
+    },
+    {
+        "apiGroups": ["kustomize.toolkit.fluxcd.io"],
+        "resources": ["kustomizations"],
+        "verbs": READ,
+    },
+]
+REQUESTED = "reconcile.fluxcd.io/requestedAt"
+ROUNDS = 3
+"""How often the paper's eight demands are sent, one right after the other."""
+
+
+def start(world: World, rig: Rig) -> Domain:
+    """Let Flux fetch every ten minutes, and start a generator that may only wake and watch it."""
+    domain = world.bootstrap(CLUSTER, rig, interval="10m")
+    kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, {domain.namespace: RIGHTS})
+    file = access_file(world.folder, CLUSTER, kubeconfig=kubeconfig)
+    world.generator.start("--clusters", str(file))
+    return domain
 
 
 def test_a_trigger_saves_the_wait_for_the_next_fetch(
@@ -23,12 +49,52 @@ def test_a_trigger_saves_the_wait_for_the_next_fetch(
 ) -> None:
     """Flux fetches only every ten minutes, so only the trigger can bring the demand in time."""
     world = make_world()
-    domain = world.bootstrap(CLUSTER, rig, interval="10m")
-    rights = {domain.namespace: [WAKER]}
-    kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, rights)
-    file = access_file(world.folder, CLUSTER, kubeconfig=kubeconfig)
-    world.generator.start("--clusters", str(file))
+    start(world, rig)
     table = Table("Triggered by the generator, next fetch after 10 minutes")
     table.add("joins", world.step(1, expected.after(1), wake=False))
     table.show(say)
     world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
+
+
+def test_flux_is_woken_only_while_it_is_idle(make_world: MakeWorld, rig: Rig) -> None:
+    """If it were busy, it could forget what it is just creating, and never remove that."""
+    world = make_world()
+    domain = start(world, rig)
+    with wakes(domain) as found:
+        for step in (*STEPS,) * ROUNDS:
+            sent = world.demand(expected.demand(step))
+        domain.wait_applied(sent.commit)
+        domain.wait_lines(WITHOUT_DEMANDS)
+    assert len(found) > 1
+    assert all(found), "Flux was woken while it was busy"
+
+
+@contextmanager
+def wakes(domain: Domain) -> Iterator[list[bool]]:
+    """Yield a list that gets, for each request to fetch, whether Flux was idle before it."""
+    found: list[bool] = []
+    over = threading.Event()
+
+    def look() -> None:
+        idle, last = True, None
+        while not over.wait(0.02):
+            applies = domain.get("Kustomization", domain.name)["status"]
+            source = domain.get("GitRepository", SOURCE)
+            requested = source["metadata"].get("annotations", {}).get(REQUESTED)
+            if last is not None and requested != last:
+                found.append(idle)
+            last, status = requested, source["status"]
+            ready = [one["status"] for one in applies["conditions"] if one["type"] == "Ready"]
+            idle = (
+                status.get("lastHandledReconcileAt") == requested
+                and applies.get("lastAttemptedRevision") == status["artifact"]["revision"]
+                and ready in (["True"], ["False"])
+            )
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield found
+    finally:
+        over.set()
+        thread.join()

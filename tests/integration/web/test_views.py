@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.health.release_health import Health
+from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.ledger.waiting import WaitingDemand
 from demandops.web.follower import Follower
@@ -94,6 +95,14 @@ def test_a_cluster_with_an_old_bootstrap_file_is_a_cause(follower: Follower) -> 
     assert cause.what.text == "bootstrap/c-its.yaml"
     assert cause.why == "is not applied to cluster 'c-its' as it is now"
     assert cause.remedy.command == old.command
+
+
+def test_an_object_that_belongs_to_no_release_is_a_cause(follower: Follower) -> None:
+    left = Orphan("c-its", "Deployment", "perception", "mqtt-gone")
+    (cause,) = causes(replace(follower.newest, orphans=(left,)), follower)
+    assert cause.what.text == "Deployment perception/mqtt-gone"
+    assert cause.why == "runs on cluster 'c-its', but belongs to no release"
+    assert cause.remedy.command == left.command
 
 
 def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:

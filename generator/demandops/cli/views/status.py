@@ -25,6 +25,7 @@ from demandops.cluster.bootstrap_status import OldBootstrap, old_bootstraps
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.orphans import Orphan, orphans
 from demandops.cluster.release_status import ReleaseStatus, statuses
 from demandops.config.durations import duration_text
 from demandops.errors import suggestion
@@ -79,8 +80,9 @@ def status(
 
     The state is the commit that the cluster has applied, and the health of the release. The exit
     code is 1 if a file is invalid or waits for a generator, or if a cluster with a kubeconfig in
-    --clusters does not answer, has an old bootstrap file or a release that is not healthy. The
-    state of a cluster without a kubeconfig is unknown, which is no fault.
+    --clusters does not answer, has an old bootstrap file, an object that belongs to no release, or
+    a release that is not healthy. The state of a cluster without a kubeconfig is unknown, which is
+    no fault.
 
     \b
     Examples:
@@ -147,6 +149,7 @@ class Status:
     clusters: frozenset[str]
     not_rendered: frozenset[str]
     old_bootstraps: tuple[OldBootstrap, ...]
+    orphans: tuple[Orphan, ...]
     missing_inputs: tuple[MissingInput, ...]
     unreadable: Mapping[str, str]
     """Name of a cluster → why its objects cannot be read."""
@@ -169,7 +172,9 @@ class Status:
         old = tuple(old_bootstraps(domains, stores, repo.file_reader(str(snapshot.commit))))
         commit = str(snapshot.commit)
         ledger = without_suspended(snapshot.state).ledger
-        found = statuses([target for _, target in targets], commit, stores, repo.repository)
+        wanted_releases = [target for _, target in targets]
+        found = statuses(wanted_releases, commit, stores, repo.repository)
+        left = tuple(orphans(domains, wanted_releases, commit, stores, repo.repository))
         rows = [
             release_data(release) | version_data(release, ledger) | _state(each)
             for (release, _), each in zip(targets, found, strict=True)
@@ -179,7 +184,7 @@ class Status:
         reasons = {name: store.why_unknown(wanted[name]) for name, store in stores.items()}
         unreadable = {name: reason for name, reason in sorted(reasons.items()) if reason}
         pending = repo.not_rendered(snapshot)
-        return cls(commit, rows, problems, known, pending, old, missing, unreadable)
+        return cls(commit, rows, problems, known, pending, old, left, missing, unreadable)
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
         """Return a text that counts problems and unhealthy releases; empty if there are none.
@@ -194,6 +199,7 @@ class Status:
             "problems in files": len(self.problems),
             "files that a generator has yet to write": len(self.not_rendered),
             "clusters with an old bootstrap file": len(self.old_bootstraps),
+            "objects that belong to no release": len(self.orphans),
             "releases failing": failing,
             "releases not healthy yet": len(watched) - failing - healthy,
             "clusters that cannot be read": ", ".join(self.unreadable),
@@ -208,6 +214,7 @@ class Status:
             "releases": self.rows,
             "not_rendered": sorted(self.not_rendered),
             "old_bootstraps": [asdict(each) for each in self.old_bootstraps],
+            "orphans": [asdict(each) | {"command": each.command} for each in self.orphans],
             "missing_inputs": [asdict(each) for each in self.missing_inputs],
             "unreadable": [
                 {"cluster": name, "reason": why} for name, why in self.unreadable.items()
@@ -222,8 +229,8 @@ class Status:
             count = len(self.problems)
             title = "1 problem" if count == 1 else f"{count} problems"
             text.insert(0, f"{title}; of each file the last valid version is in effect:")
-        old = map(str, self.old_bootstraps)
-        return [*text, releases_table(self.rows), *old, f"desired: {self.commit}"]
+        further = map(str, (*self.old_bootstraps, *self.orphans))
+        return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 
 
 def _wanted(domains: Iterable[ClusterDomain]) -> dict[str, list[ObjectSelector]]:

@@ -64,10 +64,16 @@ class ArgoCd(HealthReader):
         app = objects.get(self.follower(domain))
         return next(iter(_applied_commits(app)), "") if app else ""
 
+    def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
+        """Return whether the Application of the domain's folder has created an object."""
+        annotations = item["metadata"].get("annotations") or {}
+        tracked = f"{_folder_application(domain).name}:"
+        return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
+
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        name = name_of(self._key(target))
+        name = name_of(self.key(target))
         if item["metadata"].get("deletionTimestamp"):
             return Health("reconciled", "is being removed and will then be created again", name)
         outdated = _why_outdated(target.domain, item, commit, objects, history)

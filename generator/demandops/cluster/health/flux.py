@@ -24,6 +24,11 @@ from demandops.cluster.health.release_health import (
 
 REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 """The annotation that makes a controller reconcile an object now."""
+_APPLIED_BY, _APPLIED_IN = (
+    "kustomize.toolkit.fluxcd.io/name",
+    "kustomize.toolkit.fluxcd.io/namespace",
+)
+"""The labels that kustomize-controller sets on everything that it applies."""
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
 """The label that helm-controller sets on everything that it installs."""
 
@@ -70,6 +75,11 @@ class Flux(HealthReader):
         kustomization = objects.get(self.follower(domain)) or {}
         return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
+    def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
+        """Return whether the domain's Kustomization has created an object."""
+        labels = item["metadata"].get("labels") or {}
+        return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
+
     def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
         """Return the last request to fetch that a domain's source has handled; empty if none."""
         return _handled(self._source(domain, objects) or {})
@@ -105,7 +115,7 @@ class Flux(HealthReader):
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
         del commit, history  # the domain's health has checked the commit
-        name = name_of(self._key(target))
+        name = name_of(self.key(target))
         status = item.get("status") or {}
         ready = condition(status, "Ready")
         current = status.get("observedGeneration") == item["metadata"].get("generation")

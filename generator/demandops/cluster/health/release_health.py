@@ -152,7 +152,7 @@ class HealthReader(ABC):
         A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
         gone.
         """
-        key = self._key(target)
+        key = self.key(target)
         item = objects.get(key)
         if not target.wanted:
             return self._removal_health(target, item, objects)
@@ -173,9 +173,18 @@ class HealthReader(ABC):
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
         """Return the commit that a domain has applied; empty if it is not known."""
 
+    def key(self, target: Target) -> Key:
+        """Return the key of the object that represents a release."""
+        kind = self.service_kind if target.by_helm else "Deployment"
+        return kind, target.domain.namespace, target.name
+
+    @abstractmethod
+    def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
+        """Return whether the object that applies a domain's folder has created an object."""
+
     def last_transition(self, target: Target, objects: Objects) -> str:
         """Return when the state of a release last changed; empty if the cluster does not say."""
-        status = (objects.get(self._key(target)) or {}).get("status") or {}
+        status = (objects.get(self.key(target)) or {}).get("status") or {}
         state = self._service_state(status) if target.by_helm else condition(status, "Available")
         return str(state.get("lastTransitionTime", ""))
 
@@ -197,10 +206,6 @@ class HealthReader(ABC):
         """Return why the controller fails to remove a service; empty if no failure is known."""
         return ""
 
-    def _key(self, target: Target) -> Key:
-        kind = self.service_kind if target.by_helm else "Deployment"
-        return kind, target.domain.namespace, target.name
-
     def _deployments(self, target: Target, objects: Objects) -> list[Object]:
         return [
             item
@@ -215,7 +220,7 @@ class HealthReader(ABC):
             return Health("healthy")
         message = self._why_not_removed(item or {}) if target.by_helm else ""
         reason = f"is still being removed; {message}" if message else "is still being removed"
-        return Health("reconciled", reason, name_of(self._key(target)), failing=bool(message))
+        return Health("reconciled", reason, name_of(self.key(target)), failing=bool(message))
 
 
 def name_of(key: Key) -> str:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from demandops.cluster.bootstrap_status import OldBootstrap
+from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, requesters_of
@@ -96,6 +97,7 @@ def causes(
         *map(_waits, in_turn(now.moment.state.ledger.waiting)),
         *map(_proposed, now.proposals),
         *map(_unapplied, now.old_bootstraps),
+        *map(_orphaned, now.orphans),
         *(_pending(now.moment, sorted(pending)) if pending else ()),
     ]
     places = {kind: place for place, kind in enumerate(KINDS)}
@@ -242,6 +244,16 @@ def _unapplied(old: OldBootstrap) -> Cause:
         f"is not applied to cluster '{old.cluster}' as it is now",
         Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
         told=f"access domains: {', '.join(old.domains)}",
+    )
+
+
+def _orphaned(left: Orphan) -> Cause:
+    return Cause(
+        "decision",
+        Part(left.object),
+        f"runs on cluster '{left.cluster}', but belongs to no release",
+        Remedy(f"an administrator of cluster {left.cluster}", "delete it", left.command),
+        told="its controller forgot that it had created it",
     )
 
 

@@ -1,0 +1,78 @@
+"""Objects that a GitOps controller created and no longer removes, because it forgot them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from demandops.cluster.health import health_reader
+from demandops.cluster.health.release_health import ClusterDomain, History, Target, name_of
+from demandops.cluster.object_cache import ObjectCache
+
+
+@dataclass(frozen=True, slots=True)
+class Orphan:
+    """A release's object on a cluster that has no such release, and the command that deletes it."""
+
+    cluster: str
+    kind: str
+    namespace: str
+    name: str
+
+    @property
+    def object(self) -> str:
+        """The object's name for people: ``Deployment perception/mqtt-edge``."""
+        return name_of((self.kind, self.namespace, self.name))
+
+    @property
+    def command(self) -> str:
+        """The command that deletes the object, with the ConfigMap of a connection end."""
+        names = [f"{self.kind.lower()}/{self.name}"]
+        names += [f"configmap/{self.name}"] if self.kind == "Deployment" else []
+        return f"kubectl -n {self.namespace} delete --ignore-not-found {' '.join(names)}"
+
+    def __str__(self) -> str:
+        """Return a sentence about the object, with the remedy."""
+        return (
+            f"{self.object} on cluster '{self.cluster}' belongs to no release any more; an "
+            f"administrator of the cluster deletes it: {self.command}"
+        )
+
+
+def orphans(
+    domains: Collection[ClusterDomain],
+    targets: Iterable[Target],
+    commit: str,
+    caches: Mapping[str, ObjectCache],
+    history: History,
+) -> Iterator[Orphan]:
+    """Yield the orphans on clusters, sorted; skip domains that cannot be read.
+
+    A domain that has not applied ``commit`` yet has none, because its controller may still remove
+    objects.
+
+    Args:
+        domains: the access domains on each cluster.
+        targets: all releases at the commit.
+        commit: the newest commit.
+        caches: the objects that were read from each cluster.
+        history: the commits of the state repo.
+    """
+    needed = {(target.domain, health_reader(target.domain).key(target)) for target in targets}
+    for domain in sorted(domains, key=lambda one: (one.cluster, one.name)):
+        store = caches.get(domain.cluster)
+        if store is None or store.unread(domain):
+            continue
+        read, objects = health_reader(domain), store.objects()
+        if not read.domain_health(domain, commit, objects, history).reaches("reconciled"):
+            continue
+        for key, item in sorted(objects.items()):
+            kind, namespace, name = key
+            if (
+                namespace == domain.namespace
+                and kind in (read.service_kind, "Deployment")
+                and (domain, key) not in needed
+                and not item["metadata"].get("deletionTimestamp")
+                and read.applied_by(domain, item)
+            ):
+                yield Orphan(domain.cluster, kind, namespace, name)
