@@ -1,4 +1,4 @@
-"""An API server with the objects that a test puts into it; they can be listed and watched."""
+"""An API server with the objects that a test puts into it: to list, to watch and to annotate."""
 
 from __future__ import annotations
 
@@ -23,6 +23,8 @@ class KubeApi:
     def __init__(self) -> None:
         self.url = ""
         self.closed = False
+        self.patches: list[tuple[str, Item]] = []
+        """The path and the body of each patch."""
         self._changed = threading.Condition()
         self._items: dict[tuple[str, str, str], Item] = {}
         self._log: list[tuple[str, str, Item]] = []
@@ -37,6 +39,18 @@ class KubeApi:
             self._items[plural, namespace, name] = item
             self._log.append((plural, namespace, item))
             self._changed.notify_all()
+
+    def patch(self, path: str, body: Item) -> None:
+        """Record a patch, and annotate the object as the patch says, if it exists."""
+        *_, namespace, plural, name = path.split("/")
+        with self._changed:
+            self.patches.append((path, body))
+            item = self._items.get((plural, namespace, name))
+        if item is not None:
+            more = {key: value for key, value in item.items() if key not in ("metadata", "status")}
+            annotations = item["metadata"].get("annotations", {}) | body["metadata"]["annotations"]
+            metadata = item["metadata"] | {"annotations": annotations}
+            self.put(plural, namespace, name, item["status"], metadata=metadata, **more)
 
     def listed(self, plural: str, namespace: str) -> Item:
         with self._changed:
@@ -109,6 +123,15 @@ def kube_api() -> Iterator[KubeApi]:
                 self.wfile.write(b"0\r\n\r\n")
             except OSError:
                 self.close_connection = True
+
+        def do_PATCH(self) -> None:
+            body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+            api.patch(self.path, body)
+            self.send_response(200)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", "2")
+            self.end_headers()
+            self.wfile.write(b"{}")
 
     try:
         with running(ThreadingHTTPServer(("127.0.0.1", 0), Handler)) as api.url:

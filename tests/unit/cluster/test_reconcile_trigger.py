@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import pytest
 from demandops.cluster import clusters_file
@@ -18,7 +16,10 @@ from tests.kit.clock import Clock
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.kube_api import KubeApi, kube_api
 
+_LONG_ENOUGH_S = 0.2
+"""After this time the trigger's thread has seen what happened before."""
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
 
@@ -87,50 +88,14 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
         yield f"{server.url}/hook/abc", heard
 
 
-@dataclass
-class Api:
-    """A server that accepts every patch. Its Flux fetches and applies when the test says so."""
-
-    kubeconfig: Path = Path()
-    patches: list[tuple[str, bytes]] = field(default_factory=list)
-    asked: str = ""
-    handled: str = ""
-    fetched: str = "a"
-    applied: str = "a"
-
-    def answer(self, call: Call) -> Answer:
-        if call.method == "PATCH":
-            self.patches.append((call.path, call.body))
-            annotations = call.json()["metadata"]["annotations"]
-            self.asked = annotations.get(REQUESTED_AT, "")
-            return Answer.json({})
-        if "watch=True" in call.path:
-            time.sleep(0.01)  # a watch that ends at once is begun again at once
-            return Answer()
-        item = self._source() if "gitrepositories" in call.path else self._kustomization()
-        return Answer.json({"metadata": {"resourceVersion": "1"}, "items": [item]})
-
-    def _source(self) -> dict[str, Any]:
-        metadata = {"name": "demandops", "annotations": {REQUESTED_AT: self.asked}}
-        artifact = {"revision": f"main@sha1:{self.fetched}"}
-        status = {"lastHandledReconcileAt": self.handled, "artifact": artifact}
-        return {"metadata": metadata, "status": status}
-
-    def _kustomization(self) -> dict[str, Any]:
-        status = {
-            "lastAttemptedRevision": f"main@sha1:{self.applied}",
-            "conditions": [{"type": "Ready", "status": "True"}],
-        }
-        spec = {"sourceRef": {"name": "demandops"}}
-        return {"metadata": {"name": "perception"}, "spec": spec, "status": status}
-
-
 @pytest.fixture
-def api(tmp_path: Path) -> Iterator[Api]:
-    found = Api()
-    with serving(found.answer) as server:
-        found.kubeconfig = kubeconfig(tmp_path, server.url)
-        yield found
+def api() -> Iterator[KubeApi]:
+    with kube_api() as server:
+        yield server
+
+
+def reached(api: KubeApi, folder: Path) -> clusters_file.ClusterAccess:
+    return clusters_file.ClusterAccess(kubeconfig=kubeconfig(folder, api.url))
 
 
 @pytest.mark.parametrize(
@@ -139,42 +104,61 @@ def api(tmp_path: Path) -> Iterator[Api]:
         (
             "experiment",
             "/apis/source.toolkit.fluxcd.io/v1/namespaces/perception/gitrepositories/demandops",
-            b"reconcile.fluxcd.io/requestedAt",
+            REQUESTED_AT,
         ),
         (
             "argocd-experiment",
             "/apis/argoproj.io/v1alpha1/namespaces/argocd/applications/demandops-perception",
-            b"argocd.argoproj.io/refresh",
+            "argocd.argoproj.io/refresh",
         ),
     ],
 )
 def test_the_object_that_fetches_is_annotated(
-    api: Api, case: str, path: str, annotation: bytes
+    api: KubeApi, tmp_path: Path, case: str, path: str, annotation: str
 ) -> None:
-    trigger(case, clusters_file.ClusterAccess(kubeconfig=api.kubeconfig))
+    trigger(case, reached(api, tmp_path))
     assert {asked for asked, _ in api.patches} == {path}
-    assert annotation in api.patches[0][1]
+    assert annotation in api.patches[0][1]["metadata"]["annotations"]
 
 
-@pytest.mark.parametrize("step", ["handles", "fetches", "applies"])
-def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(api: Api, step: str) -> None:
+def fetch(api: KubeApi, commit: str) -> None:
+    """Report that Flux has handled the last request, and has fetched a commit."""
+    asked = api.patches[-1][1]["metadata"]["annotations"] if api.patches else {}
+    artifact = {"revision": f"main@sha1:{commit}"}
+    status = {"lastHandledReconcileAt": asked.get(REQUESTED_AT, ""), "artifact": artifact}
+    api.put("gitrepositories", "perception", "demandops", status, metadata={"annotations": asked})
+
+
+def apply(api: KubeApi, commit: str) -> None:
+    ready = {"type": "Ready", "status": "True"}
+    status = {"lastAttemptedRevision": f"main@sha1:{commit}", "conditions": [ready]}
+    spec = {"sourceRef": {"name": "demandops"}}
+    api.put("kustomizations", "perception", "perception", status, spec=spec)
+
+
+@pytest.mark.parametrize("step", ["asked", "fetched", "applied"])
+def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(
+    api: KubeApi, tmp_path: Path, step: str
+) -> None:
     state, _ = start("experiment")
     clock = Clock()
-    access = {"c-its": clusters_file.ClusterAccess(kubeconfig=api.kubeconfig)}
-    waker = ReconcileTrigger(access, lambda since: ("", None), clock)
+    fetch(api, "a")
+    apply(api, "a")
+    waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None), clock)
     waker(state.config)
     wait_until(lambda: len(api.patches) == 1, "the first call")
-    if step != "handles":
-        api.handled, api.fetched = api.asked, "b"
+    if step != "asked":
+        fetch(api, "b")
+    time.sleep(_LONG_ENOUGH_S)
     waker(state.config)
-    time.sleep(0.1)
+    time.sleep(_LONG_ENOUGH_S)
     clock.pass_(30)
     waker(state.config)
-    time.sleep(0.2)
+    time.sleep(_LONG_ENOUGH_S)
     assert len(api.patches) == 1  # half a minute later it is still busy with the first fetch
-    if step == "applies":
-        api.applied = "b"
-        time.sleep(0.2)
+    if step == "applied":
+        apply(api, "b")
+        time.sleep(_LONG_ENOUGH_S)
         assert len(api.patches) == 1  # it has just become idle
         clock.pass_(1)
     else:
