@@ -65,6 +65,11 @@ class _Wake:
     """Domain → the request that its source had handled before the last call."""
 
     @property
+    def is_untried(self) -> bool:
+        """Whether a push came for which no call was made yet."""
+        return self.pushed is not None and self.pause == _FIRST_RETRY_S
+
+    @property
     def due(self) -> float:
         """When to make the call; infinity if there is nothing to tell."""
         if self.pushed is None:
@@ -94,7 +99,7 @@ class ReconcileTrigger:
         self._wakes: dict[tuple[str, ...], _Wake] = {}
         self._pushed = False
         self._changed = runtime.event()
-        self._stopping = False
+        self._ends = inf
         self._caches = {
             name: ObjectCache(name, access, self._changed.set, runtime)
             for name, access in self._clusters.items()
@@ -109,8 +114,11 @@ class ReconcileTrigger:
         self._changed.set()
 
     def close(self) -> None:
-        """Wake the clusters for the last push, if that is still due, and stop."""
-        self._stopping = True
+        """Wake the clusters for the last push, if that is still due, and stop.
+
+        A Flux that stays busy for some seconds is left to its next interval.
+        """
+        self._ends = self._runtime.monotonic() + _TIMEOUT_S
         self._changed.set()
         self._thread.join(2 * _TIMEOUT_S)
         for cache in self._caches.values():
@@ -120,19 +128,22 @@ class ReconcileTrigger:
         while True:
             self._changed.wait(self._seconds_until_due())
             self._changed.clear()
-            stopping = self._stopping
             if self._pushed and self._config is not None:
                 self._pushed = False
                 self._note_push(self._config)
             for wake in self._wakes.values():
                 self._note_idle(wake)
-                if wake.due <= self._runtime.monotonic() or (stopping and wake.pushed is not None):
+                if wake.due <= self._runtime.monotonic():
                     self._try(wake)
-            if stopping:
+            if self._ends < inf and not any(wake.is_untried for wake in self._wakes.values()):
+                return
+            if self._ends <= self._runtime.monotonic():
                 return
 
     def _seconds_until_due(self) -> float | None:
+        """Return the seconds until the next call or the end; None if neither is planned."""
         due = min((wake.due for wake in self._wakes.values()), default=inf)
+        due = min(due, self._ends)
         return None if due == inf else max(0.0, due - self._runtime.monotonic())
 
     def _note_push(self, config: Config) -> None:
@@ -202,6 +213,7 @@ class ReconcileTrigger:
                 wake.pushed = None
             wake.next_try = self._runtime.monotonic() + wake.pause
             wake.pause *= 2
+        self._note_idle(wake)
 
     def _call(self, wake: _Wake, access: ClusterAccess, config: Config) -> None:
         name = wake.cluster

@@ -168,6 +168,20 @@ def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(
     waker.close()
 
 
+def test_a_last_push_is_told_at_the_end_once_flux_is_idle(api: KubeApi, tmp_path: Path) -> None:
+    state, _ = start("experiment")
+    fetch(api, "a")
+    apply(api, "a")
+    waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None))
+    waker(state.config)
+    wait_until(lambda: len(api.patches) == 1, "the first call")
+    waker(state.config)
+    fetch(api, "b")
+    apply(api, "b")
+    waker.close()
+    assert len(api.patches) == 2
+
+
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
     url, heard = receiver
     reached = clusters_file.ClusterAccess(receiver=url)
