@@ -11,7 +11,7 @@ from demandops import strict_yaml
 from demandops.config.appdef.scaling import Scaling
 from demandops.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 from demandops.config.inventory import LabelKey, LabelValue, NodeId, Resources
-from demandops.config.node_property import AskedValue, PropertyName
+from demandops.config.node_property import PropertyName, RequiredValue
 from demandops.errors import sentences, suggestion
 
 TopicPattern = Annotated[
@@ -36,7 +36,7 @@ class Place(CamelModel):
     role: Word | Literal[""] = ""
     labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
     capabilities: Items[Word] = ()
-    properties: dict[PropertyName, AskedValue] = Field(default_factory=dict)
+    properties: dict[PropertyName, RequiredValue] = Field(default_factory=dict)
 
 
 class Input(CamelModel):

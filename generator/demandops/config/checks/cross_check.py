@@ -23,7 +23,7 @@ from demandops.config.config import (
     Config,
 )
 from demandops.config.config_reader import ConfigReader
-from demandops.config.node_property import asked_kind, kind_of
+from demandops.config.node_property import comparable_kind, kind_of
 from demandops.config.override import Override, patched_settings
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
@@ -162,9 +162,11 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(file, f"{where}values", message)
         for word, value in (service.place.properties if service.place else {}).items():
             kind, first = config.property_kinds.get(word, (None, ""))
-            if kind and asked_kind(value) != kind:
+            if kind and comparable_kind(value) != kind:
                 registry = config.file_of(NODES_FILE, first)
-                message = f"asks for {asked_kind(value)}, but is {kind} at '{first}' in {registry}"
+                message = (
+                    f"asks for {comparable_kind(value)}, but is {kind} at '{first}' in {registry}"
+                )
                 message += f"; ask for {kind}"
                 reader.add_fault(file, f"{where}place.properties.{word}", message)
         if service.prefix in words:
@@ -266,7 +268,11 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault if the ``each`` of a shared service is an output that each version publishes."""
+    """Add a fault for each shared service whose ``each`` names an output of an unshared service.
+
+    With ``versions: separate``, each version has an unshared service of its own. The shared service
+    runs once for all versions.
+    """
     services = config.services.get(appdef, {})
     for name, service in services.items():
         origin = service.inputs[service.each] if service.shared and service.each else ""
@@ -282,7 +288,7 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
 
 
 def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
-    """Return whether an appdef has no list of versions, not even an invalid one."""
+    """Return whether the versions file has no entry for an appdef, not even an invalid one."""
     return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
 
 

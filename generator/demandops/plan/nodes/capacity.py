@@ -68,7 +68,7 @@ def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return (node, resource) → how much more services request after claims changed.
+    """Return (node, resource) → how much more services request after claims have changed.
 
     A release that cannot be planned requests nothing. The result is empty if no node has a
     capacity.
@@ -147,13 +147,13 @@ class Room:
     def __init__(self, world: World, usage: Usage, given_back: Iterable[Claim]) -> None:
         self._world, self._usage = world, usage
         self._own: dict[tuple[Subject, str], dict[str, int]] = {}
-        self.soon: Counter[str] = Counter()
+        self.newly_placed: Counter[str] = Counter()
         """How many applications were placed on each node."""
         self._change((one for one in given_back if one.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
-        """Book a claim on an application at its node, and count the application in ``soon``."""
-        self.soon[claim.application.node] += 1
+        """Book a claim on an application at its node, and count it in :attr:`newly_placed`."""
+        self.newly_placed[claim.application.node] += 1
         self.book([claim])
 
     def book(self, claims: Iterable[Claim]) -> None:
