@@ -68,7 +68,7 @@ def _unfit_places(config: Config) -> Iterator[Fault]:
         asked = requirement_of(service)
         problems = [*unmet(asked, config)]
         if not problems and all(any(lacks(node, asked)) for node in config.nodes.values()):
-            problems = [f"no node in {config.place_of(NODES_FILE)} has all that it asks for"]
+            problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
         for problem in problems:
             message = f"{problem}; demands that need '{name}' are refused"
             yield fault(field, message).within(file)
