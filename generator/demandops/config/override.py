@@ -242,7 +242,10 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release, each with its effects; the last override wins."""
+    """The overrides that shape a release, each with the names of its effects.
+
+    The overrides are in the order in which they apply; the last one wins.
+    """
 
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
@@ -255,7 +258,7 @@ class Shaping:
 
     @property
     def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The path and the patch of each override that patches values."""
+        """The file and the patch of each override that patches values."""
         return tuple(
             (override.path, override.values or {})
             for override, effects in self.by

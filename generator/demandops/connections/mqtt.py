@@ -209,7 +209,7 @@ def _broker(broker: Broker) -> dict[str, Any]:
 
 
 def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
-    """Return a topic's further parameters, without those that have the client's default."""
+    """Return the parameters of a topic that differ from the client's defaults."""
     options: dict[str, Any] = {}
     if route.primitive:
         options["primitive"] = True

@@ -28,7 +28,7 @@ Resource = Literal["cpu", "memory"]
 
 
 class Sizes(CamelModel):
-    """The replicas of each size; a parameter of the demands names the size."""
+    """The number of replicas for each size. A parameter of the demands names the size."""
 
     parameter: Word
     replicas: Annotated[dict[Word, Count], Field(min_length=1)]

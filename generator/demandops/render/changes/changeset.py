@@ -36,7 +36,7 @@ FileReader = Callable[[str], str | None]
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops; ``details`` are lines on the facts that change."""
+    """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
 
     name: str
     what: str
