@@ -176,8 +176,8 @@ class OverrideFile(FileModel):
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
-                "select: values are settings of clients if connections are selected, otherwise "
-                "Helm values; write two overrides"
+                "select: selects connections and services, but values are either settings of "
+                "clients or Helm values; write two overrides"
             )
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]

@@ -1,4 +1,4 @@
-"""The planner: :func:`plan` derives the release at a key from claims.
+"""The planner: :func:`plan` derives from claims the release that a key identifies.
 
 Keys come from :mod:`demandops.plan.release_keys`.
 """
@@ -245,8 +245,8 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         if len(numbers) != len(given):
             odd = next(value for value in given if value not in numbers)
             message = (
-                f"{odd!r} is not a number, but the application definition takes the "
-                f"{parameter.merge}; give a number"
+                f"{odd!r} is not a number, but the application definition merges the values "
+                f"by {parameter.merge}; give a number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)

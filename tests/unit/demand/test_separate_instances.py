@@ -228,6 +228,6 @@ values: values/follower.yaml.j2
     assert [str(fault) for fault in raised.value.faults] == [
         "appdefs/object-detection-fusion/appdef.yaml: uses.follower.lists: is "
         "'object-detection.object_list', which each version makes on its own (versions: separate), "
-        "but 'follower' runs once for all; make it a service of this definition, or share "
+        "but 'follower' runs once for all; make 'follower' a service of this definition, or share "
         "'object-detection' too"
     ]

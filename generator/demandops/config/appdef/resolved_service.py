@@ -192,9 +192,9 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
             if others and root not in others:
                 yield (
                     _place(service, role),
-                    f"'{service.inputs[role]}' does not belong to one topic of '{root}', for each "
-                    "of which the service runs; read it in a service that runs once for the "
-                    "application or the node",
+                    f"the service runs once for each topic of '{root}', but "
+                    f"'{service.inputs[role]}' does not belong to one of them; read it in a "
+                    "service that runs once for the application or the node",
                 )
     elif service.at_source:
         roots = tuple(sorted({one for of in made_from.values() for one in of}))

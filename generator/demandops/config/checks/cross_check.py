@@ -109,7 +109,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
         if closed and config.clients.of(word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
-                "forbids it; leave it out, so that each client is like its node"
+                "forbids it; leave it out, so that each client has the setting of its node"
             )
             reader.add_fault(file, f"{word}.hostNetwork", message)
 
@@ -224,7 +224,7 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                     f"appdefs/{appdef}/appdef.yaml",
                     f"uses.{name}.{service.each}",
                     f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; one service "
-                    "runs for both, so name them alike",
+                    "runs for both, so use one name in both",
                 )
 
 
@@ -282,7 +282,7 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
                 f"appdefs/{appdef}/appdef.yaml",
                 f"uses.{name}.{service.each}",
                 f"is '{origin}', which each version makes on its own (versions: separate), but "
-                f"'{name}' runs once for all; make it a service of this definition, or share "
+                f"'{name}' runs once for all; make '{name}' a service of this definition, or share "
                 f"'{producer.name}' too",
             )
 

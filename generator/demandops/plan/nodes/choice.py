@@ -271,7 +271,7 @@ class Choice:
             elif not reasons and (shortage := self._shortage(node)):
                 reasons, code = shortage, NO_ROOM
             elif not reasons:
-                reasons.append("is one with which the demand is refused")
+                reasons.append("fits, but the demand would be refused there")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))

@@ -99,8 +99,8 @@ def _connections_of_before(world: World) -> Iterator[Fault]:
                 )
     for (name, other), count in sorted(counts.items()):
         message = (
-            f"no rule of access domain '{name}' has '{other}' in its peers; connections between "
-            f"them stay ({count}), but cannot be demanded again"
+            f"no rule of access domain '{name}' has '{other}' in its peers; the existing "
+            f"connections between them ({count}) stay, but cannot be demanded again"
         )
         yield fault("", message).within(world.config.file_of(DOMAINS_FILE, name))
 
