@@ -28,7 +28,10 @@ def absolute_topic(topic: str) -> str:
 
 
 def control_character(text: str) -> str:
-    """Return the first invisible or bidirectional control character, like ``U+202E``, or ""."""
+    """Return the first invisible or bidirectional control character of a text.
+
+    The result is its name, like ``U+202E``. It is empty if there is no such character.
+    """
     for char in text:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return f"U+{ord(char):04X}"

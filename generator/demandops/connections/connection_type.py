@@ -237,7 +237,7 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
-        """Return the client with a key, or ``None`` if the client carries no topic.
+        """Return the client that ``key`` identifies, or ``None`` if the client carries no topic.
 
         Raises:
             Refused: if connections contradict each other, or the configuration no longer has what
@@ -252,7 +252,7 @@ def make_end(
     config: Config,
     **more: Any,  # noqa: ANN401 - any field
 ) -> AnyEnd:
-    """Return one end of a connection; ``more`` has the fields that only this kind of end has.
+    """Return one end of a connection; ``more`` has the fields that only the class ``end`` has.
 
     Raises:
         Refused: if the end's node is no longer in the inventory or in an access domain.

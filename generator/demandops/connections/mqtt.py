@@ -105,7 +105,7 @@ class Mqtt(ConnectionType):
         return [("brokers", broker.node)] if broker else []
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
-        """Return the end with a key, or ``None`` if its connection carries no topic."""
+        """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None

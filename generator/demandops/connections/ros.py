@@ -74,7 +74,7 @@ class Ros(ConnectionType):
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
-        """Return the end with a key, or ``None`` if its connection carries no topic."""
+        """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None

@@ -287,7 +287,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return (node, resource) → how much more services request than before.
+    """Return (node, resource) → by how much the requests of services grow.
 
     The result is empty if no node has a capacity.
     """

@@ -64,7 +64,7 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What the node of an application must have: its type, labels as pairs, capabilities.
+    """Requirements on a node: its type, labels as pairs, capabilities and properties.
 
     ``properties`` are texts like ``memoryGiB>=8`` (:mod:`demandops.config.node_property`).
     """
@@ -94,8 +94,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: an appdef at a node with inputs by role.
 
     ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
-    are sorted by topic (:meth:`booked`). ``place`` is what the node must have; it is ``None`` if
-    the demand names the node. ``separate`` says that this version runs at the same time as other
+    are sorted by topic (:meth:`booked`). ``place`` has the requirements on the node; it is ``None``
+    if the demand names the node. ``separate`` says that this version runs at the same time as other
     versions, and that the id ends in the version (:mod:`demandops.demand.separate_instance`).
     ``services`` maps each service that has a node of its own to this node. ``named`` lists the
     services whose node the demand names; the generator chose the nodes of the other services.

@@ -47,7 +47,7 @@ class GoalTopic(FrozenModel):
 
 
 class GoalPlace(FrozenModel):
-    """What the node of an application must have; ``labels`` are ``key=value``.
+    """Requirements on the node of an application; ``labels`` are ``key=value``.
 
     ``properties`` are ``name=value``, ``name>=number`` or ``name<=number``.
     """
@@ -220,7 +220,7 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return what a place requires, and add its faults; ``None`` if the place is empty."""
+    """Return the requirement in ``place``, or ``None`` if it is empty; append its faults."""
     if place == GoalPlace():
         return None
     told = {found.field for found in faults}
@@ -254,7 +254,7 @@ def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Pos
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
-    """Return the faults of the form of ``data``."""
+    """Return the faults in the form of a goal, such as unknown fields and wrong types."""
     return parse(data)[1]
 
 

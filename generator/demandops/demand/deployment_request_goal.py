@@ -167,7 +167,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
 
 def form_faults(data: object) -> list[Fault]:
-    """Return the faults of the form of ``data``: unknown fields, wrong types."""
+    """Return the faults in the form of a goal: unknown fields, wrong types."""
     if not isinstance(data, dict):
         return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]

@@ -142,10 +142,11 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for each input in ``role`` with the text ``part`` in topic names.
+        """Yield (input, version) for the inputs in ``role`` that have ``part`` in topic names.
 
-        ``part`` replaces ``{instance}`` there. Only further inputs and the inputs of separate
-        instances are yielded. The version is that of the separate instance, else empty.
+        ``part`` replaces ``{instance}`` in the patterns of topics. Only further inputs and the
+        inputs of separate instances are yielded. ``version`` is the version of the separate
+        instance, else empty.
         """
         for claim in self._claims("further", part):
             app = claim.application
@@ -331,7 +332,10 @@ class Ledger:
 def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
-    """Return node → number of applications after the first claim on an application changed."""
+    """Return ``counts`` after the first claim on an application changed.
+
+    ``counts`` is :attr:`Ledger.applications_on`. The claim was ``before`` and is ``after`` now.
+    """
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):
         for node in nodes:

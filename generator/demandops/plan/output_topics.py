@@ -41,7 +41,7 @@ def outputs(
 
 
 def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
-    """Return the text for ``{instance}`` of the service instance that runs for ``topic``.
+    """Return the text that replaces ``{instance}`` for the service instance that serves ``topic``.
 
     ``version`` is the version of a separate instance, else empty.
     """

@@ -138,7 +138,7 @@ def affected_keys(
         subject, claims = change.key.subject, _differing(change, after)
         for world, claim in zip((before, after), claims, strict=True):
             own = [claim] if claim and world.ledger.get(claim.key) else []
-            if not _decided_alike(before, after, subject):
+            if not _has_same_place_and_version(before, after, subject):
                 own += world.ledger.claims_on(subject)
             keys |= dict.fromkeys(keys_of_claims(world, own, strict=world is after))
     return tuple(keys)
@@ -183,7 +183,7 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
     return app.with_inputs(inputs)
 
 
-def _decided_alike(before: World, after: World, subject: Subject) -> bool:
+def _has_same_place_and_version(before: World, after: World, subject: Subject) -> bool:
     """Return whether an application has the same node, definition and version in both worlds.
 
     Return ``True`` for a connection, and for an application that only one world has.

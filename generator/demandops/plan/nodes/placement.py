@@ -56,7 +56,7 @@ def with_chosen_nodes(
     Args:
         request: the request.
         world: the claims and the configuration before it.
-        usage: how much services request of the nodes in ``world``.
+        usage: how much services request on each node in ``world``.
         trial: if given, a node is skipped if ``trial`` returns ``False`` for the request with this
             node.
 
@@ -195,7 +195,10 @@ def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
 
 
 def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Choice]:
-    """Yield the choices of nodes for an application and its services, as if no node were in use."""
+    """Yield the :class:`Choice` for an application and for each of its services that is placed.
+
+    No node counts as used, so the choices show which nodes could ever fit.
+    """
     if not isinstance(one.held, Application):
         return
     free, claims = Room(world, Usage(), ()), (_claim(request, one),)

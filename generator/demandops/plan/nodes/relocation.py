@@ -49,7 +49,7 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
     Args:
         request: the drain; its ``id`` is the node.
         world: the claims and the configuration.
-        usage: how much services request of the nodes in ``world``.
+        usage: how much services request on each node in ``world``.
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
     room = Room(world, usage, ())

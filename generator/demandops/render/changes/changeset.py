@@ -1,4 +1,4 @@
-"""The changes that a decision makes in the state repo: files by path, and releases in words.
+"""The changes that a decision makes in the state repo: files by path, and how releases change.
 
 A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
 """
