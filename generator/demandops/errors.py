@@ -47,7 +47,7 @@ class Fault:
 
     @property
     def place(self) -> str:
-        """File and line, as far as they are known: ``inventory/nodes.yaml:12``."""
+        """The file and the line, as far as they are known: ``inventory/nodes.yaml:12``."""
         return place_text(self.file, self.line)
 
     def within(self, file: str) -> Fault:
@@ -65,11 +65,11 @@ def place_text(file: str, line: int | None) -> str:
 class DemandOpsError(Exception):
     """Base of every error that this program raises on purpose.
 
-    The text is one line; that of :class:`InvalidInput` has one line for each fault.
+    The text of an error is one line. The text of :class:`InvalidInput` has one line for each fault.
     """
 
     def __str__(self) -> str:
-        """Return the text as one line; it may contain any text, so it is escaped."""
+        """Return the text on one line, with an escape for each invisible character."""
         return one_line(super().__str__())
 
 
@@ -90,7 +90,7 @@ class InvalidInput(DemandOpsError):
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
-        """Return an error that carries one fault, made from the arguments."""
+        """Return an error with a single fault, made from the arguments."""
         return cls([Fault(code, field, message, file)])
 
 
@@ -153,7 +153,7 @@ class QueueFull(DemandOpsError):
 
 
 def fault(field: str, message: str, *, code: str = "invalid", line: int | None = None) -> Fault:
-    """Return a fault that is not in a file yet."""
+    """Return a fault without a file; :meth:`Fault.within` adds the file later."""
     return Fault(code=code, field=field, message=message, line=line)
 
 

@@ -14,7 +14,7 @@ from demandops.strict_yaml import LOADER, load_all
 
 
 def lines(text: str, document: int = 0) -> dict[str, int]:
-    """Return field → line, for each field of a document; a field is like ``nodes[3].cluster``.
+    """Return the line of each field of a document; a field is a path like ``nodes[3].cluster``.
 
     The result is empty if :func:`load_all` refuses the text. The error of :func:`load_all` already
     names the line. ``document`` counts from 0.
@@ -49,16 +49,21 @@ class FieldLines:
         self._known: dict[str, Mapping[str, int]] = {}
 
     def of(self, file: str, field: str) -> int | None:
-        """Return the line of a field, else of the nearest enclosing part, else None."""
+        """Return the line of a field in a file.
+
+        If the field has no line of its own, return the line of the nearest part that contains it.
+        Return None if there is no such part.
+        """
         if field and file not in self._known:
             self._known[file] = lines(self._text_of(file) or "")
         return nearest(field, self._known.get(file, {}))
 
 
 def nearest(field: str, known: Mapping[str, int]) -> int | None:
-    """Return the line of a field, else of the nearest enclosing part, else None.
+    """Return the line of a field, by ``known``, which maps fields to lines.
 
-    ``known`` maps fields to lines.
+    If the field is not known, return the line of the nearest known part that contains it. Return
+    None if there is no such part.
     """
     while field and field not in known:
         field = field[: max(field.rfind("."), field.rfind("["), 0)]
@@ -66,14 +71,20 @@ def nearest(field: str, known: Mapping[str, int]) -> int | None:
 
 
 def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
-    """Return the faults with the lines of their fields added where they are known."""
+    """Return the faults, each with the line of its field if that line is known.
+
+    ``text_of`` returns the text of a file, or None if there is no such file.
+    """
     known = FieldLines(text_of)
     return [replace(one, line=one.line or known.of(one.file, one.field)) for one in faults]
 
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """Add lines to the faults that the block raises; all of them must be about ``text``."""
+    """Add the line of the field to each fault that the block raises.
+
+    The fields of the faults must be fields of ``text``.
+    """
     try:
         yield
     except InvalidInput as error:

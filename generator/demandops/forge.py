@@ -77,8 +77,7 @@ class Forge(ABC):
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
         """Return the pull request for a branch, in any state; open one if there is none.
 
-        A branch gets only one pull request. If it is closed, it is returned, and no other is
-        opened.
+        A branch gets only one pull request. If that one is closed, no other is opened.
         """
         existing = self.find(branch, target)
         if existing is not None:

@@ -28,7 +28,10 @@ def absolute_topic(topic: str) -> str:
 
 
 def control_character(text: str) -> str:
-    """Return the first invisible or bidirectional control character, like ``U+202E``, or ""."""
+    """Return the first invisible or bidirectional control character of a text.
+
+    The result is its name, like ``U+202E``. It is empty if there is no such character.
+    """
     for char in text:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return f"U+{ord(char):04X}"
@@ -38,7 +41,8 @@ def control_character(text: str) -> str:
 def id_problem(value: str) -> str:
     """Return the problem of an id, or an empty string.
 
-    Nearly all text is valid. Not valid are invisible characters, white space at an end, and ``..``.
+    An id may be nearly any text. It must not contain invisible characters or ``..``, and must not
+    start or end with white space.
     """
     if not value:
         return "is empty; give an id"
@@ -120,4 +124,4 @@ PATTERN_WORDS = {
         "a topic that begins with '/', such as /{instance}_objects"
     ),
 }
-"""Pattern of a field → description of what a person may write in the field."""
+"""Pattern of a field → description, for messages, of the texts that match the pattern."""

@@ -1,9 +1,9 @@
 """Names of Kubernetes objects and of derived topics.
 
-A name depends on its own subject only. Two different ids never give the same object name: if an id
-must be shortened or changed to fit, a hash of the exact id is appended. Object names follow
-DNS-1123 and have at most 53 characters, Helm's limit for a release name. Topic names are made as
-the reference makes them, so the ids ``a/b`` and ``a-b`` both give ``a_b`` there.
+A name depends only on the ids that it is made from. Two different ids never give the same object
+name: if an id must be shortened or changed to fit, a hash of the exact id is appended. Object names
+follow DNS-1123 and have at most 53 characters, Helm's limit for a release name. Topic names are
+made as the reference makes them, so the ids ``a/b`` and ``a-b`` both give ``a_b`` there.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MAX_TOKEN = 120
 
 
 def digest(*ids: str) -> str:
-    """Return a hash of a list of ids; ``a-b``, ``c`` and ``a``, ``b-c`` give different hashes."""
+    """Return a hash of a list of ids; the lists ``a-b, c`` and ``a, b-c`` have different hashes."""
     exact = json.dumps(ids, ensure_ascii=True)
     return hashlib.sha256(exact.encode()).hexdigest()[:_HASH]
 
@@ -31,9 +31,9 @@ def digest(*ids: str) -> str:
 def object_name(prefix: str, *ids: str) -> str:
     """Return the name of a Kubernetes object for ``ids``.
 
-    ``od``, ``edge``, ``vehicle00`` gives ``od-edge-vehicle00``. A hash is appended if an id is not
-    a valid label, if one of several ids has a dash (``a-b``, ``c`` must differ from ``a``,
-    ``b-c``), if the name ends like a hash, or if it is too long.
+    ``od``, ``edge``, ``vehicle00`` gives ``od-edge-vehicle00``. A hash is appended in each of these
+    cases: an id is not a valid label; there are several ids and one has a dash, so that other ids
+    could give the same name; the name ends like a hash; the name is too long.
     """
     plain = "-".join((prefix, *ids)) if prefix else "-".join(ids)
     exact = all(_LABEL.fullmatch(part) for part in ids)
@@ -52,10 +52,10 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    If an id gives no valid name in this way, its name gets a hash. ``extra`` distinguishes names
-    with the same id, for example those of two point clouds of one source. The name then contains
-    ``extra`` as a slug, and a hash. Results are cached, because each release asks for the names of
-    all its inputs.
+    If an id gives no valid name in this way, a hash is appended. ``extra`` distinguishes names with
+    the same id, for example those of two point clouds of one source. With ``extra``, the name also
+    contains a slug of ``extra`` and a hash. Results are cached, because each release asks for the
+    names of all its inputs.
     """
     plain = re.sub("[-/]", "_", id)
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):

@@ -62,7 +62,7 @@ def quoted(value: str, most: int = 80) -> str:
 def json_escaped(text: str) -> str:
     """Return JSON text with each invisible character replaced by JSON's escape for it.
 
-    Line breaks stay. The result has the same data.
+    Line breaks stay. The result parses to the same data.
     """
     if is_visible(text.replace("\n", "")):
         return text

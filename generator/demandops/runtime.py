@@ -33,8 +33,8 @@ _LONGEST_REASON = 300
 class Runtime:
     """The runtime of this machine; a subclass overrides the methods that it replaces.
 
-    ``unsound`` is the error for which the process must end, or None. ``when_unsound`` is called
-    after such an error.
+    ``unsound`` is the error because of which the process must end, or None. ``when_unsound`` is
+    called after such an error.
     """
 
     def __init__(self) -> None:

@@ -55,7 +55,8 @@ def modeline(path: str, schema: str) -> str:
 
 
 NOTES_ROOT = ".demandops"
-"""The top-level folder of the generator's reports to people; no decision depends on them."""
+"""The top-level folder with the generator's reports to people. No decision depends on the reports.
+"""
 
 _PACKAGE = Path(__file__).parent
 _CHECKOUT = _PACKAGE.parents[1]

@@ -78,13 +78,13 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a stand-in for a list is not a field's value, for example if it is in a text."""
+    """Raised if a list's stand-in does not occur as the value of a field, but inside a text."""
 
 
 class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
-    It refuses a deeply nested text, because code that reads the values could fail. ``lists`` maps
+    It refuses deep nesting, because recursive code that reads the values could fail. ``lists`` maps
     each stand-in in the text to the list that it stands for.
     """
 
@@ -258,8 +258,8 @@ _STAND_IN = "demandops-list"
 def _load_around_lists(text: str) -> list[Any]:
     """Read a document with PyYAML, but its long lists with the json module.
 
-    Return a list with the document. If the text has no long lists, or cannot be read in this way,
-    return an empty list.
+    Return a list with the document as its only item. Return an empty list if the text has no long
+    lists, or cannot be read in this way.
     """
     lists: dict[str, list[str]] = {}
 

@@ -1,8 +1,8 @@
 """Charts in folders of the state repo: the libraries that they depend on, and their default values.
 
-Pure: functions get the files as a mapping of paths to texts, and charts as folders. Like Flux and
-Argo CD, this module reads a library from the folder that ``repository: file://…`` in ``Chart.yaml``
-names.
+Pure: functions take the files as a mapping of paths to texts, and a chart as the path of its
+folder. Like Flux and Argo CD, this module reads a library from the folder that ``repository:
+file://…`` in ``Chart.yaml`` names.
 """
 
 from __future__ import annotations

@@ -54,9 +54,9 @@ def composed(
 
 
 def own_properties(schema: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
-    """Return name → property for what a chart's schema adds to or changes in the library's schema.
+    """Return the properties that a chart's schema adds to the library's schema, or changes there.
 
-    Descriptions are ignored and left out.
+    The result maps names to properties. Descriptions are ignored and left out.
     """
     shared = {
         name: _plain(copy.deepcopy(one))

@@ -18,7 +18,7 @@ _HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------
 
 
 def descriptions(text: str) -> dict[str, str]:
-    """Return the path of each described value (such as ``image.tag``) → its description."""
+    """Return path → description for each described value, such as ``image.tag``."""
     found: dict[str, str] = {}
     path: list[tuple[int, str]] = []
     said: list[str] = []

@@ -75,7 +75,10 @@ def _hidden(value: str) -> str:
 
 
 Visible = without(_hidden)
-"""Rejects the control characters that hide or reorder text; line breaks and tabs are valid."""
+"""A validator that rejects control characters that hide or reorder text.
+
+Line breaks and tabs are valid.
+"""
 
 Text = Annotated[str, Visible]
 """Any visible text."""

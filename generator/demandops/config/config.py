@@ -65,7 +65,10 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return how a message names the files of a collection; ``files`` are those with entries."""
+    """Return the text with which a message names the files of a collection.
+
+    ``files`` are the files that have entries.
+    """
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
@@ -104,7 +107,7 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """Part of a topic's name → the nodes whose ids become this part."""
+    """Part of a topic name → the nodes whose ids give it (:func:`demandops.naming.topic_part`)."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     """Type of nodes → these nodes, sorted by id; the empty type has all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
@@ -120,7 +123,7 @@ class Config:
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The roles, sorted, for which a service of any appdef runs once for each topic."""
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
-    """The names of services that keep replicas for a while, in at least one appdef."""
+    """The names of the services whose scaling has ``downAfter``, in at least one appdef."""
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
@@ -198,7 +201,7 @@ class Config:
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return how a message names the files of a collection."""
+        """Return the text with which a message names the files of a collection."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
@@ -230,7 +233,7 @@ class Config:
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return how a message names the file or files with the versions of an appdef."""
+        """Return the text with which a message names the files with the versions of an appdef."""
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
         return self.place_of(CHARTS_FILE)

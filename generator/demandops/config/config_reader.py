@@ -77,7 +77,7 @@ class ConfigReader:
                     name = entry.get(key) if isinstance(entry, dict) else None
                 at = (field, place)
                 if isinstance(name, str) and name in places:
-                    self.add_twice(name, places[name], (file, field_path(at)), key)
+                    self.add_duplicate(name, places[name], (file, field_path(at)), key)
                     continue
                 parsed = self._valid(item.model_validate, entry, item, file, at)
                 label = key or self._valid(_NAME.validate_python, name, item, file, at)
@@ -87,10 +87,10 @@ class ConfigReader:
                     items[name], places[name] = parsed, (file, field_path(at))
         return items
 
-    def add_twice(
+    def add_duplicate(
         self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
     ) -> None:
-        """Add the faults of an entry that appears twice, at the places ``first`` and ``second``.
+        """Add the faults of an entry that is at two places, ``first`` and ``second``.
 
         A place is (file, field). If the places are in two files, both files get a fault. So the
         changed file is quarantined, no matter which of the two a person changed.
@@ -112,9 +112,9 @@ class ConfigReader:
         }
 
     def head(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file that :meth:`read_items` read as ``model``, without its items.
+        """Return the fields of a file besides its items, as an instance of ``model``.
 
-        Return ``None`` if the other fields of the file are not valid.
+        :meth:`read_items` must have read the file. Return ``None`` if these fields are not valid.
         """
         head = self._heads.get(file)
         return head if isinstance(head, model) else None
@@ -135,7 +135,7 @@ class ConfigReader:
         return collection not in self._incomplete and name not in self._places[collection]
 
     def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
-        """Add a fault if :meth:`is_missing` holds for ``name`` in the collection ``known_in``."""
+        """Add a fault if the collection ``known_in`` has no item ``name`` (:meth:`is_missing`)."""
         if self.is_missing(known_in, name):
             where = place_of_collection(known_in, self.files_of(known_in))
             where = where.replace("inventory/", "")

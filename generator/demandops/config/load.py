@@ -132,7 +132,7 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services. For one that runs once for each cluster, add which node it runs at.
+    """Return the services, with ``runs_at`` set for each that runs once for each cluster.
 
     ``runs_at`` maps the id of each node to the node of its cluster at which the service runs.
     """
@@ -167,7 +167,7 @@ def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]
         for word in part.connection_types if part else ():
             first = files.setdefault(word, file)
             if first != file:
-                reader.add_twice(word, (first, word), (file, word))
+                reader.add_duplicate(word, (first, word), (file, word))
             found = found.model_copy(update={word: getattr(part, word)})
     return found, files
 

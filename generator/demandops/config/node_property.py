@@ -1,4 +1,4 @@
-"""Properties of nodes: typed values in the inventory, and conditions that a place sets for them.
+"""Properties of nodes: typed values in the inventory, and the conditions of ``place`` on them.
 
 The value of a property is a number, text, true or false. A condition is a text: ``ros=jazzy``,
 ``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values of the same type on all nodes. This
@@ -20,7 +20,7 @@ from demandops.quoting import quoted
 
 _NAME = "[a-z][A-Za-z0-9_]*"
 _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
-_ASKED = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
+_CONDITION = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
 _BOUNDS = {"min": ">=", "max": "<="}
 
 PropertyName = Annotated[str, StringConstraints(pattern=f"^{_NAME}$", max_length=63)]
@@ -30,8 +30,8 @@ Kind = Literal["a number", "text", "true or false"]
 """The type of a property's values, in words."""
 
 
-class Asked(NamedTuple):
-    """A condition: the name of a property, the sign of the comparison, and the value as text."""
+class PropertyCondition(NamedTuple):
+    """The name of a property, the sign of the comparison, and the value as text."""
 
     name: str
     sign: str
@@ -57,7 +57,7 @@ def _value(value: object) -> object:
     return value
 
 
-def _asked_value(value: object) -> object:
+def _required_value(value: object) -> object:
     if not isinstance(value, dict):
         return _value(value)
     bounds = {*map(str, value)}
@@ -82,13 +82,13 @@ _LIMITS: dict[str, Any] = {
 }
 PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": _PLAIN})]
 """The value of a node's property."""
-AskedValue = Annotated[
-    Any, AfterValidator(_asked_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
+RequiredValue = Annotated[
+    Any, AfterValidator(_required_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
 ]
 """The value that a definition requires of a property, or bounds of a number: ``{min: 8}``."""
 
 
-def asked_texts(properties: Mapping[str, object]) -> Iterator[str]:
+def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
     """Yield the conditions in a definition's ``properties`` as texts, like ``memoryGiB>=8``."""
     for name, value in properties.items():
         if isinstance(value, dict):
@@ -97,27 +97,31 @@ def asked_texts(properties: Mapping[str, object]) -> Iterator[str]:
             yield f"{name}={str(value).lower() if isinstance(value, bool) else value}"
 
 
-def asked_kind(value: object) -> Kind | None:
-    """Return the type of the properties with which a definition's value can be compared.
+def comparable_kind(value: object) -> Kind | None:
+    """Return the type of the properties with which a required value can be compared.
 
-    Return ``None`` if the value is not valid.
+    Return ``None`` if the required value is not valid.
     """
     return "a number" if isinstance(value, dict) else kind_of(value)
 
 
 @lru_cache(maxsize=1024)
-def asked_in(text: str) -> Asked | None:
-    """Return the condition that a text states; ``None`` if the text cannot be read."""
-    match = _ASKED.fullmatch(text)
-    asked = Asked(*match.groups()) if match else None
-    return None if asked and asked.sign != "=" and _number(asked.value) is None else asked
+def read_condition(text: str) -> PropertyCondition | None:
+    """Return the condition that a text states, or ``None`` if the text is not a condition."""
+    match = _CONDITION.fullmatch(text)
+    condition = PropertyCondition(*match.groups()) if match else None
+    return (
+        None
+        if condition and condition.sign != "=" and _number(condition.value) is None
+        else condition
+    )
 
 
-def problem_of(asked: Asked, kind: Kind) -> str:
+def condition_problem(condition: PropertyCondition, kind: Kind) -> str:
     """Return why a condition does not fit a property of the type ``kind``; empty if it fits."""
-    if _read(asked, kind) is not None:
+    if _read(condition, kind) is not None:
         return ""
-    return f"{quoted(asked.name)} is {kind}; ask for {_EXAMPLES[kind].format(asked.name)}"
+    return f"{quoted(condition.name)} is {kind}; ask for {_EXAMPLES[kind].format(condition.name)}"
 
 
 _EXAMPLES: dict[Kind, str] = {
@@ -127,15 +131,15 @@ _EXAMPLES: dict[Kind, str] = {
 }
 
 
-def has_asked(properties: Mapping[str, object], text: str) -> bool:
+def meets_condition(properties: Mapping[str, object], text: str) -> bool:
     """Return whether a node with these properties meets the condition in ``text``."""
-    asked = asked_in(text)
-    value = properties.get(asked.name) if asked else None
+    condition = read_condition(text)
+    value = properties.get(condition.name) if condition else None
     kind = kind_of(value)
-    wanted = _read(asked, kind) if asked and kind else None
-    if wanted is None or asked is None:
+    wanted = _read(condition, kind) if condition and kind else None
+    if wanted is None or condition is None:
         return False
-    match asked.sign:
+    match condition.sign:
         case ">=":
             return bool(value >= wanted)  # type: ignore[operator]  # both are numbers
         case "<=":
@@ -143,15 +147,15 @@ def has_asked(properties: Mapping[str, object], text: str) -> bool:
     return value == wanted
 
 
-def _read(asked: Asked, kind: Kind) -> object:
+def _read(condition: PropertyCondition, kind: Kind) -> object:
     """Return the value of a condition, read as ``kind``; ``None`` if it has another type."""
     if kind == "a number":
-        return _number(asked.value)
-    if asked.sign != "=":
+        return _number(condition.value)
+    if condition.sign != "=":
         return None
     if kind == "text":
-        return asked.value
-    return {"true": True, "false": False}.get(asked.value)
+        return condition.value
+    return {"true": True, "false": False}.get(condition.value)
 
 
 def _number(value: str | float) -> float | None:

@@ -176,8 +176,8 @@ class OverrideFile(FileModel):
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
-                "select: values are settings of clients if connections are selected, otherwise "
-                "Helm values; write two overrides"
+                "select: selects connections and services, but values are either settings of "
+                "clients or Helm values; write two overrides"
             )
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
@@ -242,7 +242,10 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release, each with its effects; the last override wins."""
+    """The overrides that shape a release, each with the names of its effects.
+
+    The overrides are in the order in which they apply; the last one wins.
+    """
 
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
@@ -255,7 +258,7 @@ class Shaping:
 
     @property
     def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The path and the patch of each override that patches values."""
+        """The file and the patch of each override that patches values."""
         return tuple(
             (override.path, override.values or {})
             for override, effects in self.by

@@ -88,7 +88,10 @@ class Chart(ChartSource):
         return (self, *self.channels.values())
 
     def at(self, version: str) -> ChartSource | None:
-        """Return a channel or version (empty: the default); ``None`` if the name is unknown."""
+        """Return the source of a channel or version, or ``None`` if the name is unknown.
+
+        An empty name stands for the default version.
+        """
         if not version:
             return self
         if version in self.channels:
@@ -166,7 +169,7 @@ class ImagePin(FrozenModel):
         return self
 
     def over(self, image: Image) -> Image:
-        """Return the image with this pin applied.
+        """Return ``image`` with the fields of this pin in place of its own.
 
         A pin with only a tag removes the image's digest. A pin with only a digest removes the
         image's tag.
@@ -180,7 +183,7 @@ class ImagePin(FrozenModel):
 
 
 class VersionContents(CamelModel):
-    """What one version of an application runs.
+    """The charts and images of one version of an application.
 
     A chart that is not listed has its default version. An image that is not listed is that of
     ``registry/images.yaml``.

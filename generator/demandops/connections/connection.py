@@ -48,7 +48,7 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """The type of a connection whose type is already chosen."""
+        """The type of the connection, which must be chosen already."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
@@ -77,8 +77,8 @@ class Connection:
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
 
-    def is_meant_by(self, listed: object) -> bool:
-        """Return whether ``listed``, an item of a shutdown, means this connection.
+    def matches_listed(self, listed: object) -> bool:
+        """Return whether a shutdown that lists ``listed`` means this connection.
 
         An empty source, target or type in ``listed`` matches any value.
         """
@@ -89,7 +89,7 @@ class Connection:
             and listed.type in (None, self.type)
         )
 
-    def told_apart_by(self) -> tuple[str, ...]:
+    def distinguishing_values(self) -> tuple[str, ...]:
         """Return the values by which a shutdown distinguishes connections with the same id."""
         return (self.source, self.target, self.known_type.word)
 
@@ -99,11 +99,12 @@ class Connection:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each topic of ``listed`` as text, with a list of its keys in this connection.
+        """Yield (text, keys) for each topic that a shutdown lists in ``listed``.
 
-        The list has one key, or none if this connection does not carry the topic.
+        The keys are those of the topic in this connection: one, or none if the connection does not
+        carry the topic.
         """
-        assert isinstance(listed, Connection)  # noqa: S101 - see is_meant_by
+        assert isinstance(listed, Connection)  # noqa: S101 - see matches_listed
         known = {*self.topic_keys()}
         for key in listed.topic_keys():
             yield f"topic {key[0]}", [key] if key in known else []
@@ -114,9 +115,9 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what remains of the connection without ``node``, its broker or one of its ends.
+        """Return the connection without the node, which is its broker or one of its ends.
 
-        Without an end, nothing remains: the result is ``None``. Otherwise the result has no broker.
+        Without its broker, the connection names no broker. Without an end, the result is ``None``.
         """
         return None if node in self.nodes else replace(self, broker="")
 

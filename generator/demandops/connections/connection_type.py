@@ -171,7 +171,7 @@ class ConnectionType(ABC):
     options: ClassVar[frozenset[str]]
     """The options of a route that the type supports, apart from message type and direction."""
     renames: ClassVar[bool] = False
-    """Whether a topic may have another name at the target."""
+    """Whether a topic may have another name at the target than at the source."""
     takes_broker: ClassVar[bool] = False
     """Whether a demand may name a broker."""
     speaks_dds: ClassVar[bool] = True
@@ -219,13 +219,13 @@ class ConnectionType(ABC):
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         """Return the connection as clients will carry it, and a note.
 
-        The note is how the connection differs from the demanded one; empty if it does not differ.
-        The caller must have checked that the inventory can fulfill the demand.
+        The note says how the connection differs from the demanded one. It is empty if it does not
+        differ. The caller must have checked that the inventory can fulfill the demand.
         """
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return what a demand of the connection must be allowed to use besides the nodes.
+        """Return the access that a demand of the connection needs, besides the access to its nodes.
 
         Each item is a field of an access rule, and the value that this field must allow.
         """
@@ -237,7 +237,7 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
-        """Return the client with a key, or ``None`` if the client carries no topic.
+        """Return the client that ``key`` identifies, or ``None`` if the client carries no topic.
 
         Raises:
             Refused: if connections contradict each other, or the configuration no longer has what
@@ -252,7 +252,7 @@ def make_end(
     config: Config,
     **more: Any,  # noqa: ANN401 - any field
 ) -> AnyEnd:
-    """Return one end of a connection; ``more`` has the fields that only this kind of end has.
+    """Return one end of a connection; ``more`` has the fields that only the class ``end`` has.
 
     Raises:
         Refused: if the end's node is no longer in the inventory or in an access domain.

@@ -33,7 +33,7 @@ def type_named(word: str) -> ConnectionType:
 
 
 def listed(types: Iterable[ConnectionType]) -> str:
-    """Return types as a message lists them: ``MQTT or ROS``."""
+    """Return the names of types as text for a message: ``MQTT or ROS``."""
     return " or ".join(known.name for known in types)
 
 

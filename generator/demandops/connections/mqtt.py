@@ -105,7 +105,7 @@ class Mqtt(ConnectionType):
         return [("brokers", broker.node)] if broker else []
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
-        """Return the end with a key, or ``None`` if its connection carries no topic."""
+        """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -209,7 +209,7 @@ def _broker(broker: Broker) -> dict[str, Any]:
 
 
 def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
-    """Return a topic's further parameters, without those that have the client's default."""
+    """Return the parameters of a topic that differ from the client's defaults."""
     options: dict[str, Any] = {}
     if route.primitive:
         options["primitive"] = True

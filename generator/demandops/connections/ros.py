@@ -74,7 +74,7 @@ class Ros(ConnectionType):
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
-        """Return the end with a key, or ``None`` if its connection carries no topic."""
+        """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -127,7 +127,7 @@ def _port(connection: str, wan: Wan) -> int:
 
 @lru_cache(maxsize=65_536)
 def _number(connection: str) -> int:
-    """Return a number for a connection id; it is cached, because ports are compared often."""
+    """Return a number that depends on the connection id only; it is cached for fast comparisons."""
     return int(naming.digest("port", connection), 16)
 
 

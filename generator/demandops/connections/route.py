@@ -43,7 +43,7 @@ class Route:
     rate: float = 0.0
 
     def options(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults."""
+        """Return option → value for each option that differs from its default."""
         return {
             name: value for name, default in _DEFAULTS if (value := getattr(self, name)) != default
         }

@@ -142,7 +142,7 @@ def leaves_nodes_open(state: State, goal: object) -> bool:
         request: DemandRequest | None = demand_goal.parse(goal)[0]
     else:
         request = deployment_request_goal.parse(goal, state.config.appdef_by_wire_type)[0]
-    return request is not None and request.adds_claims and placement.is_placed(request, state)
+    return request is not None and request.adds_claims and placement.needs_placement(request, state)
 
 
 def _refuse_large(request: DemandRequest, config: Config) -> None:

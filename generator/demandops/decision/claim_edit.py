@@ -29,7 +29,7 @@ from demandops.subject import Subject
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes to rendered files after a person changed claims."""
+    """Return the changes to rendered files after a person edited the claims on ``subjects``."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
     return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)

@@ -86,11 +86,11 @@ class Decision:
     overrides: tuple[str, ...] = ()
     """The files of the overrides that shaped the rendered files."""
     frees: bool = False
-    """Whether services request less of a node than before."""
+    """Whether room becomes free on a node, because services request less there than before."""
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """Where the generator placed applications whose node the demand does not name, and why."""
+        """For each placed application or service: the chosen node, and why, in words."""
         if isinstance(self.request, Drain):
             return self.request.moved
         return tuple(text for one in self.request.demanded for text in one.placed)
@@ -287,7 +287,10 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return (node, resource) → how much more services request; empty without capacities."""
+    """Return (node, resource) → by how much the requests of services grow.
+
+    The result is empty if no node has a capacity.
+    """
     return (
         capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
     )

@@ -68,7 +68,7 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
 
 
 def _repeat(changes: Changes) -> Iterator[str]:
-    """Yield a warning if the same shutdown was carried out before."""
+    """Yield a warning if the request repeats a shutdown that was carried out before."""
     if changes.repeats is not None:
         at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
         yield f"the same shutdown was carried out at {at}; this one releases nothing more"

@@ -1,4 +1,4 @@
-"""The world at one commit, with what earlier decisions planned and rendered."""
+"""The state that a demand is decided on: the world at one commit, with its template engine."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ class State(World):
         return cls(config, ledger, Engine(config.files))
 
     def usage(self) -> Usage:
-        """Return what services request of each node; only the first call counts all services."""
+        """Return how much of each resource services request on each node.
+
+        Only the first call counts all services.
+        """
         if self._usage is None:
             object.__setattr__(self, "_usage", capacity.whole_usage(self))
         assert self._usage is not None  # noqa: S101 - set above
@@ -52,7 +55,7 @@ class State(World):
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
         """Return the state after a decision, with the releases that the decision planned.
 
-        ``usage`` is what services request of each node after the decision.
+        ``usage`` is how much services request on each node after the decision.
         """
         known = self.plans
         for key, release in rendered.plans.items():

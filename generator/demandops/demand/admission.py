@@ -86,7 +86,7 @@ def _too_large(size: str, limit: str, most: int) -> str:
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of the fields that only a Demand has, not a DeploymentRequest."""
+    """Yield the faults of fields that a Demand has, but a DeploymentRequest has not."""
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         message = (

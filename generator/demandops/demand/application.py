@@ -28,20 +28,23 @@ class InputTopic(NamedTuple):
 
     @property
     def part(self) -> str:
-        """The part of topic names for this input: the source, and a further topic's own name."""
+        """The text that stands for this input in topic names.
+
+        It is made from the source. For a further topic, it contains the topic too.
+        """
         return self.part_in("")
 
     def part_in(self, version: str) -> str:
-        """Return :attr:`part` for the separate instance of a version; it has the version too.
+        """Return the text that stands for this input in topic names of a separate instance.
 
-        An empty ``version`` stands for the shared instance.
+        The text contains the ``version`` of the instance. An empty ``version`` gives :attr:`part`.
         """
-        return naming.topic_part(self.source, self.told_apart_by(self.further, version))
+        return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
-    def told_apart_by(self, further: bool, version: str) -> str:
-        """Return the text that distinguishes names with the same source.
+    def distinguishing_text(self, further: bool, version: str) -> str:
+        """Return the text that distinguishes topic names that are made from the same source.
 
-        The text is the topic if it is ``further``, and the version if it is not empty.
+        The text contains the topic if ``further`` is set, and the version if it is not empty.
         """
         if not further:
             return version
@@ -61,7 +64,7 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """What the node of an application must have: its type, labels as pairs, capabilities.
+    """Requirements on a node: its type, labels as pairs, capabilities and properties.
 
     ``properties`` are texts like ``memoryGiB>=8`` (:mod:`demandops.config.node_property`).
     """
@@ -91,8 +94,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: an appdef at a node with inputs by role.
 
     ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
-    are sorted by topic (:meth:`booked`). ``place`` is what the node must have; it is ``None`` if
-    the demand names the node. ``separate`` says that this version runs at the same time as other
+    are sorted by topic (:meth:`booked`). ``place`` has the requirements on the node; it is ``None``
+    if the demand names the node. ``separate`` says that this version runs at the same time as other
     versions, and that the id ends in the version (:mod:`demandops.demand.separate_instance`).
     ``services`` maps each service that has a node of its own to this node. ``named`` lists the
     services whose node the demand names; the generator chose the nodes of the other services.
@@ -157,10 +160,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further inputs of a role whose :attr:`part` is ``part``.
+        """Return the further inputs of a role that have the text ``part`` in topic names.
 
-        For a separate instance, return the usual inputs with this part too. The parts of all inputs
-        are computed only once, because the plan of each service for a further topic needs them.
+        For a separate instance, the usual inputs of the role count too. The parts of all inputs are
+        computed only once, because the plan of each service for a further topic needs them.
         """
         if not self._further:
             for known, topic in self.all_inputs():
@@ -191,13 +194,13 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         """The application's node, and the nodes of the services that have a node of their own."""
         return {self.node, *self.services.values()}
 
-    def decided_like(self, other: Application) -> bool:
+    def has_same_definition_and_nodes(self, other: Application) -> bool:
         """Return whether both applications have the same appdef and run on the same nodes."""
         one, two = ((app.appdef, app.node, app.services, app.moved) for app in (self, other))
         return one == two
 
-    def placed_as(self, first: Application) -> Application:
-        """Return the application moved to the nodes of ``first``.
+    def moved_to_nodes_of(self, first: Application) -> Application:
+        """Return the application with its services on the nodes of ``first``.
 
         ``first`` is the application in the first claim on the same subject.
         """
@@ -213,7 +216,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, deliver=deliver, place=place).with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
-        """Return the application with its inputs replaced; leave out roles without topics."""
+        """Return the application with other inputs; roles without topics are left out."""
         kept = {role: topics for role, topics in inputs.items() if topics}
         return replace(self, inputs=MappingProxyType(kept))
 
@@ -230,7 +233,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             more, inputs=MappingProxyType(inputs), parameters=parameters, deliver=deliver
         )
 
-    def is_meant_by(self, listed: object) -> bool:
+    def matches_listed(self, listed: object) -> bool:
         """Return whether a shutdown that lists ``listed`` means this application.
 
         A listed application without a node means an application on any node.
@@ -241,20 +244,26 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             and listed.appdef == self.appdef
         )
 
-    def told_apart_by(self) -> tuple[str, ...]:
+    def distinguishing_values(self) -> tuple[str, ...]:
         """Return the values by which a shutdown distinguishes applications with the same id."""
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
-        """Yield the key of each input, (role, topic, source), or one empty key without inputs."""
+        """Yield the key of each input: (role, topic, source).
+
+        If there are no inputs, yield one empty key.
+        """
         for role, topic in self.all_inputs():
             yield role, topic.topic, topic.source
         if not any(self.inputs.values()):
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield each input of ``listed`` as text, with the keys of the matching inputs here."""
-        assert isinstance(listed, Application)  # noqa: S101 - see is_meant_by
+        """Yield (text, keys) for each input that a shutdown lists in ``listed``.
+
+        The keys are those of the matching inputs of this application.
+        """
+        assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():
             by_name.setdefault(key[:2], []).append(key)

@@ -58,7 +58,7 @@ def _with_ends(held: Held, ends: Mapping[str, str]) -> Held:
 
 
 def _with_first_names(held: Held, config: Config) -> Held:
-    """Return an application or connection with each ``<node>@<first domain>`` as ``<node>``."""
+    """Return ``held`` with the name ``<node>`` in place of each ``<node>@<first domain>``."""
 
     def first(name: str) -> str:
         node, _, domain = name.rpartition("@")

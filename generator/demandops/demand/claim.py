@@ -67,7 +67,7 @@ class Claim:
 
     @property
     def key(self) -> ClaimKey:
-        """The key of the claim in the ledger."""
+        """The identity of the claim, by which the ledger finds it."""
         return ClaimKey(self.subject, self.demand)
 
     @property
@@ -105,7 +105,10 @@ class Claim:
         return replace(self, held=held, requesters=requesters, partial=partial)
 
     def extending(self, current: Claim) -> Claim:
-        """Return the claim extended by the ``current`` claim of the same demand."""
+        """Return the claim with everything added that ``current`` holds.
+
+        ``current`` is the earlier claim of the same demand on the same subject.
+        """
         held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
         holders = dict.fromkeys(held.topic_keys(), self.requesters)
         listed = {*self.held.topic_keys()}
@@ -140,7 +143,11 @@ class Claim:
         return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
-        """Return the claim; if ``current`` differs only in the lease, keep its booking time."""
+        """Return the claim as a booking writes it to the ledger.
+
+        If the demand's earlier claim, ``current``, differs only in the lease, the time of booking
+        stays.
+        """
         if current is None:
             return self
         kept = replace(self, booked=current.booked)

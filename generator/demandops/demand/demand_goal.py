@@ -19,7 +19,7 @@ from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel
 from demandops.config.durations import seconds_of
 from demandops.config.inventory import Coordinate, Position
-from demandops.config.node_property import asked_in
+from demandops.config.node_property import read_condition
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
 from demandops.connections.route import RouteOptions
@@ -47,7 +47,7 @@ class GoalTopic(FrozenModel):
 
 
 class GoalPlace(FrozenModel):
-    """What the node of an application must have; ``labels`` are ``key=value``.
+    """Requirements on the node of an application; ``labels`` are ``key=value``.
 
     ``properties`` are ``name=value``, ``name>=number`` or ``name<=number``.
     """
@@ -194,9 +194,9 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the field of the goal that has the field ``path`` of an item.
+    """Return the path in the goal of a field of an item, for messages about this field.
 
-    An item has the requesters of the goal, so their fields are not inside of the item.
+    The requesters are a field of the goal, not of the item.
     """
     if path.startswith("requesters"):
         return path
@@ -216,11 +216,11 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
     if goal.priority:
         yield fault("priority", f"a {goal.operation} does not wait; leave it out")
     if goal.positions:
-        yield fault("positions", f"a {goal.operation} places nothing; leave them out")
+        yield fault("positions", f"a {goal.operation} chooses no node; leave the positions out")
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return what a place requires, and add its faults; ``None`` if the place is empty."""
+    """Return the requirement in ``place``, or ``None`` if it is empty; append its faults."""
     if place == GoalPlace():
         return None
     told = {found.field for found in faults}
@@ -236,7 +236,7 @@ def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requireme
             faults.append(fault(field, "is empty; name a capability, or leave it out"))
     for index, text in enumerate(place.properties):
         field = f"{where}.properties[{index}]"
-        if asked_in(text) is None and field not in told:
+        if read_condition(text) is None and field not in told:
             message = f"{quoted(text)} is not a property; write name=value, name>=8 or name<=8"
             faults.append(fault(field, message))
     pairs = tuple((label[0], label[1]) for label in labels if len(label) > 1)
@@ -254,7 +254,7 @@ def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Pos
 
 
 def form_faults(data: dict[str, Any]) -> list[Fault]:
-    """Return the faults of the form of ``data``."""
+    """Return the faults in the form of a goal, such as unknown fields and wrong types."""
     return parse(data)[1]
 
 

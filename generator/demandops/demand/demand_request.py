@@ -19,7 +19,10 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""Maps a field of an item (``inputs.ego_data[2].source``) to the field of the goal that has it."""
+"""A function from the path of a field in an item to its path in the goal, for messages.
+
+An example of the first path is ``inputs.ego_data[2].source``.
+"""
 
 
 def place_in(field: str) -> Place:
@@ -40,10 +43,10 @@ class Demanded:
     note: str = ""
     """How a connection differs from the requested one; the receipt has this text as a warning."""
     placed: tuple[str, ...] = ()
-    """Where the generator placed the application and its services, and why."""
+    """For each placed application or service: the chosen node, and why, in words."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
-        """Return a fault of a field of this item."""
+        """Return a fault in the field ``path`` of this item; it names the field of the goal."""
         return fault(self.place(path), message, code=code)
 
 
@@ -53,8 +56,7 @@ class DemandRequest:
 
     ``demand`` is the demand's id. The reference's requests have no demand id; for each subject of
     such a request, :func:`demandops.demand.claim.demand_id` makes an id. ``own_requesters`` are the
-    requesters that the request names as a whole; for example, a release lists no item, but has
-    requesters.
+    requesters of the request itself: a release, for example, lists no item, but has requesters.
     """
 
     id: str

@@ -88,9 +88,10 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the field of the message that has the field ``path`` of an application.
+    """Return the path in the message of a field of an application, for messages about this field.
 
-    ``item`` is the application's field (``apps[0]``). ``lists`` maps roles to the message's lists.
+    ``item`` is the application's path (``apps[0]``), and ``path`` is the field's path in
+    :class:`Application`. ``lists`` maps roles to the message's lists.
     """
     name, _, rest = path.partition(".")
     if name in ("id", "node"):
@@ -108,10 +109,11 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the field of the message that has the field ``path`` of a connection.
+    """Return the path in the message of a field of a connection, for messages about this field.
 
-    ``item`` is the connection's field (``connections[0]``). The message has two lists of topics:
-    the names at the source, and the names at the target.
+    ``item`` is the connection's path (``connections[0]``), and ``path`` is the field's path in
+    :class:`Connection`. The message has two lists of topics: the names at the source, and the names
+    at the target.
     """
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"
@@ -165,7 +167,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
 
 def form_faults(data: object) -> list[Fault]:
-    """Return the faults of the form of ``data``: unknown fields, wrong types."""
+    """Return the faults in the form of a goal: unknown fields, wrong types."""
     if not isinstance(data, dict):
         return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]

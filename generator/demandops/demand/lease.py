@@ -52,7 +52,7 @@ class Lease:
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
         """Return the lease with its full term from ``now``.
 
-        If ``before`` is given, the result ends no earlier than this lease.
+        The result ends no earlier than ``before``, if that is given.
         """
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)
@@ -63,7 +63,7 @@ class Lease:
         return self.until + timedelta(seconds=self.slack)
 
     def has_ended(self, now: datetime) -> bool:
-        """Return whether the claim may be released according to the recorded end."""
+        """Return whether the claim may be released: the recorded end and the slack have passed."""
         return self.expires_at < now
 
     def renewed(self, term: Term, now: datetime) -> Lease:

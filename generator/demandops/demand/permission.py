@@ -26,7 +26,7 @@ Access = list[tuple[str, str]]
 PEERS = "peers"
 """The field of a rule with the access domains at the other ends of connections."""
 _NO_RULES = (Rule(name="everything"),)
-"""The rules of a domain without rules: everybody may demand everything inside of the domain."""
+"""The rules of a domain that has none: everybody may demand everything inside of the domain."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -225,7 +225,7 @@ def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Ite
 
 
 def with_leases_from_approval(request: AnyRequest) -> AnyRequest:
-    """Return the request with leases that start at its approval."""
+    """Return the request with leases that start when a person approves the request."""
 
     def from_approval(one: Demanded) -> Demanded:
         return replace(one, term=replace(one.term, on_approval=True)) if one.term else one

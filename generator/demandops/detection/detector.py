@@ -19,7 +19,7 @@ from demandops.detection.rules.rule_template import Values
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """What an event wants from now on: a goal, or ``None`` to end the event's demand."""
+    """The goal that an event wants from now on; ``None`` ends the event's demand."""
 
     key: Key
     goal: Goal | None

@@ -39,10 +39,10 @@ class ClaimChange:
 class Changes:
     """The claims that a request changed.
 
-    ``not_held``: what a shutdown lists, but its requesters do not hold. ``shutdowns``: the digests
-    of shutdowns that the ledger now records or forgets. ``repeats``: the earlier shutdown that the
-    request repeats, or ``None``. ``kept``: the service instances whose kept replicas changed.
-    ``waiting``: the ids of the demands that begin or cease to wait.
+    ``not_held``: the items that a shutdown lists, but that its requesters do not hold.
+    ``shutdowns``: the digests of shutdowns that the ledger now records or forgets. ``repeats``: the
+    earlier shutdown that the request repeats, or ``None``. ``kept``: the service instances whose
+    kept replicas changed. ``waiting``: the ids of the demands that begin or cease to wait.
     """
 
     claims: tuple[ClaimChange, ...] = ()

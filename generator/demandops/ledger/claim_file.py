@@ -33,7 +33,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only newer versions of the generator write, with the nodes of services."""
+"""Folders for the nodes of services, which only newer versions of the generator write."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")

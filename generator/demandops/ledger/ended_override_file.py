@@ -33,7 +33,7 @@ def path_of(name: str) -> str:
 
 
 def text_of(override: Override) -> str:
-    """Return the text of the marker of an override that reached its end."""
+    """Return the text of the marker that records the end of an override."""
     assert override.end is not None  # noqa: S101 - only an override with an end ends
     return strict_yaml.dump(
         {

@@ -36,28 +36,32 @@ from demandops.settings import LEDGER_API_VERSION
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
 Instance: TypeAlias = "tuple[str, ...]"
-"""The identity of a service instance: ``replicas``, then a value for each of ``_FIELDS``."""
+"""The identity of a service instance: the word ``replicas``, then the values of ``_FIELDS``."""
 
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
 
 
 class Kept(NamedTuple):
-    """The least number of replicas that a service has until the time ``until``."""
+    """A step: the service has at least ``replicas`` replicas until the time ``until``."""
 
     replicas: int
     until: datetime
 
 
 Steps: TypeAlias = "tuple[Kept, ...]"
-"""What one service keeps: each step has fewer replicas and a later end than the previous one."""
+"""The replicas that one service keeps.
+
+Each step has fewer replicas and a later end than the previous step.
+"""
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    """Return the steps of a service after the need of its demands changed.
+    """Return the steps of a service after its demands need another number of replicas.
 
     Args:
-        steps: what the service kept before.
-        needed, was_needed: the replicas that its demands need now and needed before.
+        steps: the steps before.
+        needed, was_needed: the replicas that the demands need now, and those that they needed
+            before.
         now: the time.
         until: when the service stops keeping the replicas that were needed before.
     """
@@ -77,7 +81,7 @@ def _minute(moment: datetime) -> str:
 
 @dataclass(frozen=True, slots=True)
 class KeptReplicas:
-    """What all services keep.
+    """The replicas that all services keep.
 
     ``steps`` maps each service instance to its steps. ``by_minute`` maps a minute to the instances
     whose first step ends in it.

@@ -94,7 +94,7 @@ class Ledger:
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions that claims on an application ask for.
 
-        An empty text means that a claim asks for no version, or for an unknown one.
+        The result has an empty text if a claim asks for no version, or for an unknown one.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         found = {word: len(keys) for word, keys in by_version.items() if keys}
@@ -105,11 +105,11 @@ class Ledger:
         """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
-    def claims_taking(self, source: str, topic: str) -> tuple[Claim, ...]:
+    def claims_reading(self, source: str, topic: str) -> tuple[Claim, ...]:
         """Return the claims with ``topic`` of ``source`` as an input, sorted by application."""
         return self._claims("takes", source, topic)
 
-    def each_taking(self, source: str, topic: str) -> Iterator[Claim]:
+    def each_reading(self, source: str, topic: str) -> Iterator[Claim]:
         """Yield the claims with ``topic`` of ``source`` as an input, in no order."""
         for key in self.index.get(("takes", source, topic)) or ():
             claim = self.get(key)
@@ -118,7 +118,7 @@ class Ledger:
 
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
         """Return the input ``topic`` of ``source`` in ``role`` as a claim has it, or ``None``."""
-        for claim in self.each_taking(source, topic):
+        for claim in self.each_reading(source, topic):
             if found := claim.application.inputs_from(role, source, topic):
                 return found[0]
         return None
@@ -135,17 +135,17 @@ class Ledger:
         """Yield the usual topics of ``source`` in ``role`` that claims have, except ``but``."""
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("takes", source, but)) or ()):
-            return  # all these claims take ``but``
+            return  # all these claims have the topic ``but``
         found = (claim for key in keys if (claim := self.get(key)))
         topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
         usual = {one.topic for one in topics if one.source == source and not one.further}
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for the inputs in ``role`` for which ``part`` names an instance.
+        """Yield (input, version) for the inputs in ``role`` that have ``part`` in topic names.
 
-        ``part`` is the text that replaces ``{instance}`` in names of topics. Only further inputs
-        and the inputs of separate instances are yielded. The version is that of the separate
+        ``part`` replaces ``{instance}`` in the patterns of topics. Only further inputs and the
+        inputs of separate instances are yielded. ``version`` is the version of the separate
         instance, else empty.
         """
         for claim in self._claims("further", part):
@@ -173,7 +173,7 @@ class Ledger:
         return self._ids("moved")
 
     def is_only_kept(self, subject: Subject) -> bool:
-        """Return whether no demand holds ``subject``: at most overrides keep it."""
+        """Return whether no demand holds ``subject``, so that only overrides may keep it."""
         return len(self.claims.get(subject) or ()) == len(self.kept_claims(subject))
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
@@ -201,7 +201,7 @@ class Ledger:
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the ids of the applications that become ``part`` in names of topics, sorted."""
+        """Return the ids of the applications that have the text ``part`` in topic names, sorted."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
@@ -210,7 +210,7 @@ class Ledger:
         return min((claim.lease.expires_at for claim in found if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
-        """Return the keys of the claims whose leases end in the first minute with any lease end.
+        """Return the keys of the claims whose leases end first: those that end in the same minute.
 
         Return ``None`` if there is no lease. As long as no claim enters the set, leaves it or gets
         another end, each call returns the same object.
@@ -256,7 +256,7 @@ class Ledger:
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return all names in one kind of index entry, such as ``requester``.
+        """Return all names that the index has in one kind of entry, such as ``requester``.
 
         This scans the whole index.
         """
@@ -332,7 +332,10 @@ class Ledger:
 def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
-    """Return ``applications_on`` after the first claim on an application changed."""
+    """Return ``counts`` after the first claim on an application changed.
+
+    ``counts`` is :attr:`Ledger.applications_on`. The claim was ``before`` and is ``after`` now.
+    """
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):
         for node in nodes:

@@ -39,7 +39,7 @@ This is longer than :data:`REMEMBERED`, because a repeat may have waited in a jo
 """
 
 _FORGOTTEN = 10
-"""How many old records of shutdowns one booking removes at most."""
+"""The highest number of old records of shutdowns that one booking removes."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
@@ -59,13 +59,13 @@ class RecentShutdown:
 
     @classmethod
     def of(cls, request: Shutdown, at: datetime) -> RecentShutdown:
-        """Return the record of a shutdown that was received at a time."""
+        """Return the record of a shutdown that was received at the time ``at``."""
         listed = {
             (
                 one.held.subject.kind.value,
                 one.held.subject.id,
                 tuple(sorted(set(one.requesters))),
-                one.held.told_apart_by(),
+                one.held.distinguishing_values(),
                 tuple(sorted({words for words, _ in one.held.listed_topics(one.held)})),
             )
             for one in request.demanded
@@ -89,7 +89,7 @@ class RecentShutdowns:
         return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        """Return the shutdowns with ``shutdown`` at ``digest``; ``None`` removes the one there."""
+        """Return the shutdowns with ``shutdown`` as the one at ``digest``, or with none there."""
         known = self.by_digest.get(digest)
         if known == shutdown:
             return self

@@ -14,16 +14,16 @@ from demandops import naming
 from demandops.config.appdef import Service
 from demandops.config.config import Config
 from demandops.demand.application import Application, InputTopic
-from demandops.plan.output_topics import named, published, told_apart_by
+from demandops.plan.output_topics import distinguishing_text, published_topic, topic_name
 from demandops.plan.release import ServiceKey
 from demandops.subject import TopicKey
 
 
-class Made(NamedTuple):
+class PublishedTopic(NamedTuple):
     """A topic that a service reads, and the node that publishes the topic.
 
-    ``root`` is the key of the demanded topic: of ``topic`` itself, or of the one that ``topic`` is
-    made from. It is empty if ``topic`` is not made from one particular demanded topic.
+    ``root`` is the key of the demanded topic: the key of ``topic`` itself, or of the topic that
+    ``topic`` is made from. It is empty if ``topic`` is not made from one particular demanded topic.
     """
 
     topic: InputTopic
@@ -70,7 +70,7 @@ def node_of(app: Application, service: Service, source: str) -> str:
 
 
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
-    """Yield the key of each instance of a service that an application needs."""
+    """Yield the key of each instance that an application needs of a service."""
     if service.scope == "application":
         yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:
@@ -102,7 +102,7 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
     return [(role, one.topic, one.source) for role, one in topics if one.source == key.node]
 
 
-def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
+def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[PublishedTopic]:
     """Yield the topics of an application that ``origin`` names.
 
     ``origin`` is an input role of the application, or ``<service>.<output>``.
@@ -110,21 +110,23 @@ def made(config: Config, app: Application, origin: str) -> Iterator[Made]:
     name, _, output = origin.partition(".")
     if not output:
         for one in app.inputs.get(origin, ()):
-            yield Made(one, one.source, (origin, one.topic, one.source))
+            yield PublishedTopic(one, one.source, (origin, one.topic, one.source))
         return
     producer = config.services[app.appdef][name]
     pattern = producer.outputs[output]
     if not producer.roots:
         node = node_of(app, producer, "")
         instance = naming.topic_part(app.id if producer.scope == "application" else node)
-        yield Made(InputTopic(named(pattern, instance), node), node)
+        yield PublishedTopic(InputTopic(topic_name(pattern, instance), node), node)
         return
     version = version_of_instance(app, producer)
     for role in producer.roots:
         for one in app.inputs.get(role, ()):
-            told = told_apart_by(config, role, one, version) if producer.root else ""
+            told = distinguishing_text(config, role, one, version) if producer.root else ""
             node = one.source if producer.at_source else node_of(app, producer, one.source)
-            yield Made(published(pattern, one.source, told), node, (role, one.topic, one.source))
+            yield PublishedTopic(
+                published_topic(pattern, one.source, told), node, (role, one.topic, one.source)
+            )
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
@@ -133,7 +135,7 @@ def flows(config: Config, app: Application) -> list[Flow]:
     for service in config.services.get(app.appdef, {}).values():
         for node, part in _parts(app, service):
             for origin in service.inputs.values():
-                for one in made(config, part, origin):
+                for one in topics_of_origin(config, part, origin):
                     if one.node != node:
                         root = one.root or (next(part.topic_keys()) if service.roots else ())
                         name = one.topic.topic
@@ -151,7 +153,7 @@ def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
         service = config.services.get(app.appdef, {}).get(name)
         if service is None or output not in service.outputs:
             continue  # admission reports an unknown output
-        for one in made(config, app, delivery.output):
+        for one in topics_of_origin(config, app, delivery.output):
             topic = one.topic.topic
             target = delivery.topic or topic
             if (one.node, topic) != (delivery.node, target):

@@ -63,7 +63,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
         for flow in flows(config, app):
             if (flow.receiver, flow.target) in brought or not _is_valid(flow, config):
                 continue
-            needed = carrying(flow, one.connect, ledger)
+            needed = connection_for(flow, one.connect, ledger)
             field = places.get(flow.root, "node")
             if flow.delivery is not None:
                 field = f"deliver[{flow.delivery}]"
@@ -146,7 +146,7 @@ def _is_valid(flow: Flow, config: Config) -> bool:
     return known and not topic_problem(flow.topic) and not topic_problem(flow.target)
 
 
-def carrying(flow: Flow, type: str, ledger: Ledger) -> Connection:
+def connection_for(flow: Flow, type: str, ledger: Ledger) -> Connection:
     """Return the connection for a flow, with the flow's topic as its only topic.
 
     If a claimed connection already carries the flow, the result is this connection. Otherwise it is

@@ -35,39 +35,41 @@ def outputs(
     else:
         input = InputTopic(str(key.topic), str(key.source), further=further)
         instance = instance_of(config, service.root, input, key.version)
-    return {name: named(pattern, instance) for name, pattern in sorted(service.outputs.items())}
+    return {
+        name: topic_name(pattern, instance) for name, pattern in sorted(service.outputs.items())
+    }
 
 
 def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
-    """Return the text for ``{instance}`` of the service instance that runs for ``topic``.
+    """Return the text that replaces ``{instance}`` for the service instance that serves ``topic``.
 
     ``version`` is the version of a separate instance, else empty.
     """
-    return naming.topic_part(topic.source, told_apart_by(config, role, topic, version))
+    return naming.topic_part(topic.source, distinguishing_text(config, role, topic, version))
 
 
-def told_apart_by(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text that distinguishes the names of topics that are made for one source.
+def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
+    """Return the text that distinguishes topic names that are made from the same source.
 
     The text has the topic, if that is a further topic of its source, and the version of a separate
     instance. It is empty if neither applies.
     """
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
-    return topic.told_apart_by(further, version)
+    return topic.distinguishing_text(further, version)
 
 
 @lru_cache(maxsize=65_536)
-def published(pattern: str, source: str, told: str) -> InputTopic:
+def published_topic(pattern: str, source: str, told: str) -> InputTopic:
     """Return the topic that a service publishes for ``source``.
 
-    ``told`` is the result of :func:`told_apart_by`. A fusion reads hundreds of such topics, so the
-    results are cached.
+    ``told`` is the result of :func:`distinguishing_text`. A fusion reads hundreds of such topics,
+    so the results are cached.
     """
-    return InputTopic(named(pattern, naming.topic_part(source, told)), source)
+    return InputTopic(topic_name(pattern, naming.topic_part(source, told)), source)
 
 
-def named(pattern: str, instance: str) -> str:
+def topic_name(pattern: str, instance: str) -> str:
     """Return a topic name: the appdef's ``pattern`` with ``{instance}`` replaced."""
     return pattern.replace("{instance}", instance)
 

@@ -1,4 +1,4 @@
-"""The planner: :func:`plan` derives the release at a key from claims.
+"""The planner: :func:`plan` derives from claims the release that a key identifies.
 
 Keys come from :mod:`demandops.plan.release_keys`.
 """
@@ -23,7 +23,7 @@ from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, requesters_of
 from demandops.errors import Refused
 from demandops.ledger.world import World
-from demandops.plan.flows import made, roots_of
+from demandops.plan.flows import roots_of, topics_of_origin
 from demandops.plan.output_topics import outputs, usual_topic
 from demandops.plan.overrides import release_overrides
 from demandops.plan.overrides.claim_overrides import without_suspended
@@ -166,7 +166,7 @@ def _inputs(
     for part in parts:
         origin = _origin(config, key, role, part)
         if "." in origin:
-            found.update(one.topic for one in made(config, part, origin))
+            found.update(one.topic for one in topics_of_origin(config, part, origin))
         else:
             found.update(part.inputs.get(origin, ()))
     return tuple({one[:2]: one for one in sorted(found)}.values())
@@ -194,7 +194,7 @@ def demanded_inputs(
         }
         app = app.with_inputs(left)
     for role in service.inputs:
-        for one in made(world.config, app, _origin(world.config, key, role, app)):
+        for one in topics_of_origin(world.config, app, _origin(world.config, key, role, app)):
             yield role, one.topic.topic, one.root
 
 
@@ -245,8 +245,8 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         if len(numbers) != len(given):
             odd = next(value for value in given if value not in numbers)
             message = (
-                f"{odd!r} is not a number, but the application definition takes the "
-                f"{parameter.merge}; give a number"
+                f"{odd!r} is not a number, but the application definition merges the values "
+                f"by {parameter.merge}; give a number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)

@@ -61,7 +61,7 @@ def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceK
     app = claim.application
     first = world.ledger.application(app.id) or app
     known = strict or first.appdef in world.config.services
-    app = app.placed_as(first)
+    app = app.moved_to_nodes_of(first)
     for service in services_of(world.config, first.appdef).values() if known else ():
         yield from instances(app, service)
 
@@ -77,7 +77,9 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
         users = world.config.users_of(key.service)
         claims = tuple(one for name in users for one in ledger.claims_of_definition(name))
     else:
-        claims = ledger.claims_at(key.node) if key.scope == "node" else ledger.claims_taking(*topic)
+        claims = (
+            ledger.claims_at(key.node) if key.scope == "node" else ledger.claims_reading(*topic)
+        )
     services = {id: _service(world, id, key) for id in {one.subject.id for one in claims}}
     return tuple(
         one
@@ -94,7 +96,7 @@ def is_needed(world: World, key: ServiceKey) -> bool:
         return bool(claims_needing(world, key))
     return any(
         service is not None and takes(one.application, service, key)
-        for one in world.ledger.each_taking(str(key.source), str(key.topic))
+        for one in world.ledger.each_reading(str(key.source), str(key.topic))
         for service in (_service(world, one.subject.id, key),)
     )
 
@@ -136,7 +138,7 @@ def affected_keys(
         subject, claims = change.key.subject, _differing(change, after)
         for world, claim in zip((before, after), claims, strict=True):
             own = [claim] if claim and world.ledger.get(claim.key) else []
-            if not _decided_alike(before, after, subject):
+            if not _has_same_place_and_version(before, after, subject):
                 own += world.ledger.claims_on(subject)
             keys |= dict.fromkeys(keys_of_claims(world, own, strict=world is after))
     return tuple(keys)
@@ -181,7 +183,7 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
     return app.with_inputs(inputs)
 
 
-def _decided_alike(before: World, after: World, subject: Subject) -> bool:
+def _has_same_place_and_version(before: World, after: World, subject: Subject) -> bool:
     """Return whether an application has the same node, definition and version in both worlds.
 
     Return ``True`` for a connection, and for an application that only one world has.
@@ -192,7 +194,7 @@ def _decided_alike(before: World, after: World, subject: Subject) -> bool:
     if not one or not other:
         return True
     versions = (running_version(world, subject.id) for world in (before, after))
-    return one.decided_like(other) and same_version(*versions)
+    return one.has_same_definition_and_nodes(other) and same_version(*versions)
 
 
 def all_keys(world: World) -> tuple[ReleaseKey, ...]:

@@ -73,10 +73,11 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return the replicas of a service, and the step that keeps them.
+    """Return the replicas of a service that may keep some for a while (``scaling.downAfter``).
 
-    If the service still keeps more replicas than ``needed``, the result is the kept number and the
-    step that keeps it. Otherwise the result is ``needed`` and ``None``.
+    ``steps`` are the kept replicas (:mod:`demandops.ledger.kept_replicas`). If the first step has
+    more replicas than the demands need, return its number and the step. Otherwise return ``needed``
+    and ``None``.
     """
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None

@@ -64,7 +64,7 @@ def check_configuration(kind: str, configuration: dict[str, Any], client: str) -
     """Check the configuration of a client against the schema of its connection type.
 
     Raises:
-        InvalidInput: if fields do not match; it names each of them. The cause is a fault of
+        InvalidInput: if fields do not match; the error names each of them. The cause is a fault of
             DemandOps, not of a demand.
     """
     schema = data_folder("templates") / "connections" / kind / "schema.json"

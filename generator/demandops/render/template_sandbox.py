@@ -186,7 +186,7 @@ def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
 
 
 def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a filter that takes steps too, and raises SecurityError for too large a result."""
+    """Return ``function`` as a filter that takes steps and refuses to make too large a result."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -206,7 +206,7 @@ def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _test(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a test that also takes steps for the size of its arguments."""
+    """Return ``function`` as a test that takes steps for the size of its arguments."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)

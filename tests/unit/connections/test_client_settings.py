@@ -124,8 +124,8 @@ def test_settings_and_patches_that_are_not_valid_are_named() -> None:
     ]
     both = [{"connections": ["*"]}, {"nodes": ["edge"]}]
     assert refusals({PATCH: override(*both, values={"env": {}})}) == [
-        "overrides/tested.yaml: select: values are settings of clients if connections "
-        "are selected, otherwise Helm values; write two overrides"
+        "overrides/tested.yaml: select: selects connections and services, but values are "
+        "either settings of clients or Helm values; write two overrides"
     ]
     patch = override({"connections": ["*"]}, values={"resources": {"limits": {"memory": 1}}})
     assert refusals({PATCH: patch}) == [

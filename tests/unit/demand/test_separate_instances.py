@@ -165,7 +165,7 @@ def test_what_several_definitions_share_runs_once_so_another_version_of_it_is_re
     repo.send(record("a", ""))
     assert repo.faults(record("b", "1.1.0")) == [
         "applications[0].version: driver for /points of 'vehicle00' would run in version 1.1.0, "
-        "but in 1.0.0 for 'edge/record', which share it; request the same version"
+        "but is shared with 'edge/record' in version 1.0.0; request the same version"
     ]
     assert repo.send(record("b", "1.0.1")).outcome == "booked"
     services = repo.books()["services"]
@@ -228,6 +228,6 @@ values: values/follower.yaml.j2
     assert [str(fault) for fault in raised.value.faults] == [
         "appdefs/object-detection-fusion/appdef.yaml: uses.follower.lists: is "
         "'object-detection.object_list', which each version makes on its own (versions: separate), "
-        "but 'follower' runs once for all; make it a service of this definition, or share "
+        "but 'follower' runs once for all; make 'follower' a service of this definition, or share "
         "'object-detection' too"
     ]

@@ -159,11 +159,11 @@ def test_two_applications_of_one_demand_must_agree_where_versions_are_refused() 
     repo = MemoryRepo(config("refuse"))
     goal = put("a", "1.0.0")
     goal["applications"] += put("a", "1.1.0", id="edge/b")["applications"]
-    end = "which share it; request the same version"
-    what = "object-detection for /points of 'edge' would run in version"
+    end = "request the same version"
+    what = "version: object-detection for /points of 'edge' would run in version"
     assert repo.faults(goal) == [
-        f"applications[0].version: {what} 1.0.0, but in 1.1.0 for 'edge/b', {end}",
-        f"applications[1].version: {what} 1.1.0, but in 1.0.0 for 'edge/a', {end}",
+        f"applications[0].{what} 1.0.0, but is shared with 'edge/b' in version 1.1.0; {end}",
+        f"applications[1].{what} 1.1.0, but is shared with 'edge/a' in version 1.0.0; {end}",
     ]
 
 

@@ -24,7 +24,7 @@ def test_nearness_starts_and_stops_at_its_own_distance() -> None:
 def test_an_event_says_what_has_happened() -> None:
     run = Run(rule("near", near=NEAR))
     (event,) = run.step(1, at(1, "a", 30, 40))
-    assert event.why == "a is 50.0 m away"
+    assert event.why == "a is 50.0 m from the area"
     assert event.values == {"rule": "near", "entity": "a", "x": 30, "y": 40, "distance": 50}
     (event,) = run.step(9)
     assert (event.why, event.at) == ("a is silent for 3 s", 4)

@@ -184,5 +184,5 @@ def test_a_node_may_not_have_what_its_domain_forbids() -> None:
             for place in (1, 2, 3)
         ),
         f"{CLIENTS}: mqtt.hostNetwork: is true, and podSecurity of access domain 'fleet' is "
-        "baseline, which forbids it; leave it out, so that each client is like its node",
+        "baseline, which forbids it; leave it out, so that each client has the setting of its node",
     ]

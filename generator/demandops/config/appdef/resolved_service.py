@@ -1,4 +1,4 @@
-"""The services of an appdef, each with where its inputs come from."""
+"""The services of an appdef, each with the origins of its inputs."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from demandops.errors import suggestion
 
 
 class Service(Deployed):
-    """A service as the applications of one appdef have it.
+    """A service of one appdef, with the origins of its inputs.
 
     ``folder`` is the folder of its definition in ``appdefs/``. ``inputs`` maps each input to a role
     of the appdef or to ``<service>.<output>``. A service with ``each`` runs once for each topic of
-    the role ``root``. ``roots`` are the roles from which one instance of the service reads the
-    topics of a single source. If the service runs once for each cluster, ``runs_at`` maps the node
-    of an application to the node of the service.
+    the role ``root``. If an instance serves a single source, ``roots`` are the roles whose topics
+    of this source it reads, directly or through other services. If the service runs once for each
+    cluster, ``runs_at`` maps the node of an application to the node of the service.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Service(Deployed):
 
     @property
     def at_source(self) -> bool:
-        """Whether the service runs at the sources of its inputs."""
+        """Whether the service runs on the nodes that its inputs come from."""
         return self.placement == "source"
 
     @property
@@ -52,7 +52,7 @@ class Service(Deployed):
 
     @property
     def is_placeable(self) -> bool:
-        """Whether the service may get a node of its own.
+        """Whether a node may be chosen for the service alone, apart from its application.
 
         An instance of such a service serves applications of only one appdef, and the service does
         not run at its sources.
@@ -192,9 +192,9 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
             if others and root not in others:
                 yield (
                     _place(service, role),
-                    f"'{service.inputs[role]}' does not belong to one topic of '{root}', for each "
-                    "of which the service runs; read it in a service that runs once for the "
-                    "application or the node",
+                    f"the service runs once for each topic of '{root}', but "
+                    f"'{service.inputs[role]}' does not belong to one of them; read it in a "
+                    "service that runs once for the application or the node",
                 )
     elif service.at_source:
         roots = tuple(sorted({one for of in made_from.values() for one in of}))

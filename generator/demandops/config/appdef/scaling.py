@@ -1,4 +1,4 @@
-"""How many replicas a service has, and what decides this number."""
+"""The number of replicas of a service, and the fields of a definition that decide it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ Count = Annotated[int, Field(ge=0, le=1000)]
 """A number of replicas."""
 
 Percent = Annotated[int, Field(ge=1, le=1000)]
-"""A share of what a pod requests, in percent; a pod may use more than it requests."""
+"""A percentage of what a pod requests of a resource.
+
+It may be above 100, because a pod may use more than it requests.
+"""
 
 Measure = Literal["topics", "sources", "claims", "requesters"]
-"""What is counted to set the number of replicas: one replica serves a given number of these."""
+"""What is counted to get the number of replicas; each replica serves a fixed number of these."""
 
 Resource = Literal["cpu", "memory"]
-"""What an autoscaler measures."""
+"""The resource whose usage an autoscaler measures."""
 
 
 class Sizes(CamelModel):
-    """The replicas of each size; a parameter of the demands names the size."""
+    """The number of replicas for each size. A parameter of the demands names the size."""
 
     parameter: Word
     replicas: Annotated[dict[Word, Count], Field(min_length=1)]

@@ -11,7 +11,7 @@ from demandops import strict_yaml
 from demandops.config.appdef.scaling import Scaling
 from demandops.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 from demandops.config.inventory import LabelKey, LabelValue, NodeId, Resources
-from demandops.config.node_property import AskedValue, PropertyName
+from demandops.config.node_property import PropertyName, RequiredValue
 from demandops.errors import sentences, suggestion
 
 TopicPattern = Annotated[
@@ -27,7 +27,7 @@ Scope = Literal["application", "topic", "node", "cluster"]
 
 
 class Place(CamelModel):
-    """What the node of a service must have: type, labels of its selector, capabilities, properties.
+    """Requirements on a service's node: type, labels of its selector, capabilities, properties.
 
     ``properties`` maps the name of a property to the value that it must have, or to the bounds of
     its number: ``{min: 8}``.
@@ -36,7 +36,7 @@ class Place(CamelModel):
     role: Word | Literal[""] = ""
     labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
     capabilities: Items[Word] = ()
-    properties: dict[PropertyName, AskedValue] = Field(default_factory=dict)
+    properties: dict[PropertyName, RequiredValue] = Field(default_factory=dict)
 
 
 class Input(CamelModel):
@@ -57,10 +57,10 @@ class Parameter(CamelModel):
 class Deployed(CamelModel):
     """How a service runs: its releases' names, chart and values, and what it publishes.
 
-    If ``each`` names an input, the service runs once for every topic of this input. ``place`` is
-    what the node of the service must have, if the generator chooses a node for the service
-    (:mod:`demandops.plan.nodes.placement`). ``requests`` is what each replica needs of its node
-    (:mod:`demandops.plan.nodes.capacity`).
+    If ``each`` names an input, the service runs once for every topic of this input. ``place`` has
+    the requirements on the node, if the generator chooses a node for the service
+    (:mod:`demandops.plan.nodes.placement`). ``requests`` is how much of each resource a replica
+    requests of its node (:mod:`demandops.plan.nodes.capacity`).
     """
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
@@ -98,7 +98,7 @@ class OwnService(Deployed):
         if self.placement == "source" and not self.each:
             raise ValueError("placement 'source' needs 'each': an application has no single source")
         if self.placement == "source" and self.place:
-            raise ValueError("place and placement 'source' both say where it runs; keep one")
+            raise ValueError("place and placement 'source' both choose the node; keep one")
         return self
 
 
@@ -120,12 +120,12 @@ class ServiceDefinition(Deployed, FileModel):
         if bool(self.nodes) is not (self.scope == "cluster"):
             raise ValueError(
                 "scope 'cluster' needs 'nodes', the node of each cluster, and no other scope may "
-                "have it"
+                "have 'nodes'"
             )
         if self.placement == "source" and self.scope == "cluster":
             raise ValueError("scope 'cluster' runs at its nodes; leave out placement")
         if (self.each is None) is (self.scope == "topic"):
-            raise ValueError("scope 'topic' needs 'each', and no other scope may have it")
+            raise ValueError("scope 'topic' needs 'each', and no other scope may have 'each'")
         if self.each and self.each not in self.inputs:
             known = suggestion(self.each, self.inputs)
             raise ValueError(f"each: '{self.each}' is not an input{known}")
@@ -153,8 +153,8 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         return
     if parameter.merge in ("max", "min"):
         yield (
-            f"{place}: '{name}' has merge: {parameter.merge}, which is for numbers; with union, "
-            "the largest size counts"
+            f"{place}: '{name}' has merge: {parameter.merge}, which is for numbers; use union, "
+            "with which the largest size counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)

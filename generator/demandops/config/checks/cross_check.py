@@ -23,7 +23,7 @@ from demandops.config.config import (
     Config,
 )
 from demandops.config.config_reader import ConfigReader
-from demandops.config.node_property import asked_kind, kind_of
+from demandops.config.node_property import comparable_kind, kind_of
 from demandops.config.override import Override, patched_settings
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
@@ -109,7 +109,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
         if closed and config.clients.of(word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
-                "forbids it; leave it out, so that each client is like its node"
+                "forbids it; leave it out, so that each client has the setting of its node"
             )
             reader.add_fault(file, f"{word}.hostNetwork", message)
 
@@ -162,9 +162,11 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(file, f"{where}values", message)
         for word, value in (service.place.properties if service.place else {}).items():
             kind, first = config.property_kinds.get(word, (None, ""))
-            if kind and asked_kind(value) != kind:
+            if kind and comparable_kind(value) != kind:
                 registry = config.file_of(NODES_FILE, first)
-                message = f"asks for {asked_kind(value)}, but is {kind} at '{first}' in {registry}"
+                message = (
+                    f"asks for {comparable_kind(value)}, but is {kind} at '{first}' in {registry}"
+                )
                 message += f"; ask for {kind}"
                 reader.add_fault(file, f"{where}place.properties.{word}", message)
         if service.prefix in words:
@@ -222,7 +224,7 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                     f"appdefs/{appdef}/appdef.yaml",
                     f"uses.{name}.{service.each}",
                     f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; one service "
-                    "runs for both, so name them alike",
+                    "runs for both, so use one name in both",
                 )
 
 
@@ -266,7 +268,11 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault if the ``each`` of a shared service is an output that each version publishes."""
+    """Add a fault for each shared service whose ``each`` names an output of an unshared service.
+
+    With ``versions: separate``, each version has an unshared service of its own. The shared service
+    runs once for all versions.
+    """
     services = config.services.get(appdef, {})
     for name, service in services.items():
         origin = service.inputs[service.each] if service.shared and service.each else ""
@@ -276,13 +282,13 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
                 f"appdefs/{appdef}/appdef.yaml",
                 f"uses.{name}.{service.each}",
                 f"is '{origin}', which each version makes on its own (versions: separate), but "
-                f"'{name}' runs once for all; make it a service of this definition, or share "
+                f"'{name}' runs once for all; make '{name}' a service of this definition, or share "
                 f"'{producer.name}' too",
             )
 
 
 def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
-    """Return whether an appdef has no list of versions, not even an invalid one."""
+    """Return whether the versions file has no entry for an appdef, not even an invalid one."""
     return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
 
 

@@ -33,7 +33,7 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
         if one.priority != other.priority:
             continue
         contested = contested_effects(one, other)
-        if contested and can_meet(one.select, other.select, config):
+        if contested and may_select_same_release(one.select, other.select, config):
             reader.add_fault(
                 other.path,
                 "priority",
@@ -74,13 +74,15 @@ def patches_commute(one: object, other: object) -> bool:
     )  # unlike ==, it distinguishes 1 from True
 
 
-def can_meet(one: Iterable[Selector], other: Iterable[Selector], config: Config) -> bool:
+def may_select_same_release(
+    one: Iterable[Selector], other: Iterable[Selector], config: Config
+) -> bool:
     """Return whether one release, now or later, may match selectors of both overrides."""
     others = list(other)
-    return any(_meet(left, right, config) for left in one for right in others)
+    return any(_may_match_same_release(left, right, config) for left in one for right in others)
 
 
-def _meet(one: Selector, other: Selector, config: Config) -> bool:
+def _may_match_same_release(one: Selector, other: Selector, config: Config) -> bool:
     if (one.connections and _selects_services(other)) or (
         other.connections and _selects_services(one)
     ):
@@ -98,7 +100,7 @@ def _selects_services(selector: Selector) -> bool:
 
 
 def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
-    """Yield the fields for which every release that the selectors match has a single value."""
+    """Yield the fields in which both selectors must overlap to match the same release."""
     yield from ("services", "nodes")
     if not any(_shared(one, other, services) for services in config.services.values()):
         yield from ("applications", "appdefs")

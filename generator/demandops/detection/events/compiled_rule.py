@@ -109,10 +109,10 @@ class AreaRule(CompiledRule):
         """Return an entity's position and distance, or the number of entities."""
         named = self._named(subjects)
         if self.count is not None:
-            return Facts({**named, "count": count}, f"{count} are there")
+            return Facts({**named, "count": count}, f"{count} entities are in or near the area")
         x, y = seen[self.sources[0], subjects[0]].position or (0.0, 0.0)
         distance = self.area.distance(x, y)
-        text = f"{subjects[0]} is {distance:.1f} m away"
+        text = f"{subjects[0]} is {distance:.1f} m from the area"
         return Facts({**named, "x": x, "y": y, "distance": distance}, text)
 
 

@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 Key: TypeAlias = tuple[str, tuple[str, ...]]
-"""An event: its rule, and the entities that it is about."""
+"""The identity of an event: its rule, and the entities that it is about."""
 
 Who: TypeAlias = tuple[str, str]
-"""An entity: its source and its name."""
+"""The identity of an entity: its source and its name."""
 
 Cell: TypeAlias = tuple[str, str, int, int]
 """A square of the map, for a rule on pairs and one of its sources: rule, source, column and row."""

@@ -86,7 +86,7 @@ def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: A
 
 
 def _requesters_by_field(data: Any) -> Iterator[tuple[str, list[str]]]:  # noqa: ANN401
-    """Yield, for each item of a ``DeploymentRequest``, the field of its requesters, and these."""
+    """Yield (field, requesters) for each item of a ``DeploymentRequest``."""
     for index, app in enumerate(data.get("apps", ())):
         field = "object_detection_fusion_app"
         yield f"apps[{index}].{field}.requester_ids", app.get(field, {}).get("requester_ids", [])

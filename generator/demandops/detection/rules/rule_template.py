@@ -89,9 +89,9 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return the entities with which the template becomes ``text``, by their names in the template.
+    """Return the entities for which a template becomes ``text``: name in braces → entity.
 
-    The mapping is empty if no entities do that.
+    The mapping is empty if there are no such entities.
     """
     seen: set[str] = set()
     pattern, end = "", 0

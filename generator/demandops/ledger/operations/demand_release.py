@@ -1,4 +1,4 @@
-"""The release of a demand by its id."""
+"""A release gives up everything that a demand with an id holds."""
 
 from __future__ import annotations
 

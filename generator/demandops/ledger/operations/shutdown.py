@@ -64,7 +64,7 @@ def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: s
     own = demand_id(request.id, one.requesters)
     claims = ledger.claims_held_by(requester, one.held.subject)
     return sorted(
-        (claim for claim in claims if claim.joined and claim.held.is_meant_by(one.held)),
+        (claim for claim in claims if claim.joined and claim.held.matches_listed(one.held)),
         key=lambda c: (c.demand != own, c.request != request.id, c.booked, c.demand),
     )
 

@@ -173,8 +173,8 @@ def _publishers(
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the service instances on a node that publish ``topic``, except ``but``.
 
-    The output patterns of the appdefs give the instances that would publish the topic. Only those
-    that the ledger needs are yielded.
+    The output patterns of the appdefs tell which instances would publish the topic. Of these, only
+    instances that the ledger needs are yielded.
     """
     for services in world.config.services.values():
         for name, service in services.items():
@@ -195,10 +195,10 @@ def _publishers(
 def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys on a node for which a service's ``{instance}`` is replaced by ``instance``.
+    """Yield the keys of a service's instances on a node that have ``instance`` in topic names.
 
-    Some of these instances may not be needed. ``but`` is the instance whose clashes are looked for;
-    its own topic does not count as the usual topic of its source.
+    The ledger may not need all of them. ``but`` is the instance whose clashes are looked for; its
+    own topic does not count as the usual topic of its source.
     """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
@@ -220,7 +220,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys that instances of a service on a node have; some may not be needed."""
+    """Yield the keys of a service's instances on a node; the ledger may not need all of them."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)

@@ -41,8 +41,8 @@ With ``separate`` each version is an application of its own, so only shared serv
 class Difference:
     """A difference between the versions of one application or service that demands share.
 
-    ``what`` is this application or service, in words. ``demanded`` is the version of the new
-    demand, ``others`` is the newest version that the other demands ask for.
+    ``what`` describes this application or service. ``demanded`` is the version of the new demand,
+    ``others`` is the newest version that the other demands ask for.
     """
 
     what: str
@@ -158,9 +158,10 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim that asks for ``version``, and its word for it.
+    """Return the requesters of the first claim with ``version``, and the claim's word for it.
 
-    The word is the claim's version or channel; it is empty if the claim takes the default version.
+    The word is the version or channel in the claim. It is empty if the claim takes the default
+    version.
     """
     for claim in ledger.claims_on(subject):
         word = claim.application.version
@@ -208,8 +209,8 @@ def _of_service(
         )
         sharing = ", ".join(f"'{other}'" for other in others[:3])
         message = (
-            f"{what} would run in version {new}, but in {current} for {sharing}, which share it; "
-            "request the same version"
+            f"{what} would run in version {new}, but is shared with {sharing} in version "
+            f"{current}; request the same version"
         )
         appdefs = (config.appdefs[version.appdef] for version in (own, theirs))
         strictest = min(appdefs, key=lambda appdef: _STRICTNESS.index(appdef.versions))

@@ -50,7 +50,7 @@ class Usage:
 
 
 def whole_usage(world: World) -> Usage:
-    """Return what all services request; empty if no node has a capacity."""
+    """Return how much all services request on each node; empty if no node has a capacity."""
     if not world.config.limits_capacity:
         return Usage()
     keys: dict[ReleaseKey, None] = {}
@@ -61,14 +61,14 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return (node, resource) → how much more ``after`` requests, where the amounts differ."""
+    """Return (node, resource) → by how much the requests grow, where they differ."""
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return (node, resource) → how much more services request after claims changed.
+    """Return (node, resource) → by how much the requests of services grow after claims change.
 
     A release that cannot be planned requests nothing. The result is empty if no node has a
     capacity.
@@ -147,13 +147,13 @@ class Room:
     def __init__(self, world: World, usage: Usage, given_back: Iterable[Claim]) -> None:
         self._world, self._usage = world, usage
         self._own: dict[tuple[Subject, str], dict[str, int]] = {}
-        self.soon: Counter[str] = Counter()
+        self.newly_placed: Counter[str] = Counter()
         """How many applications were placed on each node."""
         self._change((one for one in given_back if one.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
-        """Book a claim on an application at its node, and count the application in ``soon``."""
-        self.soon[claim.application.node] += 1
+        """Book a claim on an application at its node, and count it in :attr:`newly_placed`."""
+        self.newly_placed[claim.application.node] += 1
         self.book([claim])
 
     def book(self, claims: Iterable[Claim]) -> None:
@@ -231,7 +231,7 @@ class Room:
     def _after(
         self, claims: Iterable[Claim], *, give_back: bool = False
     ) -> tuple[World, Mapping[Need, int]]:
-        """Return the world with these claims booked, and how much more services then request.
+        """Return the world with these claims booked, and by how much the requests grow.
 
         With ``give_back``, the claims are released instead.
         """
@@ -249,4 +249,4 @@ def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
         most = node.most(resource) if node else None
         if node and most is not None and used > most:
             used_text, most_text = amount_text(used, resource), amount_text(most, resource)
-            yield node, f"services request {used_text} {resource} of {most_text}"
+            yield node, f"services request {used_text} {resource}, but the node has {most_text}"

@@ -15,7 +15,12 @@ from demandops import strict_yaml
 from demandops.config.appdef import Place, Service
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.inventory import Node, Position
-from demandops.config.node_property import asked_in, asked_texts, has_asked, problem_of
+from demandops.config.node_property import (
+    condition_problem,
+    condition_texts,
+    meets_condition,
+    read_condition,
+)
 from demandops.demand import permission
 from demandops.demand.application import Application, Requirement
 from demandops.demand.claim import Claim
@@ -52,7 +57,7 @@ def requirement_of(service: Service) -> Requirement:
         place.role,
         tuple(sorted(place.labels.items())),
         tuple(sorted({*place.capabilities})),
-        tuple(sorted(asked_texts(place.properties))),
+        tuple(sorted(condition_texts(place.properties))),
     )
 
 
@@ -85,7 +90,7 @@ class Choice:
     """The choice of the node of one application, or of one of its services.
 
     ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims to
-    book for the application; their node does not matter.
+    book for the application, on any node.
     """
 
     one: Demanded
@@ -208,7 +213,7 @@ class Choice:
         """
         distance = self._distance(node, centre, positions)
         booked = self.world.ledger.applications_on.get(node.id) or 0
-        booked += self.room.soon[node.id]
+        booked += self.room.newly_placed[node.id]
         away = not self._is_home(node)
         match self.config.repo_settings.placement:
             case "spread":
@@ -266,7 +271,7 @@ class Choice:
             elif not reasons and (shortage := self._shortage(node)):
                 reasons, code = shortage, NO_ROOM
             elif not reasons:
-                reasons.append("is one with which the demand is refused")
+                reasons.append("fits, but the demand would be refused there")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))
@@ -284,23 +289,25 @@ class Choice:
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
-    """Yield a message for each part of a requirement that is wrong for the whole inventory.
+    """Yield a message for each part of a requirement that no node of the inventory can meet.
 
-    This is a role or property that no node has, or a property compared with a value of a wrong
-    type.
+    Such a part names a role or property that no node has, or compares a property with a value of a
+    wrong type.
     """
     role, roles = requirement.role, config.nodes_by_role.keys() - {""}
     if role and role not in roles:
         yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
     kinds = config.property_kinds
     for text in requirement.properties:
-        asked = asked_in(text)
-        if asked is None:  # the form of the demand has a fault
+        condition = read_condition(text)
+        if condition is None:  # the form of the demand has a fault
             continue
-        if asked.name not in kinds:
-            known = suggestion(asked.name, kinds) or f"; add it in {config.place_of(NODES_FILE)}"
-            yield f"no node has the property {quoted(asked.name)}{known}"
-        elif problem := problem_of(asked, kinds[asked.name][0]):
+        if condition.name not in kinds:
+            known = (
+                suggestion(condition.name, kinds) or f"; add it in {config.place_of(NODES_FILE)}"
+            )
+            yield f"no node has the property {quoted(condition.name)}{known}"
+        elif problem := condition_problem(condition, kinds[condition.name][0]):
             yield problem
 
 
@@ -316,9 +323,9 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
         if capability not in node.capabilities:
             yield f"the capability {quoted(capability)}"
     for text in requirement.properties:
-        if not has_asked(node.properties, text):
-            asked = asked_in(text)
-            value = node.properties.get(asked.name) if asked else None
+        if not meets_condition(node.properties, text):
+            condition = read_condition(text)
+            value = node.properties.get(condition.name) if condition else None
             has = "" if value is None else f" (it has {strict_yaml.short_repr(value)})"
             yield f"the property {quoted(text)}{has}"
 

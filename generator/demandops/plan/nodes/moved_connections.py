@@ -20,7 +20,7 @@ from demandops.ledger.claim_changes import ClaimChange, claim_changes
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.flows import Flow, flows
-from demandops.plan.implied_connections import carrying
+from demandops.plan.implied_connections import connection_for
 from demandops.subject import Subject, SubjectKind
 
 Move = Callable[[Application], Application]
@@ -116,7 +116,7 @@ def _carried_by(flow: Flow, known: Connection | None, claim: Claim, world: World
     """
     route = known.topics[0] if known else None
     flow = replace(flow, topic=route.read_topic) if route else flow
-    connection = carrying(flow, known.known_type.word if known else "auto", world.ledger)
+    connection = connection_for(flow, known.known_type.word if known else "auto", world.ledger)
     if route and not world.ledger.is_carried_to(flow.receiver, flow.target):
         route = replace(route, source=flow.topic, target=flow.target, reverse=False)
         connection = replace(connection, topics=(route,))

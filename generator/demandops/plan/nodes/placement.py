@@ -56,7 +56,7 @@ def with_chosen_nodes(
     Args:
         request: the request.
         world: the claims and the configuration before it.
-        usage: how much services request of the nodes in ``world``.
+        usage: how much services request on each node in ``world``.
         trial: if given, a node is skipped if ``trial`` returns ``False`` for the request with this
             node.
 
@@ -66,7 +66,7 @@ def with_chosen_nodes(
     if not request.adds_claims:
         return request, []
     faults: list[Fault] = []
-    if is_placed(request, world):
+    if needs_placement(request, world):
         request, faults = _placed(request, world, usage, trial)
     demanded = (
         replace(one, held=_overridden(one.held, world))
@@ -77,8 +77,8 @@ def with_chosen_nodes(
     return replace(request, demanded=tuple(demanded)), faults
 
 
-def is_placed(request: DemandRequest, world: World) -> bool:
-    """Return whether nodes must be worked out for a request.
+def needs_placement(request: DemandRequest, world: World) -> bool:
+    """Return whether nodes must be chosen or checked for a request.
 
     This is so if the request leaves a node to the generator, or if a service of one of its
     applications has a node of its own in the request or in the ledger.
@@ -106,7 +106,9 @@ def _overridden(app: Application, world: World) -> Application:
     a change of an override or a definition moves them again.
     """
     booked = world.ledger.application(app.id)
-    if booked is not None and replace(app, moved=booked.moved).decided_like(booked):
+    if booked is not None and replace(app, moved=booked.moved).has_same_definition_and_nodes(
+        booked
+    ):
         return replace(app, moved=booked.moved)
     return with_overridden_nodes(app, world)
 
@@ -161,7 +163,7 @@ def _so_far(
 
 
 def _without_services(one: Demanded, world: World) -> Demanded:
-    """Return an application that has nodes only for the services whose node the demand names."""
+    """Return an application without the nodes of services that the demand does not name."""
     if not isinstance(one.held, Application):
         return one
     services = {service.name: "" for service in _services_to_place(one.held, world)}
@@ -193,7 +195,10 @@ def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
 
 
 def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Choice]:
-    """Yield the choices of nodes for an application and its services, as if no node were in use."""
+    """Yield the :class:`Choice` for an application and for each of its services that is placed.
+
+    No node counts as used, so the choices show which nodes could ever fit.
+    """
     if not isinstance(one.held, Application):
         return
     free, claims = Room(world, Usage(), ()), (_claim(request, one),)
@@ -232,7 +237,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
     """
     role = service.root or ""
     for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
-        for claim in world.ledger.claims_taking(topic.source, topic.topic):
+        for claim in world.ledger.claims_reading(topic.source, topic.topic):
             other = world.ledger.application(claim.subject.id) or claim.application
             if other.id == app.id or not shares(service, app, other):
                 continue
@@ -363,6 +368,6 @@ def _with_services(
         told = f"{text}{quoted(found.node)}, {found.why}"
         held = on_node(choice.app, found.node, service, world)
         one = replace(one, held=held, placed=(*one.placed, told))
-        room.soon[found.node] += 1
+        room.newly_placed[found.node] += 1
         room.book([_claim(request, one)])
     return one, faults

@@ -49,7 +49,7 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
     Args:
         request: the drain; its ``id`` is the node.
         world: the claims and the configuration.
-        usage: how much services request of the nodes in ``world``.
+        usage: how much services request on each node in ``world``.
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
     room = Room(world, usage, ())
@@ -80,9 +80,10 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return what of an application is placed on a node.
+    """Return the parts of an application that are placed on a node.
 
-    ``None`` stands for the application itself; the services are those with a node of their own.
+    ``None`` stands for the application itself; the other parts are services with a node of their
+    own.
     """
     app = world.ledger.application(id)
     if app is None:
@@ -154,7 +155,7 @@ def _moved(
     renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
     for chosen in choice.candidates({}):
         if route := renamed.get(chosen.node):
-            names = f"'{route.read_topic}' would no longer become '{route.written_topic}'"
+            names = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
             reasons.append(f"on {quoted(chosen.node)} {names}")
             continue
         move = partial(on_node, node=chosen.node, service=service, world=world)
@@ -167,8 +168,8 @@ def _moved(
 
 
 @dataclass(frozen=True, slots=True)
-class Followed:
-    """The ledger in which services are on the nodes that overrides name.
+class LedgerAfterMoves:
+    """The ledger after services have moved to the nodes that overrides name.
 
     ``keys`` are the keys of the claims that may have changed.
     """
@@ -179,7 +180,9 @@ class Followed:
     """(file of an override, message) for each service that cannot be moved as the override asks."""
 
 
-def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> Followed:
+def following_overrides(
+    world: World, subjects: Iterable[Subject] | None = None
+) -> LedgerAfterMoves:
     """Return the ledger with services moved to the nodes that overrides name.
 
     The connections follow the services.
@@ -216,11 +219,11 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
             world, keys = after, [*keys, *(one.key for of in changes.values() for one in of)]
         else:
             stays += _unmoved(ids[0], world, fault)
-    return Followed(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
+    return LedgerAfterMoves(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a rollback whose claims have their services on the nodes that overrides now name."""
+    """Return a restoration whose claims have services on the nodes that overrides now name."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims

@@ -26,7 +26,7 @@ state of its claims; it is partly suspended if they differ, and waiting if it ha
 
 @dataclass(frozen=True, slots=True)
 class HeldDemand:
-    """A demand and what it holds. Its lease is the lease that ends first among its claims."""
+    """A demand and what it holds. ``lease`` is the first of its leases to end."""
 
     name: str
     state: State

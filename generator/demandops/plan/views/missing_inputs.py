@@ -29,7 +29,7 @@ class MissingInput:
 
     @property
     def warning(self) -> Fault:
-        """Return the missing input as a warning, located in the claim's file."""
+        """The missing input as a warning, located in the claim's file."""
         return fault(f"application '{self.application}'", self.reason).within(self.file)
 
 

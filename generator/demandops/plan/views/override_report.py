@@ -37,7 +37,7 @@ class Entry:
 
 
 def override_report(world: World, now: datetime) -> list[Entry]:
-    """Return every override, sorted by name, with what it does."""
+    """Return an entry for every override, sorted by name."""
     if not world.config.overrides:
         return []
     releases = _releases(world)

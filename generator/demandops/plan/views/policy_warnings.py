@@ -68,7 +68,7 @@ def _unfit_places(config: Config) -> Iterator[Fault]:
         asked = requirement_of(service)
         problems = [*unmet(asked, config)]
         if not problems and all(any(lacks(node, asked)) for node in config.nodes.values()):
-            problems = [f"no node in {config.place_of(NODES_FILE)} has all that it asks for"]
+            problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
         for problem in problems:
             message = f"{problem}; demands that need '{name}' are refused"
             yield fault(field, message).within(file)
@@ -99,8 +99,8 @@ def _connections_of_before(world: World) -> Iterator[Fault]:
                 )
     for (name, other), count in sorted(counts.items()):
         message = (
-            f"no rule of access domain '{name}' has '{other}' in its peers; connections between "
-            f"them stay ({count}), but cannot be demanded again"
+            f"no rule of access domain '{name}' has '{other}' in its peers; the existing "
+            f"connections between them ({count}) stay, but cannot be demanded again"
         )
         yield fault("", message).within(world.config.file_of(DOMAINS_FILE, name))
 

@@ -29,7 +29,7 @@ _Unit: TypeAlias = "Subject | ReleaseKey"
 _Read: TypeAlias = "Subject | tuple[str, ...]"
 
 _ALL: _Read = ("all",)
-"""A read of the whole ledger."""
+"""The record of a read of the whole ledger."""
 
 
 class TracedPlan:
@@ -102,7 +102,7 @@ def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
 
 @dataclass(frozen=True)
 class _RecordingKept:
-    """Records reads of the kept replicas; planning reads only their :attr:`steps`."""
+    """Kept replicas that record reads; planning reads only their :attr:`steps`."""
 
     steps: _Recording
 

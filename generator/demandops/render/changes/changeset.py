@@ -1,4 +1,4 @@
-"""The changes that a decision makes in the state repo: files by path, and releases in words.
+"""The changes that a decision makes in the state repo: files by path, and how releases change.
 
 A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
 """
@@ -36,7 +36,7 @@ FileReader = Callable[[str], str | None]
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops; ``details`` are lines on the facts that change."""
+    """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
 
     name: str
     what: str

@@ -135,7 +135,7 @@ def _follow(cluster: str, then: str) -> Step:
 
 
 def _bootstrap_again(cluster: str) -> Step:
-    description = "apply its bootstrap file again, because that changed"
+    description = "apply its bootstrap file again, because the file changed"
     return Step(cluster, description, (_apply(cluster),))
 
 
