@@ -48,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""How a release or an entry of the bookkeeping changes → its mark in text."""
+"""How a release or an entry of the bookkeeping changes → the sign in front of its name."""
 
 
 def terminal_width() -> int | None:
@@ -128,7 +128,7 @@ def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:
-    """Return lines for a release: its version, then each version that demands name.
+    """Return a release's version as a line, then a line for each version that demands name.
 
     ``data`` has the form that :func:`demandops.cli.json_output.version_data` returns.
     """

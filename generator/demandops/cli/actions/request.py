@@ -56,7 +56,7 @@ class Document:
 
 
 class _Answer(Future["Receipt | dict[str, str]"]):
-    """The future answer to a request: its receipt, or the proposal that awaits approval."""
+    """A future for the answer to a request: the receipt, or the proposal that awaits approval."""
 
 
 @click.command()
@@ -68,7 +68,7 @@ class _Answer(Future["Receipt | dict[str, str]"]):
     "--wait",
     is_flag=True,
     help="Wait until demands that need approval are decided. Otherwise they are proposed, and "
-    "the next generator that starts on this machine follows them up.",
+    "the next generator that starts on this machine completes them after the decision.",
 )
 @signing_option
 @output_option
@@ -244,7 +244,7 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
 
 
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
-    """Submit a request; return the future answer.
+    """Submit a request; return a future for its answer.
 
     Without ``wait``, a proposal that awaits approval is an answer too.
     """

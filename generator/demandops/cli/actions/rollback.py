@@ -16,10 +16,10 @@ from demandops.cli.actions.ledger_change import (
     started_generator,
 )
 from demandops.cli.actions.person_change import (
-    confirmed,
+    confirm,
     is_asked,
-    known,
     reason_option,
+    warned_if_unnamed,
     yes_option,
 )
 from demandops.cli.json_output import claim_data, faults_of, output_option, show
@@ -78,7 +78,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
-        who = repo.operator() if dry_run else known(repo.operator())
+        who = repo.operator() if dry_run else warned_if_unnamed(repo.operator())
         goal = rollback_goal.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
         result: dict[str, Any] = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
@@ -90,7 +90,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     if not dry_run and not result["faults"]:
         if is_asked(yes, output) and result["outcome"] != "unchanged":
             show(output, None, _lines(result, True))
-            confirmed("Continue?", yes, output)
+            confirm("Continue?", yes, output)
         result |= _roll_back(state_repo, goal, signing_key, base)
     if result["faults"] and output == "text":
         print_refusal(f"the rollback to {to[:10]} is refused:", result["faults"])

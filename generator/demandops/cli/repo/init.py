@@ -60,9 +60,9 @@ def init(
 ) -> None:
     """Create a state repo.
 
-    Its first commit has the skeleton, and the fleet and application of the example. To make a
-    cluster follow the state repo, install Flux or Argo CD there (docs/flux.md, docs/argocd.md) and
-    run:
+    Its first commit has the files that people edit, with the fleet and application of the example.
+    To make a cluster follow the state repo, install Flux or Argo CD there (docs/flux.md,
+    docs/argocd.md) and run:
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
 
@@ -91,7 +91,7 @@ def init(
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
         lines.append(
-            "no cluster can follow it yet: write the url that clusters fetch to demandops.yaml"
+            "no cluster can follow it yet: in demandops.yaml, set the url that clusters fetch"
         )
     else:
         cluster = "c-its" if example == "experiment" else "CLUSTER"

@@ -51,7 +51,7 @@ def _state(answer: Json) -> str:
     if kind in ("file", "claim") and not runs:
         return "no longer exists" if answer["stopped"] else "exists"
     if kind in ("demand", "requester"):
-        return "holds" if runs else "is suspended" if answer["claims"] else "holds nothing"
+        return "holds claims" if runs else "is suspended" if answer["claims"] else "holds nothing"
     if kind == "node":
         return "is used" if runs else "is not used"
     if kind == "override":
