@@ -134,7 +134,10 @@ class CommitState:
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield each release of ``before`` whose claims on ``subjects`` changed; update its claims."""
+        """Yield each release of ``before`` whose claims on ``subjects`` changed.
+
+        The yielded values have the new claims.
+        """
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:

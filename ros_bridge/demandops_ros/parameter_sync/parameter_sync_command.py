@@ -42,9 +42,9 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
 
     It watches the ConfigMap, which holds a ROS parameter file, and sets the parameters of the
     running node when they change, or when the node starts again. Everything after --ros-args goes
-    to ROS. Parameters, as those of the reference's k8s_configmap_watcher: configmap_name,
-    namespace, ros_params_file_name (the key in the ConfigMap; params.yml), target_ros_node. Stop
-    it with Ctrl-C or SIGTERM.
+    to ROS. The ROS parameters are those of the reference's k8s_configmap_watcher: configmap_name,
+    namespace, ros_params_file_name (the key in the ConfigMap; default params.yml) and
+    target_ros_node. Stop it with Ctrl-C or SIGTERM.
 
     \b
     Examples:
