@@ -69,10 +69,8 @@ class DetectorDiagnostics:
         if unanswered:
             text = f"{unanswered} demands have no answer yet"
         if refusals:
-            level, text = (
-                DiagnosticStatus.WARN,
-                f"{len(refusals)} demands failed and are tried again",
-            )
+            level = DiagnosticStatus.WARN
+            text = f"{len(refusals)} demands failed and are tried again"
         values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
         for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
             values[" ".join((rule, *subjects))] = why

@@ -138,15 +138,11 @@ class DetectorNode(Node):  # type: ignore[misc]
         if self._is_started:
             return
         if self._now() == _UNHEARD_CLOCK:
-            missing = (
-                "no message on /clock yet, so nothing is demanded: use_sim_time is set; start a "
-            )
-            missing += "node that publishes /clock, or set use_sim_time to false"
+            missing = "no message on /clock yet, so nothing is demanded: use_sim_time is set; "
+            missing += "start a node that publishes /clock, or set use_sim_time to false"
         else:
-            missing = (
-                "no bookkeeping yet, so nothing is demanded: start demandops serve, or set the "
-            )
-            missing += "parameter bookkeeping_topic to the topic of its bookkeeping"
+            missing = "no bookkeeping yet, so nothing is demanded: start demandops serve, or set "
+            missing += "the parameter bookkeeping_topic to the topic of its bookkeeping"
         self.get_logger().warning(missing)
 
     # ---- periodic work ----
