@@ -106,7 +106,7 @@ class TestInit:
         folder = tmp_path / "state"
         ran = demandops("init", folder)
         assert "kubectl" not in ran.out
-        assert "no cluster can follow it yet: in demandops.yaml, set the url" in ran.out
+        assert "no cluster can follow it yet: set the url" in ran.out
         assert not (folder / "bootstrap").exists()
         root = folder / "demandops.yaml"
         root.write_text(

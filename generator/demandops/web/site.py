@@ -215,7 +215,7 @@ class _ClosedHeaders:
         await self._application(scope, receive, sending)
 
 
-# ---- what templates print ----
+# ---- filters of the templates ----
 
 
 def _visible(value: object) -> object:

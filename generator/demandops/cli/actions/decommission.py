@@ -104,7 +104,8 @@ def _book(
                 await_answer(ticket.future)
             receipt = ticket.future.result()
         except Refused as error:
-            _raise_unless_unclaimed_node(error, goal, generator.snapshot)
+            if not _is_unclaimed_node(error, goal, generator.snapshot):
+                raise
             return None
     return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
 
@@ -115,18 +116,18 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
         try:
             decision = decide(snapshot.state, goal, REAL.now(), repo.file_reader())
         except Refused as error:
-            _raise_unless_unclaimed_node(error, goal, snapshot)
+            if not _is_unclaimed_node(error, goal, snapshot):
+                raise
             return None
     if output == "text":
         print_consequences(decision)
     return _row(goal, decision.outcome, None, decision.changes.claims)
 
 
-def _raise_unless_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> None:
-    """Raise the error, unless it says that no claim concerns a node that the inventory has."""
+def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
+    """Return whether the only fault is that no claim concerns a node of the inventory."""
     codes = {each.code for each in error.faults}
-    if codes != {"not-held"} or goal["name"] not in snapshot.state.config.nodes:
-        raise error
+    return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 
 
 def _row(

@@ -112,7 +112,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return the reference's custom resources in a cluster: a list of one (origin, data) pair."""
+    """Return one (origin, data) pair, in a list: the reference's custom resources in a cluster."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

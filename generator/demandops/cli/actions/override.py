@@ -125,7 +125,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 def end(name: str, options: EditOptions) -> None:
     """End an override: remove its file.
 
-    The releases that the override changed return to what the demands ask for.
+    The releases that the override changed are rendered again without it.
 
     \b
     Examples:
@@ -168,7 +168,7 @@ def new_override(
 
 
 def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show what a new override does, ask for confirmation, and commit the override."""
+    """Show the effect of a new override, ask for confirmation, and commit the override."""
     if repo.file_reader()(edit.path) is not None:
         message = "exists already; end it first, or choose another name"
         raise InvalidInput.at("", message, file=edit.path)
@@ -178,7 +178,7 @@ def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show what the end of an override changes, ask for confirmation, and commit the removal."""
+    """Show the effect of ending an override, ask for confirmation, and commit the removal."""
     known = repo.last_valid_snapshot(repo.commit()).state.config.overrides
     if edit.name not in known:
         message = f"there is no override '{edit.name}'{suggestion(edit.name, known)}"

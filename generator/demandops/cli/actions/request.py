@@ -63,7 +63,9 @@ class _Answer(Future["Receipt | dict[str, str]"]):
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
 @writable_repo_option
 @dry_run_option
-@click.option("--release", is_flag=True, help="Release what the documents demand, instead.")
+@click.option(
+    "--release", is_flag=True, help="Release the demands of the documents instead of booking them."
+)
 @click.option(
     "--wait",
     is_flag=True,

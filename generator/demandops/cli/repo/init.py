@@ -90,9 +90,7 @@ def init(
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
-        lines.append(
-            "no cluster can follow it yet: in demandops.yaml, set the url that clusters fetch"
-        )
+        lines.append("no cluster can follow it yet: set the url for the clusters in demandops.yaml")
     else:
         cluster = "c-its" if example == "experiment" else "CLUSTER"
         lines.append(

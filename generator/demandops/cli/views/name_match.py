@@ -47,7 +47,7 @@ class Match:
 
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
-    """Return what a name or path identifies; ``kind`` limits the search to one kind.
+    """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
 
     Raises:
         StateRepoError: if the name identifies nothing, or several things.
@@ -102,9 +102,10 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 def _by_looser_match(
     repo: Reader, snapshot: Snapshot, name: str, kind: str | None
 ) -> Iterator[Match]:
-    """Yield what a name identifies, if no release, application or connection has exactly this name.
+    """Yield the demand, node or other object of this name.
 
-    The name may then be a part of a release's name, or the first part of a demand's id.
+    If there is none, yield the release whose name contains ``name``, or the demand whose id begins
+    with it.
     """
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)

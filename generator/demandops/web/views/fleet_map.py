@@ -95,8 +95,8 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     Args:
         now: the situation.
         wanted: the filter; services, connections and nodes that match are highlighted.
-        layout: ``place`` or ``cluster``. Any other value, or ``place`` without a node that has a
-            position, means ``place`` if most nodes have a position, else ``cluster``.
+        layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
+            position, else ``cluster``. Without any position, ``place`` means ``cluster``.
     """
     config = now.commit_state.config
     nodes = list(config.nodes.values())
@@ -145,7 +145,8 @@ def _apart(
 ) -> tuple[list[_Drawn], list[_Drawn]]:
     """Return the parts to draw together, and the parts to draw one by one.
 
-    At most ``most`` parts are drawn one by one: all, else the special ones, else none.
+    All parts are drawn one by one if they are at most ``most``. Otherwise only the special parts
+    are, or none if even these are more than ``most``.
     """
     if len(drawn) <= most:
         return [], drawn
