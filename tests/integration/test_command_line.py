@@ -246,7 +246,7 @@ class TestRequest:
             "standard input: request 1 'two' refused\n"
             "  line 21: apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you "
             "mean 'edge'?\n"
-            "  not held: application 'other' for vehicle00\n"
+            "  listed, but not held by the requester: application 'other' for vehicle00\n"
         )
 
     def test_files_and_documents_are_taken_in_order(

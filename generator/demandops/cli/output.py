@@ -48,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""How a release or an entry of the bookkeeping changes → the sign in front of its name."""
+"""The change of a release or of an entry of the bookkeeping → the sign before its name."""
 
 
 def terminal_width() -> int | None:
@@ -128,7 +128,7 @@ def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:
-    """Return a release's version as a line, then a line for each version that demands name.
+    """Return a line with a release's version, and a line for each version that is asked for.
 
     ``data`` has the form that :func:`demandops.cli.json_output.version_data` returns.
     """

@@ -127,7 +127,7 @@ class Follower:
         return commit_state.last_changes[path]
 
     def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
-        """Return the generated files that a generator has yet to write or remove at a commit.
+        """Return the generated files that, as of a commit, a generator has yet to write or remove.
 
         Return an empty set if the state repo cannot be read.
         """

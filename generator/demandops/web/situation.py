@@ -55,7 +55,7 @@ class Planned:
 class ReusableRows:
     """The rows of a list, kept so that a later call need not make them again.
 
-    ``rows`` maps the id of a row to the parts from which the row was made, and the row.
+    ``rows`` maps the id of an entry to the values of the entry, and the row made from them.
     ``statuses`` are the statuses of releases for which all rows were made; None if the rows were
     made for an earlier commit.
     """

@@ -99,7 +99,7 @@ def writable(
 
 @dataclass(frozen=True, slots=True)
 class EditOptions:
-    """The values of the options that every command for an edit of an override has."""
+    """The values of the options common to all commands that create or end an override."""
 
     state_repo: str
     signing_key: Path | None

@@ -339,7 +339,7 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
         for warning in (*_unit_warnings(document.goal), *row["warnings"]):
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:
-            errors.print(f"  not held: {item}")
+            errors.print(f"  listed, but not held by the requester: {item}")
     if not dry_run and any(row["outcome"] in ("booked", "released") for row in rows):
         for line in hint_to_pull():
             errors.print(line)

@@ -124,8 +124,9 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    ``base`` is the commit for which the caller knows the consequences. The result contains them
-    only if they differ: the rollback was refused, changed nothing, or is based on a newer commit.
+    ``base`` is the commit for which the caller has computed the consequences. The result has
+    consequences only if others apply: the rollback was refused, changed nothing, or is based on a
+    newer commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:
@@ -159,5 +160,5 @@ def _lines(result: dict[str, Any], dry_run: bool) -> Iterator[str]:
     releases = (ReleaseChange(**each) for each in result["releases"])
     yield from (f"  {line}" for line in release_lines(releases, "release "))
     if result["configuration_since"]:
-        yield f"a rollback does not change configuration; changed since {to}:"
+        yield f"a rollback does not change the configuration; these files differ from {to}:"
         yield from (f"  {path}" for path in result["configuration_since"])

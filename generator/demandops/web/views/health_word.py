@@ -30,7 +30,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 
 def since_of(status: ReleaseStatus) -> datetime | None:
-    """Return since when a release has its state; None if the cluster does not report the time."""
+    """Return the time of the last change of a release's state; None if the cluster has none."""
     try:
         return datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:

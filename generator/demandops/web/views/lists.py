@@ -19,22 +19,22 @@ from demandops.web.situation import CommitState, ReusableRows, Situation
 from demandops.web.views.filtered_table import Cell, Column, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import RANKS, WORDS, word_of, worst_word
 
-Parts: TypeAlias = "tuple[Any, ...]"
+Values: TypeAlias = "tuple[Any, ...]"
 
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
     """A kind of list: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields the id and the parts of each entry. ``row`` makes a row from the parts; it is
-    called again only if a part of the entry has changed.
+    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values; it
+    is called again only if a value of the entry has changed.
     """
 
     name: str
     title: str
     about: str
     columns: tuple[Column, ...]
-    entries: Callable[[Situation], Iterator[tuple[str, Parts]]]
+    entries: Callable[[Situation], Iterator[tuple[str, Values]]]
     row: Callable[..., Row]
 
 
@@ -62,7 +62,7 @@ def _requesters(of: Iterable[str]) -> Cell:
     return cell(*_filtered("demands", "requester", of))
 
 
-def _services(now: Situation) -> Iterator[tuple[str, Parts]]:
+def _services(now: Situation) -> Iterator[tuple[str, Values]]:
     for release, _ in now.commit_state.targets:
         if isinstance(release, ServiceRelease):
             name = release.name
@@ -91,7 +91,7 @@ def _service(world: World, release: ServiceRelease, claims: list[Claim], word: s
     )
 
 
-def _connections(now: Situation) -> Iterator[tuple[str, Parts]]:
+def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
     ledger, carrying = now.commit_state.active.ledger, clients_of(now.commit_state)
     for id in ledger.subjects(SubjectKind.CONNECTION):
         claims, clients = ledger.connection_claims(id), carrying.get(id, [])
@@ -129,7 +129,7 @@ def clients_of(commit_state: CommitState) -> dict[str, list[str]]:
     return found
 
 
-def _demands(now: Situation) -> Iterator[tuple[str, Parts]]:
+def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
     commit_state = now.commit_state
     for id, claims in commit_state.claims_of_demands.items():
         releases = commit_state.releases_of_demands.get(id, [])
@@ -165,7 +165,7 @@ def _demand(
     )
 
 
-def _leases(now: Situation) -> Iterator[tuple[str, Parts]]:
+def _leases(now: Situation) -> Iterator[tuple[str, Values]]:
     for claim in now.commit_state.state.ledger:
         if claim.lease is not None:
             yield f"{claim.subject} {claim.demand}", (claim,)
@@ -197,16 +197,16 @@ def _columns(*named: str) -> tuple[Column, ...]:
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; make only the rows whose parts have changed."""
+    """Return the rows of a list; reuse the rows of entries that have not changed."""
     commit_state, kind = now.commit_state, LISTS[name]
     known = commit_state.rows.get(name, ReusableRows(None, {}))
     if known.statuses is not now.statuses:
-        made: dict[str, tuple[Parts, Row]] = {}
-        for id, parts in kind.entries(now):
+        made: dict[str, tuple[Values, Row]] = {}
+        for id, values in kind.entries(now):
             before = known.rows.get(id)
-            is_same = before is not None and before[0] == parts
+            is_same = before is not None and before[0] == values
             made[id] = (
-                before if before and is_same else (parts, kind.row(commit_state.state, *parts))
+                before if before and is_same else (values, kind.row(commit_state.state, *values))
             )
         known = commit_state.rows[name] = ReusableRows(now.statuses, made)
     return [row for _, row in known.rows.values()]

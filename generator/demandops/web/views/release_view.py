@@ -67,7 +67,7 @@ class Explained:
 
     @property
     def since(self) -> datetime | None:
-        """Since when the release has its state; None if the cluster does not report the time."""
+        """The time of the last change of the release's state; None if the cluster has none."""
         return since_of(self.status)
 
     @property
