@@ -100,13 +100,11 @@ def warn_of(problems: Iterable[object]) -> None:
 def warn_of_not_rendered(paths: Collection[str]) -> None:
     """Warn about generated files that a generator has yet to write or remove."""
     if paths:
-        files = (
-            "1 generated file waits" if len(paths) == 1 else f"{len(paths)} generated files wait"
-        )
+        files = "1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"
         listed = ", ".join(sorted(paths)[:_MOST_LISTED]) + (
             ", …" if len(paths) > _MOST_LISTED else ""
         )
-        errors.print(f"warning: {files} for a generator to write or remove: {listed}")
+        errors.print(f"warning: a generator has yet to write or remove {files}: {listed}")
 
 
 at_option = click.option(

@@ -63,7 +63,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
 ) -> None:
     """Release all claims of a node or a requester.
 
-    A node loses its applications, the inputs from it and the connections that end at it, for every
+    A node loses its applications, the inputs from it and the connections from and to it, for every
     requester; then you can delete it from the inventory. A requester loses all its claims, also
     the claims that it shares with other requesters. If NAME is both a node and a requester, both
     are decommissioned. At a terminal, the command shows the consequences first and asks.

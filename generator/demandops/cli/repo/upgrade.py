@@ -121,8 +121,10 @@ def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
         )
         return
     yield from _summary(made, dry_run)
-    before = "before the upgrade" if dry_run else "before the upgrade, this had to be done"
-    yield from _step_lines(f"{before}, on the clusters:", made.handover.before)
+    before = "before the upgrade, on the clusters:"
+    if not dry_run:
+        before = "on the clusters, this had to be done before the upgrade:"
+    yield from _step_lines(before, made.handover.before)
     yield from _step_lines("after the upgrade, on the clusters:", made.handover.after)
 
 
