@@ -66,7 +66,9 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         return (running or matches)[0]
     if matches:
         kinds = ", ".join(each.kind for each in matches)
-        raise StateRepoError(f"{quoted(name)} names several things: {kinds}; choose one with --kind")
+        raise StateRepoError(
+            f"{quoted(name)} names several things: {kinds}; choose one with --kind"
+        )
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     running_names = {release.name for release in release_causes.releases(world)}
