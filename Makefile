@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.setup-done
-# Each target first checks what the system must give for it.
+# Each target first checks that the system provides what it needs.
 SYSTEM := system-demo system-test system-page system-faults system-e2e system-e2e-argocd
 # Distributions have too old a Go, so the end-to-end tests bring this one unless PATH has it.
 GO     := 1.26
@@ -26,7 +26,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help setup demo test test-packages page faults e2e e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate docs wheel release clean
 .PHONY: $(SYSTEM) go
 
-help:  ## Show what there is to make
+help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 $(SYSTEM): system-%:
@@ -79,7 +79,7 @@ coverage: system-test setup  ## Report what the tests cover, then what the core'
 	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
 
 # The long form tries every call: make faults FAULTS=--long
-faults: system-faults setup  ## Kill generators; fail, kill, fill and cut off at each system call of a demand; four minutes
+faults: system-faults setup  ## Kill generators; inject an error, a kill, a full disk or power loss at each system call of a demand; four minutes
 	@$(PY) -m pytest -q -n auto $(KILL_TESTS)
 	@$(PY) -m tests.faults $(FAULTS)
 
@@ -90,13 +90,13 @@ e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests o
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e --ignore tests/e2e/argocd -x -q
 
 e2e-argocd: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONFIG),,go)  ## Run them with Argo CD
+e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests with Argo CD
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
 
 # With FIGURES=1 it also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (docs/experiment.md)
+experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (docs/experiment.md)
 	@$(PY) -m tests.experiment $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test and test-packages
@@ -112,13 +112,13 @@ format: setup  ## Format the code and mend what the linter can
 	@$(PY) -m ruff format .
 	@$(PY) -m ruff check --fix .
 
-golden: setup  ## Write the golden folders and what follows from the charts anew; review the diff
+golden: setup  ## Rewrite the golden folders, and the schemas and tables of the charts; review the diff
 	@$(PY) -m tests.golden.write
 	@$(PY) -m tests.terminal.write
 	@$(PY) -m tests.unit.charts.write
 	@$(PY) -m tests.unit.messages
 
-bench: system-page setup  ## Measure what a commit costs beside the floor, how a demand's cost grows, the event detector and the page
+bench: system-page setup  ## Measure the cost of commits and demands as the ledger grows, the event detector and the page
 	@$(PY) -m tests.benchmarks.commits
 	@$(PY) -m tests.benchmarks.growth
 	@$(PY) -m tests.benchmarks.configured
@@ -126,10 +126,10 @@ bench: system-page setup  ## Measure what a commit costs beside the floor, how a
 	@$(PY) -m tests.benchmarks.request
 	@$(PY) -m tests.benchmarks.page
 
-bench-audit: setup  ## Measure what an auditor's questions cost after 10,000 commits
+bench-audit: setup  ## Measure the cost of an auditor's questions after 10,000 commits
 	@$(PY) -m tests.benchmarks.audit
 
-load: setup  ## Four generators and a person write at once, 2,000 demands, connections are cut
+load: setup  ## Test load: four generators and a person write 2,000 demands at once, while connections are cut
 	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py tests/integration/staterepo/test_people_in_the_loop.py
 
 # The gate gives each target 2 seconds. What it found before is tried again: build/fuzz/corpus.
@@ -137,7 +137,7 @@ fuzz: export FUZZ_S ?= 10
 fuzz: system-test setup  ## Try odd inputs at every parser and writer, FUZZ_S seconds for each (default 10)
 	@$(PY) -m tests.fuzz
 
-simulate: setup  ## Find planted faults, then play histories of generators and people with faults, for SIMULATE_S=60 seconds from SEED
+simulate: setup  ## Find planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
 	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
 

@@ -115,7 +115,7 @@ def _text(outcome: Receipt | BaseException) -> str:
 
 
 def _not_held(receipt: Receipt) -> list[str]:
-    return [f"not held: {one_line(item)}" for item in receipt.not_held]
+    return [f"listed, but not held by the requester: {one_line(item)}" for item in receipt.not_held]
 
 
 def _code(outcome: Receipt | BaseException) -> str:

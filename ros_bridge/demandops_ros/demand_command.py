@@ -28,7 +28,7 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
     default=DEFAULT_DEMAND_ACTION_NAME,
     show_default=True,
     metavar="NAME",
-    help="The node's action.",
+    help="The name of the node's action Demand.",
 )
 @click.option(
     "--timeout",

@@ -78,9 +78,9 @@ def _of_parts(generator: Generator) -> DiagnosticStatus:
 
 
 def _of_actions(generator: Generator, others: dict[str, list[str]]) -> DiagnosticStatus:
-    level, text = DiagnosticStatus.OK, "no other node serves them"
+    level, text = DiagnosticStatus.OK, "no other node serves these actions"
     if any(others.values()):
-        level, text = DiagnosticStatus.WARN, "another node serves them too; see the log"
+        level, text = DiagnosticStatus.WARN, "another node serves these actions too; see the log"
     values = {action: ", ".join(nodes) for action, nodes in others.items()}
     return status("demandops: actions", generator.address, level, text, values)
 

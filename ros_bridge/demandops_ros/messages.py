@@ -20,9 +20,9 @@ from demandops_interfaces.action import Demand as DemandMessage
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
     """Return a message as mappings, lists and plain values, like those of its YAML form.
 
-    A ``DeploymentRequest.Goal`` becomes what
-    :func:`demandops.demand.deployment_request_goal.parse` takes, so that a goal over ROS 2 equals
-    the same goal in a file.
+    A ``DeploymentRequest.Goal`` becomes the data for
+    :func:`demandops.demand.deployment_request_goal.parse`, so that a goal over ROS 2 equals the
+    same goal in a file.
     """
     fields = getattr(message, "get_fields_and_field_types", None)
     if fields is not None:

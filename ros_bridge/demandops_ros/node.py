@@ -270,7 +270,7 @@ class DemandNode(Node):  # type: ignore[misc]
         if status is not None:
             problem = status.why_unreachable(target.domain for target in outcome.targets)
         if problem or status is None:
-            warnings = (*outcome.warnings, f"answered at pushed: {problem}")
+            warnings = (*outcome.warnings, f"answered at pushed, not at {level}: {problem}")
             self._finish(goal, replace(outcome, warnings=warnings))
             return
         rolled_out = status.follow(

@@ -1,4 +1,4 @@
-"""The parameters of the reference's node, and what replaces them here.
+"""Reads the parameters of the reference's node, and warns about those without effect.
 
 A fleet may start our node with the parameter file of the reference's node. The file calls that node
 ``application_manager``. Our node takes the action's name from the file. Brokers, topics and
@@ -54,7 +54,7 @@ def read(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` without effect, with what replaces it."""
+    """Yield a warning for each parameter in ``values`` without effect; it names the replacement."""
     for name in dict.fromkeys(each.partition(".")[0] for each in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"

@@ -56,14 +56,14 @@ _FLUSH_S = 0.3
 @click.option(
     "--fetch-interval",
     metavar="DURATION",
-    help="How often to fetch what people pushed while no demand comes, such as 30s; 0 for never. "
+    help="How often to fetch people's commits while no demand comes, such as 30s; 0 for never. "
     f"Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
 )
 @click.option(
     "--webhook",
     metavar="HOST:PORT",
-    help="Listen there for push notifications, and fetch at once: POST /push by GitHub, GitLab, "
-    "Gitea or Forgejo; see docs/operations.md. Off by default.",
+    help="Listen at this address for push notifications, and fetch at once: POST /push by GitHub, "
+    "GitLab, Gitea or Forgejo; see docs/operations.md. Off by default.",
 )
 @click.option(
     "--webhook-secret-file",
@@ -75,8 +75,8 @@ _FLUSH_S = 0.3
 @click.option(
     "--web",
     metavar="HOST:PORT",
-    help="Show the state repo on a web page there, such as 127.0.0.1:8080; see docs/page.md. Off "
-    "by default.",
+    help="Show the state repo on a web page at this address, such as 127.0.0.1:8080; see "
+    "docs/page.md. Off by default.",
 )
 @click.option(
     "--leader-lease",

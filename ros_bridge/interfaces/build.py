@@ -143,7 +143,7 @@ def is_current(digest: str) -> bool:
 
 
 def missing(environ: Mapping[str, str]) -> list[str]:
-    """Return what is missing for a build, with the remedy, as lines of text."""
+    """Return the missing requirements of a build and their remedies, as lines of text."""
     lines = []
     wheels = [wheel for wheel in WHEELS if not any(SITE.glob(f"{wheel}-*.dist-info"))]
     if wheels:

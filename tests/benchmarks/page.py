@@ -95,7 +95,7 @@ def measure(releases: int) -> dict[str, Row]:
         generator = Generator(str(laid.path))
         follower = Follower(Reader.of(str(laid.path)), {}, 0)
         server = WebServer("127.0.0.1:0", "--listen", follower)
-        release = next(iter(follower.newest.moment.releases))
+        release = next(iter(follower.newest.commit_state.releases))
         for view in (*VIEWS, f"release?name={release}"):
             rows[view.partition("=")[0] or "not ready"] = _row(browser, generator, server, view)
         server.close()

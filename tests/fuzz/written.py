@@ -18,7 +18,7 @@ import pyjson5
 import yaml
 from demandops import naming, strict_yaml
 from demandops.cli.actions.override import new_override
-from demandops.cli.actions.person_change import Way
+from demandops.cli.actions.person_change import EditOptions
 from demandops.config.base_model import parse_file
 from demandops.config.load import load
 from demandops.config.override import Override, OverrideFile
@@ -195,10 +195,10 @@ def name_of_object(ids: tuple[str, str]) -> None:
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
     """The override file has what a person gives to the command, unless that is refused."""
     reason, owner, nodes, patch = words
-    way = Way("", None, " ".join(reason.split()) or "x", False, False, False, "text")
+    options = EditOptions("", None, " ".join(reason.split()) or "x", False, False, False, "text")
     given = {"owner": owner or "x", "values": patch}
-    text = new_override(None, "x", way, {"node": (*nodes,)}, given)  # type: ignore[arg-type]
-    wanted = {"reason": way.reason, **given, "select": [{"node": nodes}]}
+    text = new_override(None, "x", options, {"node": (*nodes,)}, given)  # type: ignore[arg-type]
+    wanted = {"reason": options.reason, **given, "select": [{"node": nodes}]}
     data = strict_yaml.load(text)
     assert {key: data[key] for key in wanted} == wanted
     assert text.startswith("# yaml-language-server: ") and _yaml(text) == data

@@ -220,7 +220,7 @@ class TestWhy:
         ran = demandops("why", "twin", "--state-repo", state.path)
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            "error: 'twin' can mean several: application, connection; choose one with --kind\n"
+            "error: 'twin' names several things: application, connection; choose one with --kind\n"
         )
         assert ask("why", "twin", "--kind", "connection")["kind"] == "connection"
 

@@ -106,7 +106,7 @@ class TestInit:
         folder = tmp_path / "state"
         ran = demandops("init", folder)
         assert "kubectl" not in ran.out
-        assert "no cluster can follow it yet: write the url that clusters fetch" in ran.out
+        assert "no cluster can follow it yet: set the url" in ran.out
         assert not (folder / "bootstrap").exists()
         root = folder / "demandops.yaml"
         root.write_text(
@@ -246,7 +246,7 @@ class TestRequest:
             "standard input: request 1 'two' refused\n"
             "  line 21: apps[0].header.node_id: 'egde' is not in inventory/nodes.yaml; did you "
             "mean 'edge'?\n"
-            "  not held: application 'other' for vehicle00\n"
+            "  listed, but not held by the requester: application 'other' for vehicle00\n"
         )
 
     def test_files_and_documents_are_taken_in_order(
@@ -634,7 +634,7 @@ class TestVerify:
         demandops("request", *EXPERIMENT, "--state-repo", state.path)
         ran = demandops("verify", f"{first}..main", "--state-repo", state.path)
         assert (ran.code, ran.err) == (0, "")
-        assert ran.out.splitlines()[-1] == "8 of 8 commits hold"
+        assert ran.out.splitlines()[-1] == "8 of 8 commits are verified"
         rows = demandops(
             "verify", f"{first}..main", "--state-repo", state.path, "--output", "json"
         ).json()
@@ -650,7 +650,7 @@ class TestVerify:
         assert ran.out.splitlines() == [
             f"{joined.tip[:10]} DIFFERS  Forged",
             f"    {path}",
-            "0 of 1 commits hold",
+            "0 of 1 commits are verified",
         ]
         (row,) = demandops("verify", "--state-repo", joined.path, "--output", "json").json()
         assert row == {

@@ -169,7 +169,7 @@ def test_an_override_that_a_hold_keeps_back_is_not_said_to_be_in_force(
         "calm": "not rendered yet",
         "more": "held back",
     }
-    waits = "warning: 1 generated file waits for a generator to write or remove: clusters/"
+    waits = "warning: a generator has yet to write or remove 1 generated file: clusters/"
     assert ran.err.startswith(waits)
     ran = demandops("why", FUSION, "--state-repo", fleet.path, "-o", "json")
     assert [Path(path).stem for path in ran.json()["not_rendered"]] == [FUSION]

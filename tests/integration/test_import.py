@@ -216,7 +216,8 @@ def test_nothing_held_is_an_error(migration: Migration) -> None:
     refused = migration.run("-", files="no such file", stdin="{}")
     assert (refused.code, refused.err) == (
         1,
-        "error: nothing to import: nobody holds anything in the given files\n",
+        "error: nothing to import: "
+        "the given files name no requester of an application or a connection\n",
     )
     assert "nothing to import: give FILE or --cluster" in migration.run(files="no such file").err
 

@@ -96,7 +96,7 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
     name = "overrides/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
     assert (code, errors) == (1, f"error: {FUSION}: {LOST}, and merge {name} as shown\n")
     assert out == (
-        f"\ninstead of editing {FUSION}, {name}:\n"
+        f"\ninstead of editing {FUSION}, write {name}:\n"
         "\n"
         "# yaml-language-server: $schema=../schemas/override.json\n"
         "apiVersion: demandops/v1\n"

@@ -284,7 +284,7 @@ class TestVerify:
         book("b")
         ran = demandops("verify", f"{first}..main", "--state-repo", state.path)
         assert ran.code == 0
-        assert ran.out.splitlines()[-2:] == ["2 of 2 commits hold", "1 of 2 are signed"]
+        assert ran.out.splitlines()[-2:] == ["2 of 2 commits are verified", "1 of 2 are signed"]
 
     def test_with_a_list_every_later_commit_must_be_signed(
         self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path

@@ -205,7 +205,7 @@ def test_a_dry_run_tells_all_and_writes_nothing(
         "  write  clusters/c-its/perception/edge/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
         "\n  write  demandops.yaml\n"
         "\n"
-        "before this, on the clusters:\n"
+        "before the upgrade, on the clusters:\n"
         "- c-its: suspend Flux, so that it does not prune the workloads\n"
         "      kubectl -n perception patch kustomization perception --type merge -p "
         '\'{"spec":{"suspend":true}}\'\n'
@@ -213,7 +213,7 @@ def test_a_dry_run_tells_all_and_writes_nothing(
         "kustomize.toolkit.fluxcd.io/name=perception -o name | xargs -r kubectl -n perception "
         'patch --type merge -p \'{"spec":{"suspend":true}}\'\n'
         "\n"
-        "after it, on the clusters:\n"
+        "after the upgrade, on the clusters:\n"
         "- c-its: make the cluster follow the repo again; wait until all Applications are Synced\n"
         "      git show main:bootstrap/c-its.yaml | kubectl apply -f -\n"
         "- c-its: delete Flux's objects; because Flux is suspended, no workload is removed\n"
@@ -248,10 +248,10 @@ def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
     os.close(ours)
     os.close(theirs)
     assert done.returncode == code
-    assert done.stdout.startswith("\nbefore this, on the clusters:\n- c-its: suspend Flux")
+    assert done.stdout.startswith("\nbefore the upgrade, on the clusters:\n- c-its: suspend Flux")
     assert (state.tip == before) is (code == 1)
     if code:
-        assert done.stderr == "error: nothing was changed; do this first, or give --yes\n"
+        assert done.stderr == "error: nothing was changed; do these steps first, or give --yes\n"
 
 
 def test_back_to_flux_argo_cds_finalizers_go_first(

@@ -94,7 +94,7 @@ class Story:
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)
-        for release, target in self.follower.at(commit).moment.targets:
+        for release, target in self.follower.at(commit).commit_state.targets:
             if target.by_helm:
                 fault = FAULT if release.name == FAILING and not mended else ""
                 self.api.service(NAMESPACE, release.name, fault, since)
@@ -130,7 +130,7 @@ def _denies(generator: Generator) -> bool:
 
 
 def _is_at(told: Story) -> bool:
-    return told.follower.newest.moment.commit == str(told.generator.snapshot.commit)
+    return told.follower.newest.commit_state.commit == str(told.generator.snapshot.commit)
 
 
 def _is_seen(told: Story) -> bool:

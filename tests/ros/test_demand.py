@@ -146,7 +146,9 @@ def test_a_service_runs_on_the_node_that_the_message_names(
 def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: DemandClient) -> None:
     answer = vehicle.put("healthy", connections=[link("healthy")], answer="healthy")
     assert (answer.outcome, answer.reached) == ("booked", "pushed")
-    assert answer.warnings == ("answered at pushed: this node has no access to the clusters",)
+    assert answer.warnings == (
+        "answered at pushed, not at healthy: this node has no access to the clusters",
+    )
 
 
 def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(

@@ -100,7 +100,7 @@ def time_data(moment: datetime | None) -> str | None:
 
 
 def time_text(time: str) -> str:
-    """Return a time of the JSON output as text for people, without fractions of a second."""
+    """Return text for people for a time from the JSON output, without fractions of a second."""
     return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
 
 
@@ -138,7 +138,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return the description and the place of a release (cluster, domain, node) as JSON data."""
+    """Return the description of a release and its cluster, access domain and node as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -165,7 +165,7 @@ def version_data(release: Release, ledger: Ledger) -> Json:
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    """Return an override as JSON data, with these effects; by default with all its effects."""
+    """Return an override as JSON data, with the effects that ``effects`` names; by default all."""
     names = override.effects() if effects is None else effects
     return {
         "name": override.name,
@@ -179,7 +179,10 @@ def override_data(override: Override, effects: Iterable[str] | None = None) -> J
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return the value of an effect as in the override's file; a patch keeps its null values."""
+    """Return the value of an effect as plain data, as the override's file has it.
+
+    A patch keeps its null values.
+    """
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value

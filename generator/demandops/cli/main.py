@@ -33,7 +33,7 @@ COMMANDS = {
     "detect": ("demandops_ros.detector", "Watch topics and demand by rules."),
     "diff": ("views", "Show the differences between two commits."),
     "get": ("views", "List demands, nodes, services, overrides and so on."),
-    "import": ("actions", "Book the reference's applications and connections."),
+    "import": ("actions", "Import bookings from the paper's application manager."),
     "init": ("repo", "Create a state repo."),
     "journal": ("repo", "List the accepted demands that are not published."),
     "log": ("views", "List the commits of the state repo, newest first."),
@@ -41,7 +41,7 @@ COMMANDS = {
     "override": ("actions", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
         "demandops_ros.parameter_sync",
-        "Keep a ROS node's parameters as a ConfigMap has them.",
+        "Keep a ROS node's parameters equal to those in a ConfigMap.",
     ),
     "reject": ("actions", "Turn a proposed demand down: delete its branch."),
     "request": ("actions", "Book demand requests from files."),
@@ -52,17 +52,17 @@ COMMANDS = {
     "status": ("views", "Show the state of each release on its cluster."),
     "suspend": ("actions", "Stop applications and connections without releasing them."),
     "upgrade": ("repo", "Render everything again, in one commit."),
-    "verify": ("repo", "Render the ledger of commits again and compare the bytes."),
+    "verify": ("repo", "Render commits again from their ledger and compare the bytes."),
     "version": ("repo", "Print the versions of the program and of its formats."),
     "watch": ("views", "Show releases, demands and the latest commits live."),
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Each command, by name: the folder of its module, and its short help."""
+"""Name of a command → the package of its module, and its short help."""
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that log or fill the screen. They show no progress of slow git operations."""
+"""The commands that log or fill the screen. They do not show the progress of git operations."""
 
 
 class ExitCode(IntEnum):

@@ -48,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""How a release or an entry of the bookkeeping changes → its mark in text."""
+"""The change of a release or of an entry of the bookkeeping → the sign before its name."""
 
 
 def terminal_width() -> int | None:
@@ -100,13 +100,11 @@ def warn_of(problems: Iterable[object]) -> None:
 def warn_of_not_rendered(paths: Collection[str]) -> None:
     """Warn about generated files that a generator has yet to write or remove."""
     if paths:
-        files = (
-            "1 generated file waits" if len(paths) == 1 else f"{len(paths)} generated files wait"
-        )
+        files = "1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"
         listed = ", ".join(sorted(paths)[:_MOST_LISTED]) + (
             ", …" if len(paths) > _MOST_LISTED else ""
         )
-        errors.print(f"warning: {files} for a generator to write or remove: {listed}")
+        errors.print(f"warning: a generator has yet to write or remove {files}: {listed}")
 
 
 at_option = click.option(
@@ -128,7 +126,7 @@ def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:
-    """Return lines for a release: its version, then each version that demands name.
+    """Return a line with a release's version, and a line for each version that is asked for.
 
     ``data`` has the form that :func:`demandops.cli.json_output.version_data` returns.
     """

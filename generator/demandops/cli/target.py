@@ -100,7 +100,7 @@ def hint_to_pull() -> list[str]:
 def _from_context(field: str) -> Callable[[], str | None]:
     """Return a function that returns the default of an option.
 
-    The default is the named field of the context that applies to the state repo, if there is one.
+    The default is the value of ``field`` in the context that applies to the state repo.
     """
 
     def default() -> str | None:

@@ -57,7 +57,7 @@ class ClusterWatch:
     def statuses(
         self, targets: Iterable[Target], commit: str, repository: StateRepository
     ) -> dict[str, ReleaseStatus]:
-        """Return release name → status; also start to watch the places of new releases."""
+        """Return release name → status, and start to watch the access domains of new releases."""
         wanted = list(targets)
         self._watch(target.domain for target in wanted)
         found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)
@@ -68,7 +68,7 @@ class ClusterWatch:
     def old_bootstraps(
         self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
     ) -> tuple[OldBootstrap, ...]:
-        """Return the clusters whose bootstrap file is not applied as it is now.
+        """Return the clusters that have not applied the current version of their bootstrap file.
 
         ``read`` returns the text of a file of the state repo.
         """

@@ -1,4 +1,4 @@
-"""Follows the state repo: the newest situation, any earlier one, and the history.
+"""Follows the state repo; provides its newest situation, earlier ones, and the newest commits.
 
 One thread fetches new commits and publishes each new situation. The threads that answer requests
 read the published situation.
@@ -25,7 +25,7 @@ from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write.proposal_branch import pending_proposals
 from demandops.web.cluster_watch import ClusterWatch
-from demandops.web.situation import Commit, HealthChange, Moment, Situation
+from demandops.web.situation import Commit, CommitState, HealthChange, Situation
 
 log = logging.getLogger("demandops")
 
@@ -39,7 +39,7 @@ _MOST_OF_TIME = 4
 
 So the follower uses little processor time. A pause lasts at most one second.
 """
-_MOST_MOMENTS = 8
+_MOST_COMMIT_STATES = 8
 
 
 class Follower:
@@ -70,13 +70,13 @@ class Follower:
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = runtime.event(), runtime.event()
         self._watch = ClusterWatch(clusters, self._wake.set, runtime)
-        self._moments: dict[str, Moment] = {}
+        self._commit_states: dict[str, CommitState] = {}
         self._loading = runtime.lock()
         self.version = 0
-        """The number of new situations so far."""
+        """How often the situation has changed since the start."""
         self.history: tuple[Commit, ...] = ()
         """The newest commits, at most ``MOST_COMMITS``, newest first."""
-        self._newest = self._situation_at(self._first_moment(progress))
+        self._newest = self._situation_at(self._first_commit_state(progress))
         self._thread = runtime.keep_running("page", self._run)
 
     @property
@@ -106,35 +106,38 @@ class Follower:
             return newest
         reader = self.reader()
         commit = reader.commit(revision)
-        if commit == newest.moment.commit:
+        if commit == newest.commit_state.commit:
             return newest
         with self._loading:  # load only one commit at a time, because loading may take seconds
-            moment = self._moments.pop(commit, None) or _moment(
+            commit_state = self._commit_states.pop(commit, None) or _commit_state(
                 reader, reader.last_valid_snapshot(commit)
             )
-            self._moments[commit] = moment
-            if len(self._moments) > _MOST_MOMENTS:
-                del self._moments[next(iter(self._moments))]
-        return Situation(moment, newest.now, is_newest=False)
+            self._commit_states[commit] = commit_state
+            if len(self._commit_states) > _MOST_COMMIT_STATES:
+                del self._commit_states[next(iter(self._commit_states))]
+        return Situation(commit_state, newest.now, is_newest=False)
 
-    def last_change(self, moment: Moment, path: str) -> LogEntry | None:
-        """Return the newest commit up to a moment that changed a file; None if there is none."""
-        if path not in moment.last_changes:
-            found = self.reader().log(moment.commit, path) if path else iter(())
-            moment.last_changes[path] = next(found, None)
-        return moment.last_changes[path]
+    def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
+        """Return the newest commit that changed a file, up to the commit of ``commit_state``.
 
-    def not_rendered(self, moment: Moment) -> frozenset[str]:
-        """Return the generated files that at a moment a generator has yet to write or remove.
+        Return None if no commit changed the file.
+        """
+        if path not in commit_state.last_changes:
+            found = self.reader().log(commit_state.commit, path) if path else iter(())
+            commit_state.last_changes[path] = next(found, None)
+        return commit_state.last_changes[path]
+
+    def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
+        """Return the generated files that, as of a commit, a generator has yet to write or remove.
 
         Return an empty set if the state repo cannot be read.
         """
-        if moment.not_rendered is None:
+        if commit_state.not_rendered is None:
             try:
-                moment.not_rendered = self.reader().not_rendered(moment.snapshot)
+                commit_state.not_rendered = self.reader().not_rendered(commit_state.snapshot)
             except DemandOpsError:
                 return frozenset()
-        return moment.not_rendered
+        return commit_state.not_rendered
 
     def wake(self) -> None:
         """Check for a new commit now; any thread may call it."""
@@ -148,9 +151,9 @@ class Follower:
         self._watch.close()
         self._reader.close()
 
-    def _first_moment(self, progress: Progress) -> Moment:
+    def _first_commit_state(self, progress: Progress) -> CommitState:
         snapshot = self._reader.last_valid_snapshot(self._reader.commit(), progress)
-        return _moment(self._reader, snapshot)
+        return _commit_state(self._reader, snapshot)
 
     def _run(self) -> None:
         while not self.closed.is_set():
@@ -165,12 +168,12 @@ class Follower:
         """Read new commits and statuses; publish a new situation if something changed."""
         known = self._newest
         try:
-            commit, moment = self._reader.refresh(), known.moment
-            if commit != moment.commit:
-                snapshot = self._reader.snapshot_after(moment.snapshot)
-                moment = _moment(self._reader, snapshot)
-                moment.take_over(known.moment)
-            found = self._situation_at(moment)
+            commit, commit_state = self._reader.refresh(), known.commit_state
+            if commit != commit_state.commit:
+                snapshot = self._reader.snapshot_after(commit_state.snapshot)
+                commit_state = _commit_state(self._reader, snapshot)
+                commit_state.take_over(known.commit_state)
+            found = self._situation_at(commit_state)
         except DemandOpsError as error:
             found = replace(known, unread=one_line(str(error).replace("\n", "; ")))
         except Exception as error:  # must not stop the ROS node in the same process
@@ -181,21 +184,21 @@ class Follower:
             self._newest = found
             self.version += 1
 
-    def _situation_at(self, moment: Moment) -> Situation:
-        """Return the situation at a moment, with the newest statuses, proposals and history."""
-        self._read_history(moment.commit)
+    def _situation_at(self, commit_state: CommitState) -> Situation:
+        """Return the situation at the newest commit; read statuses, proposals and history."""
+        self._read_history(commit_state.commit)
         statuses: Mapping[str, ReleaseStatus] = {}
         old: tuple[OldBootstrap, ...] = ()
         left: tuple[Orphan, ...] = ()
         if self._watch.clusters:
-            wanted = [target for _, target in moment.targets]
+            wanted = [target for _, target in commit_state.targets]
             repository = self._reader.repository
-            statuses = self._watch.statuses(wanted, moment.commit, repository)
-            domains = rollout_targets.domains_of_state(moment.state)
-            old = self._watch.old_bootstraps(domains, self._reader.file_reader(moment.commit))
-            left = self._watch.orphans(domains, wanted, moment.commit, repository)
+            statuses = self._watch.statuses(wanted, commit_state.commit, repository)
+            domains = rollout_targets.domains_of_state(commit_state.state)
+            old = self._watch.old_bootstraps(domains, self._reader.file_reader(commit_state.commit))
+            left = self._watch.orphans(domains, wanted, commit_state.commit, repository)
         return Situation(
-            moment,
+            commit_state,
             self._runtime.now(),
             statuses=statuses,
             watched=self._watch.clusters,
@@ -219,6 +222,6 @@ class Follower:
         self.history = (added + before)[:MOST_COMMITS]
 
 
-def _moment(reader: Reader, snapshot: Snapshot) -> Moment:
+def _commit_state(reader: Reader, snapshot: Snapshot) -> CommitState:
     entry = next(reader.log(str(snapshot.commit)))
-    return Moment(snapshot, entry, reader.problems_of(snapshot))
+    return CommitState(snapshot, entry, reader.problems_of(snapshot))

@@ -32,7 +32,7 @@ from demandops.config.durations import relative
 from demandops.errors import DemandOpsError
 from demandops.quoting import escaped, lines
 from demandops.web.follower import Follower
-from demandops.web.view_pages import NAVIGATION, VIEWS, Asked, Data, View
+from demandops.web.view_pages import NAVIGATION, VIEWS, Data, View, ViewRequest
 from demandops.web.views import filtered_table
 
 log = logging.getLogger("demandops")
@@ -64,7 +64,7 @@ _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 _EARLIER_AT_ONCE = 4
-"""How many views of earlier moments are rendered at the same time.
+"""How many views of earlier commits are rendered at the same time.
 
 Such a view may take seconds. The limit keeps these views from delaying views of the present.
 """
@@ -129,7 +129,7 @@ class Site:
 
     def _render(self, view: View, request: Request) -> Response:
         try:
-            asked = Asked(self._follower, request)
+            asked = ViewRequest(self._follower, request)
             template, data = view(asked)
             return self._page(asked, template, data)
         except DemandOpsError as error:
@@ -139,13 +139,13 @@ class Site:
             text = "a fault of the program; see its log"
             return self._message(request, "This view does not work", text, 500)
 
-    def _page(self, asked: Asked, template: str, data: Data, status: int = 200) -> Response:
+    def _page(self, asked: ViewRequest, template: str, data: Data, status: int = 200) -> Response:
         common = {
             "navigation": NAVIGATION,
             "here": asked,
             "now": asked.situation.now,
             "situation": asked.situation,
-            "moment": asked.situation.moment,
+            "commit_state": asked.situation.commit_state,
             "exactly": filtered_table.exactly,
             "program": __version__,
             "has_docs": self._has_docs,
@@ -215,7 +215,7 @@ class _ClosedHeaders:
         await self._application(scope, receive, sending)
 
 
-# ---- what templates print ----
+# ---- filters of the templates ----
 
 
 def _visible(value: object) -> object:

@@ -1,7 +1,7 @@
-"""The moment and the situation, which the page shows.
+"""What the page shows: the state at a commit, the health of releases and the open proposals.
 
-A moment is the state at one commit. A situation is a moment with the reports of the clusters and
-the open proposals.
+A commit state is the state at one commit, with everything that the page derives from it. A
+situation is a commit state with the reports of the clusters and the open proposals.
 """
 
 from __future__ import annotations
@@ -42,37 +42,41 @@ _UNKNOWN = ReleaseStatus(Health("waiting"))
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A planned release, its place in a cluster, and the claims that need the release."""
+    """A planned release, and the claims that need it.
+
+    ``target`` names the object on the cluster whose health is the release's.
+    """
 
     release: Release
     target: Target
-    behind: list[Claim]
+    claims: list[Claim]
 
 
 @dataclass(frozen=True, slots=True)
-class KnownRows:
-    """The rows of a list that are already made, to be reused.
+class ReusableRows:
+    """The rows of a list, kept so that a later call need not make them again.
 
-    ``rows`` maps the id of a row to the parts from which the row was made, and the row.
-    ``made_for`` are the statuses that the rows show; None if the rows are of an earlier moment.
+    ``rows`` maps the id of an entry to the values of the entry, and the row made from them.
+    ``statuses`` are the statuses of releases for which all rows were made; None if the rows were
+    made for an earlier commit.
     """
 
-    made_for: object
+    statuses: object
     rows: Mapping[str, tuple[tuple[Any, ...], Any]]
 
 
-class Moment:
+class CommitState:
     """The state at one commit: what runs, and for whom.
 
-    Most parts are derived when they are first read, and then kept. :meth:`take_over` reuses the
-    parts of an earlier moment that are the same, so only what a new commit changes is derived.
+    Most attributes are computed at their first use, and then kept. :meth:`take_over` takes the
+    unchanged releases and rows from an earlier commit state, so a new commit costs what it changes.
     """
 
     def __init__(
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
-        self.rows: dict[str, KnownRows] = {}
+        self.rows: dict[str, ReusableRows] = {}
         """Name of a list → its rows, for the lists that were shown."""
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
@@ -101,8 +105,8 @@ class Moment:
         """Configuration and ledger without the claims that overrides suspend."""
         return without_suspended(self.state)
 
-    def take_over(self, before: Moment) -> None:
-        """Take the releases and rows of an earlier moment; derive only those that may differ.
+    def take_over(self, before: CommitState) -> None:
+        """Take the releases and rows of an earlier commit state; plan only those that may differ.
 
         Do nothing if the configuration or the overrides differ, because then everything may differ.
         """
@@ -111,24 +115,30 @@ class Moment:
             return
         subjects = _changed_subjects(old.ledger, new.ledger)
         changes = changes_on(old.ledger, new.ledger, subjects)
-        keys = {*affected_keys(old, new, changes), *_kept_differently(old.ledger, new.ledger)}
+        keys = {
+            *affected_keys(old, new, changes),
+            *_services_with_other_replicas(old.ledger, new.ledger),
+        }
         for one, other in ((change.before, change.after) for change in changes):
             # other requesters rarely change a file, so `affected_keys` omits these releases
             if one and other and (one.requesters, one.partial) != (other.requesters, other.partial):
                 keys.update(keys_of_claims(self.active, [other]))
-        known = before.planned | dict(self._for_other_claims(before, subjects))
+        known = before.planned | dict(self._with_other_claims(before, subjects))
         for key in keys:
             known.pop(key, None)
             planned = self._plan(key)
             if planned or denied_release(new, key):
                 known[key] = planned
         self._planned = known
-        self.rows = {name: replace(rows, made_for=None) for name, rows in before.rows.items()}
+        self.rows = {name: replace(rows, statuses=None) for name, rows in before.rows.items()}
 
-    def _for_other_claims(
-        self, before: Moment, subjects: Iterable[Subject]
+    def _with_other_claims(
+        self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield the releases of ``before`` that other claims on these subjects need now."""
+        """Yield each release of ``before`` whose claims on ``subjects`` changed.
+
+        The yielded values have the new claims.
+        """
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
@@ -139,14 +149,14 @@ class Moment:
         for key, one in before.planned.items():
             if one is None:
                 continue
-            kind, ids = _held_by(one.release)
+            kind, ids = _subjects_of(one.release)
             if fresh[kind].keys().isdisjoint(ids):
                 continue
-            kept = [claim for claim in one.behind if id(claim) not in gone]
+            kept = [claim for claim in one.claims if id(claim) not in gone]
             added = [claim for id in ids for claim in fresh[kind].get(id, ())]
             needing = [claim for claim in added if release_causes.needs(claim, one.release)]
-            if needing or len(kept) < len(one.behind):
-                yield key, replace(one, behind=release_causes.by_booking([*kept, *needing]))
+            if needing or len(kept) < len(one.claims):
+                yield key, replace(one, claims=release_causes.by_booking([*kept, *needing]))
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
         release = plan(self.state, key)
@@ -170,12 +180,12 @@ class Moment:
 
     @cached_property
     def targets(self) -> list[tuple[Release, Target]]:
-        """Every release with its place in a cluster, sorted by cluster and name."""
+        """Every planned release and its target, sorted by cluster and name."""
         return [(one.release, one.target) for one in self._sorted]
 
     @cached_property
     def denied(self) -> list[tuple[Release, Override]]:
-        """Each release that claims need but an override denies, with this override."""
+        """Each release that claims need but an override denies, and that override."""
         keys = (key for key, one in self.planned.items() if one is None)
         return [found for key in keys if (found := denied_release(self.state, key))]
 
@@ -185,7 +195,7 @@ class Moment:
         return {release.name: release for release, _ in self.targets}
 
     def override_entries(self, now: datetime) -> list[Entry]:
-        """Return the effect of each override.
+        """Return each override with its state and the releases and claims that it affects.
 
         Only the first call computes the result, so its ``now`` decides which overrides have
         expired.
@@ -195,15 +205,15 @@ class Moment:
         return self._entries
 
     @cached_property
-    def behind(self) -> dict[str, list[Claim]]:
+    def claims_of_releases(self) -> dict[str, list[Claim]]:
         """Name of a release → the claims that need it."""
-        return {one.target.name: one.behind for one in self._sorted}
+        return {one.target.name: one.claims for one in self._sorted}
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
         """Id of a demand → the names of the releases that it needs."""
         found: dict[str, list[str]] = {}
-        for name, claims in self.behind.items():
+        for name, claims in self.claims_of_releases.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
                 found.setdefault(demand, []).append(name)
         return found
@@ -220,8 +230,8 @@ class Moment:
         return found
 
 
-def _held_by(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
-    """Return the kind and the ids of the applications or connections that a release is for."""
+def _subjects_of(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
+    """Return the subjects that a release serves: their kind, and their ids."""
     if isinstance(release, ServiceRelease):
         return SubjectKind.APPLICATION, release.applications
     return SubjectKind.CONNECTION, release.connections
@@ -239,8 +249,8 @@ def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
     return [*dict.fromkeys(before.get(each) or after[each] for each in differing)]
 
 
-def _kept_differently(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services for which ``new`` keeps other replicas than ``old``."""
+def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
+    """Yield the services that must keep other numbers of replicas in ``new`` than in ``old``."""
     before, after = old.kept.steps, new.kept.steps
     for instance in {*before, *after}:
         if before.get(instance) != after.get(instance):
@@ -249,15 +259,15 @@ def _kept_differently(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """The state at a moment, with the health of releases and the open proposals.
+    """The state at a commit, with the health of releases and the open proposals.
 
-    ``statuses`` maps names of releases to their status; it is empty for an earlier moment.
+    ``statuses`` maps names of releases to their status; it is empty for an earlier commit.
     ``watched`` names the clusters that are watched. ``old_bootstraps`` lists the clusters without
     the current bootstrap file, ``orphans`` the objects on clusters that belong to no release.
     ``unread`` is the reason why a newer state cannot be read, or empty.
     """
 
-    moment: Moment
+    commit_state: CommitState
     now: datetime
     is_newest: bool = True
     statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)

@@ -27,7 +27,7 @@ from demandops.web.views.filtered_table import Filter, Link, Row
 from demandops.web.views.lists import LISTS, rows_of
 
 _KEPT = ("at", "q")
-"""The parameters of a request that links to other views keep: the moment and the filter."""
+"""The parameters that a link to another view keeps: the chosen commit or time, and the filter."""
 
 NAVIGATION = (
     ("", "Not ready"),
@@ -42,11 +42,11 @@ NAVIGATION = (
 _MOST_CAUSES = 100
 
 Data = dict[str, Any]
-View = Callable[["Asked"], tuple[str, Data]]
+View = Callable[["ViewRequest"], tuple[str, Data]]
 
 
-class Asked:
-    """A request for a view: its parameters, and the situation and the filter that these choose."""
+class ViewRequest:
+    """A request for a view: its parameters, and the situation and filter that they choose."""
 
     def __init__(self, follower: Follower, request: Request) -> None:
         self.follower = follower
@@ -65,7 +65,7 @@ class Asked:
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 
     def to(self, path: str | None = None, **changes: str | int) -> str:
-        """Return the address of a view that keeps the chosen moment and filter.
+        """Return the address of a view, with the chosen commit or time and the filter.
 
         Without ``path``, return the address of this view with all its parameters. ``changes`` are
         new values of parameters; an empty value removes the parameter.
@@ -76,41 +76,41 @@ class Asked:
         return f"/{self.path if path is None else path}{query}"
 
     def link(self, link: Link) -> str:
-        """Return the address of a link at the chosen moment.
+        """Return the address of a link, with the chosen commit or time.
 
         The address has the filter of the link, if any, instead of the current filter.
         """
         return self.to(link.path, **{"q": "", **link.params})
 
 
-def _not_ready(asked: Asked) -> tuple[str, Data]:
-    moment = asked.situation.moment
-    last_change = partial(asked.follower.last_change, moment)
-    pending = asked.follower.not_rendered(moment)
+def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
+    commit_state = asked.situation.commit_state
+    last_change = partial(asked.follower.last_change, commit_state)
+    pending = asked.follower.not_rendered(commit_state)
     causes = not_ready.causes(asked.situation, asked.filter, last_change, pending)
     applications = not_ready.applications(asked.situation, causes, asked.filter)
     data = {"causes": causes[:_MOST_CAUSES], "total": len(causes), "applications": applications}
     return "not_ready.html.j2", data
 
 
-def _map(asked: Asked) -> tuple[str, Data]:
+def _map(asked: ViewRequest) -> tuple[str, Data]:
     shown = fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))
     return "map.html.j2", {"map": shown}
 
 
-def _list(asked: Asked) -> tuple[str, Data]:
+def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind = LISTS[asked.path]
     found = rows_of(asked.situation, kind.name)
     shown = filtered_table.table(kind.columns, found, asked.filter, asked.get("sort"), asked.page())
     return "list.html.j2", {"kind": kind, "table": shown}
 
 
-def _demand(asked: Asked) -> tuple[str, Data]:
+def _demand(asked: ViewRequest) -> tuple[str, Data]:
     held = demand_view.explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))
     return "demand.html.j2", {"demand": held}
 
 
-def _release(asked: Asked) -> tuple[str, Data]:
+def _release(asked: ViewRequest) -> tuple[str, Data]:
     found = release_view.explained(asked.situation, asked.follower.reader(), asked.get("name"))
     return "release.html.j2", {"release": found}
 
@@ -118,14 +118,14 @@ def _release(asked: Asked) -> tuple[str, Data]:
 _EVENTS = 50
 
 
-def _timeline(asked: Asked) -> tuple[str, Data]:
+def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     now, lane = asked.situation, asked.get("lane")
     every = time_line.events(asked.follower.history, asked.follower.health_changes)
     found = time_line.matching(every, asked.filter, lane if lane in time_line.LANES else "")
-    chosen = None if now.is_newest else (now.moment.entry.time, now.moment.commit)
+    chosen = None if now.is_newest else (now.commit_state.entry.time, now.commit_state.commit)
     changed: list[str] = []
     if asked.get("at"):
-        reader, commit = asked.follower.reader(), now.moment.commit
+        reader, commit = asked.follower.reader(), now.commit_state.commit
         changed = reader.files_changed_by(commit)
     last = max(1, -(-len(found) // _EVENTS))
     page = min(max(asked.page(), 1), last)
@@ -143,11 +143,11 @@ def _timeline(asked: Asked) -> tuple[str, Data]:
     }
 
 
-def _overrides(asked: Asked) -> tuple[str, Data]:
+def _overrides(asked: ViewRequest) -> tuple[str, Data]:
     now, entries = asked.situation, []
-    pending = asked.follower.not_rendered(now.moment)
-    for found in now.moment.override_entries(now.now):
-        entry = replace(found, state=override_state(found, now.moment.state, pending))
+    pending = asked.follower.not_rendered(now.commit_state)
+    for found in now.commit_state.override_entries(now.now):
+        entry = replace(found, state=override_state(found, now.commit_state.state, pending))
         texts = {
             "owner": [entry.override.owner],
             "reason": [entry.override.reason],
@@ -163,7 +163,7 @@ def _overrides(asked: Asked) -> tuple[str, Data]:
     }
 
 
-def _rates(asked: Asked) -> tuple[str, Data]:
+def _rates(asked: ViewRequest) -> tuple[str, Data]:
     span = asked.get("span") if asked.get("span") in time_line.SPANS else "1d"
     health = asked.follower.health_changes
     commits = [

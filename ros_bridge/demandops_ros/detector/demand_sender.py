@@ -27,7 +27,7 @@ Log = Callable[[str, str], None]
 
 
 class DemandSender:
-    """Sends goals until the node has booked exactly what the events want."""
+    """Sends goals until exactly the demands of the current events are booked."""
 
     def __init__(
         self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
@@ -57,10 +57,10 @@ class DemandSender:
         self._requests.close()
 
     def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
-        """Record what events want from now on, and send the goals for it.
+        """Record the demands that events need from now on, and send the goals for them.
 
         Args:
-            wants: a want for each event that has changed.
+            wants: the wanted demand of each event that has changed.
             booked: the goals of events that were booked before the detector started.
         """
         with self._changed:

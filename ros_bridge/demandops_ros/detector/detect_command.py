@@ -26,7 +26,7 @@ from demandops.input_file import read_input
     "--plot",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Draw the replay as an SVG file: tracks, areas, and when each event lasted.",
+    help="Draw the replay as an SVG file: tracks, areas, and the time of each event.",
 )
 @output_option
 @click.pass_context
@@ -101,7 +101,7 @@ def _run(rules: str | None, ros_args: list[str]) -> None:
         node = DetectorNode(rules)
         thread = ros_process.ExecutorThread(node)
         wait_for_signal()
-        node.get_logger().info("stopping; what is demanded stays booked")
+        node.get_logger().info("stopping; the booked demands stay booked")
         thread.close()
         node.close()
         node.destroy_node()

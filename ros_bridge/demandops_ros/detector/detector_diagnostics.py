@@ -65,11 +65,12 @@ class DetectorDiagnostics:
 
     def _of_demands(self, detector: Detector, sender: DemandSender) -> DiagnosticStatus:
         _, unanswered, refusals = sender.summary()
-        level, text = DiagnosticStatus.OK, "all are answered"
+        level, text = DiagnosticStatus.OK, "every demand is answered"
         if unanswered:
-            text = f"{unanswered} are under way"
+            text = f"{unanswered} demands have no answer yet"
         if refusals:
-            level, text = DiagnosticStatus.WARN, f"{len(refusals)} failed and are tried again"
+            level = DiagnosticStatus.WARN
+            text = f"{len(refusals)} demands failed and are tried again"
         values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
         for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
             values[" ".join((rule, *subjects))] = why

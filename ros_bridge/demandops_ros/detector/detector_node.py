@@ -138,11 +138,11 @@ class DetectorNode(Node):  # type: ignore[misc]
         if self._is_started:
             return
         if self._now() == _UNHEARD_CLOCK:
-            missing = "no clock was heard yet, so nothing is demanded: use_sim_time is set, and "
-            missing += "who publishes /clock?"
+            missing = "no message on /clock yet, so nothing is demanded: use_sim_time is set; "
+            missing += "start a node that publishes /clock, or set use_sim_time to false"
         else:
-            missing = "no bookkeeping was heard yet, so nothing is demanded: is demandops serve "
-            missing += "running, and is bookkeeping_topic its topic?"
+            missing = "no bookkeeping yet, so nothing is demanded: start demandops serve, or set "
+            missing += "the parameter bookkeeping_topic to the topic of its bookkeeping"
         self.get_logger().warning(missing)
 
     # ---- periodic work ----

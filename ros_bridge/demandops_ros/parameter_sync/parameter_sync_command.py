@@ -33,17 +33,18 @@ Its `period` is not among them, because a watch does not poll."""
     envvar="KUBECONFIG",
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
     metavar="FILE",
-    help="How to reach the cluster; default: as the pod in it that this is [env: KUBECONFIG].",
+    help="How to reach the cluster; default: with the account of the pod that the command runs in "
+    "[env: KUBECONFIG].",
 )
 @click.pass_context
 def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
-    """Keep a ROS node's parameters as a ConfigMap has them.
+    """Keep a ROS node's parameters equal to those in a ConfigMap.
 
     It watches the ConfigMap, which holds a ROS parameter file, and sets the parameters of the
     running node when they change, or when the node starts again. Everything after --ros-args goes
-    to ROS. Parameters, as those of the reference's k8s_configmap_watcher: configmap_name,
-    namespace, ros_params_file_name (the key in the ConfigMap; params.yml), target_ros_node. Stop
-    it with Ctrl-C or SIGTERM.
+    to ROS. The ROS parameters are those of the reference's k8s_configmap_watcher: configmap_name,
+    namespace, ros_params_file_name (the key in the ConfigMap; default params.yml) and
+    target_ros_node. Stop it with Ctrl-C or SIGTERM.
 
     \b
     Examples:

@@ -51,7 +51,7 @@ class Shown:
     def look(self, path: str, status: int = 200, **params: str) -> Page:
         """Wait until the site has the newest commit, and return the page at a path."""
         wait_until(
-            lambda: self.follower.newest.moment.commit == str(self.generator.snapshot.commit),
+            lambda: self.follower.newest.commit_state.commit == str(self.generator.snapshot.commit),
             "the page has the newest commit",
         )
         answer = self.client.get(path, params=params)
@@ -105,4 +105,4 @@ def look(shown: Shown) -> Look:
 
 
 def causes(now: Situation, follower: Follower, text: str = "") -> list[not_ready.Cause]:
-    return not_ready.causes(now, Filter(text), partial(follower.last_change, now.moment))
+    return not_ready.causes(now, Filter(text), partial(follower.last_change, now.commit_state))

@@ -19,7 +19,7 @@ from demandops.staterepo.reader import Reader
 from demandops.web import view_pages
 from demandops.web.follower import Follower
 from demandops.web.site import Site
-from demandops.web.situation import Moment
+from demandops.web.situation import CommitState
 from demandops.web.views import fleet_map, map_layout
 from demandops.web.views.filtered_table import Filter
 from demandops.web.views.lists import LISTS, rows_of
@@ -54,7 +54,8 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     assert cause.remedy.command == "git rm overrides/roadworks.yaml"
     assert cause.requesters == ("station00", "vehicle01")
     assert (
-        cause.since == follower.last_change(follower.newest.moment, "overrides/roadworks.yaml").time
+        cause.since
+        == follower.last_change(follower.newest.commit_state, "overrides/roadworks.yaml").time
     )  # type: ignore[union-attr]
     assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
     assert "vehicle01/edge" not in look("/connections").text
@@ -239,7 +240,9 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
     for number, node in enumerate(nodes["nodes"]):
         node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
     person.change({path: yaml.safe_dump(nodes)})
-    wait_until(lambda: next(iter(follower.newest.moment.config.nodes.values())).position, "places")
+    wait_until(
+        lambda: next(iter(follower.newest.commit_state.config.nodes.values())).position, "places"
+    )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
     assert (drawn.layout, drawn.layouts) == ("place", ("cluster", "place"))
     for layout in drawn.layouts:
@@ -287,7 +290,7 @@ def test_what_is_taken_over_is_what_deriving_everything_gives(
     scaling = "{max: 4, per: {sources: 1}, dividesWork: true, downAfter: 1s}"
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Keep replicas")
-    wait_until(lambda: follower.newest.moment.config.files[appdef] == text, "the page has it")
+    wait_until(lambda: follower.newest.commit_state.config.files[appdef] == text, "the page has it")
     joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
     one_leaves = copy.deepcopy(joins[0]) | {"shutdown": True, "connections": []}
     one_leaves["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station00"]
@@ -302,9 +305,11 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
     for name in LISTS:
         look(f"/{name}")
     now = follower.newest
-    anew = replace(now, moment=Moment(now.moment.snapshot, now.moment.entry, ()))
-    assert now.moment.targets == anew.moment.targets
-    assert now.moment.behind == anew.moment.behind
+    anew = replace(
+        now, commit_state=CommitState(now.commit_state.snapshot, now.commit_state.entry, ())
+    )
+    assert now.commit_state.targets == anew.commit_state.targets
+    assert now.commit_state.claims_of_releases == anew.commit_state.claims_of_releases
     for name in LISTS:
         assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
 

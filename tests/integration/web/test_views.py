@@ -13,7 +13,7 @@ from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.ledger.waiting import WaitingDemand
 from demandops.web.follower import Follower
-from demandops.web.situation import Moment, Situation
+from demandops.web.situation import CommitState, Situation
 from demandops.web.views import fleet_map
 from demandops.web.views.filtered_table import Filter
 from demandops.web.views.lists import rows_of
@@ -46,7 +46,8 @@ def bare(still: Shown) -> Path:
 
 def with_health(follower: Follower, **named: Health) -> Situation:
     statuses = {
-        name: ReleaseStatus(Health("healthy"), "abc") for name in follower.newest.moment.releases
+        name: ReleaseStatus(Health("healthy"), "abc")
+        for name in follower.newest.commit_state.releases
     }
     for name, health in named.items():
         statuses[name.replace("_", "-")] = ReleaseStatus(health, "abc", "2026-05-04T12:00:00Z")
@@ -82,7 +83,7 @@ def test_a_failing_release_names_who_can_mend_it(follower: Follower, reason: str
 
 def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
     away = Health("waiting", "cannot be read: it is away", "cluster c-its")
-    names = [name.replace("-", "_") for name in follower.newest.moment.releases]
+    names = [name.replace("-", "_") for name in follower.newest.commit_state.releases]
     now = with_health(follower, **dict.fromkeys(names, away))
     (cause,) = causes(now, follower)
     assert cause.kind == "waiting" and len(cause.releases) == len(names)
@@ -93,7 +94,7 @@ def test_a_cluster_with_an_old_bootstrap_file_is_a_cause(follower: Follower) -> 
     old = OldBootstrap("c-its", "bootstrap/c-its.yaml", ("perception",), "git show …")
     (cause,) = causes(replace(follower.newest, old_bootstraps=(old,)), follower)
     assert cause.what.text == "bootstrap/c-its.yaml"
-    assert cause.why == "is not applied to cluster 'c-its' as it is now"
+    assert cause.why == "is not applied to cluster 'c-its' in its current version"
     assert cause.remedy.command == old.command
 
 
@@ -154,7 +155,9 @@ def test_a_moment_shows_the_books_of_then(look: Look, state: GitRepo) -> None:
 
 def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
     now = follower.newest
-    demand = next(one.demand for one in now.moment.state.ledger if "vehicle01" in one.requesters)
+    demand = next(
+        one.demand for one in now.commit_state.state.ledger if "vehicle01" in one.requesters
+    )
     lit = fleet_map.picture(now, Filter(f"demand={demand}"), "")
     assert {node.id for node in lit.nodes if node.is_lit} == {"edge", "station00", "vehicle01"}
     services = {one.name for node in lit.nodes for one in node.services if one.is_lit}
@@ -163,14 +166,16 @@ def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
 
 def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: Follower) -> None:
     newest = follower.newest
-    config = newest.moment.config
+    config = newest.commit_state.config
     model = next(iter(config.nodes.values()))
     far = {
         f"far{number}": model.model_copy(update={"id": f"far{number}"}) for number in range(1000)
     }
-    state = replace(newest.moment.state, config=replace(config, nodes={**config.nodes, **far}))
-    snapshot = replace(newest.moment.snapshot, state=state)
-    now = replace(newest, moment=Moment(snapshot, newest.moment.entry, ()))
+    state = replace(
+        newest.commit_state.state, config=replace(config, nodes={**config.nodes, **far})
+    )
+    snapshot = replace(newest.commit_state.snapshot, state=state)
+    now = replace(newest, commit_state=CommitState(snapshot, newest.commit_state.entry, ()))
     drawn = fleet_map.picture(now, Filter(""), "")
     assert (drawn.nodes, drawn.total) == ((), len(state.config.nodes))
     squares = sum(mass.path.count("M") for mass in drawn.many_nodes)
@@ -188,10 +193,10 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     newest = follower.newest
     since = newest.now - timedelta(minutes=5)
     waiting = WaitingDemand("later", "later", ("vehicle02",), since, 0, {})
-    ledger = replace(newest.moment.state.ledger, waiting=HashTrieMap({"later": waiting}))
-    state = replace(newest.moment.state, ledger=ledger)
-    snapshot = replace(newest.moment.snapshot, state=state)
-    now = replace(newest, moment=Moment(snapshot, newest.moment.entry, ()))
+    ledger = replace(newest.commit_state.state.ledger, waiting=HashTrieMap({"later": waiting}))
+    state = replace(newest.commit_state.state, ledger=ledger)
+    snapshot = replace(newest.commit_state.snapshot, state=state)
+    now = replace(newest, commit_state=CommitState(snapshot, newest.commit_state.entry, ()))
     (cause,) = causes(now, follower, "vehicle02")
     assert (cause.kind, cause.what.text, cause.since) == ("waiting", "later", since)
     assert cause.why == "waits for room on a node"

@@ -1,1 +1,1 @@
-"""Commands that change the ledger: request, import, decommission, rollback."""
+"""Commands that write to the state repo: bookings, approvals and overrides."""

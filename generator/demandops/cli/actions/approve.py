@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from demandops.cli.actions.person_change import (
-    confirmed,
-    known,
+    confirm,
     reason_option,
+    warned_if_unnamed,
     writable,
     yes_option,
 )
@@ -48,7 +48,7 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print a proposal, so that a person can decide about it."""
+    """Print the branch, summary, requesters and time of a proposal, but only for text output."""
     if output == "text":
         errors.print(f"{proposal.branch}: {proposal.summary}")
         errors.print(
@@ -73,8 +73,8 @@ def approve(
 ) -> None:
     """Approve a proposed demand: merge its branch in your own name.
 
-    The generator then answers the demand and removes the branch. If main changed the same files
-    since, the generator first makes the proposal anew.
+    The generator then answers the demand and removes the branch. If the same files changed
+    on main since the proposal was made, the generator first makes the proposal anew.
 
     \b
     Examples:
@@ -84,10 +84,10 @@ def approve(
     with writable(state_repo, signing_key) as repo:
         proposal = proposal_named(repo, name)
         print_proposal(proposal, output)
-        confirmed("Approve it?", yes, output)
+        confirm("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         why = " ".join((reason or "").split())
-        author = Author(known(repo.operator()), REAL.now(), summary, why)
+        author = Author(warned_if_unnamed(repo.operator()), REAL.now(), summary, why)
         made = person_commit.merge(repo.repository, proposal, author)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": made.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {made.commit}"])

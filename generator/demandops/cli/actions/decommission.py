@@ -15,10 +15,10 @@ from demandops.cli.actions.ledger_change import (
     started_generator,
 )
 from demandops.cli.actions.person_change import (
-    confirmed,
+    confirm,
     is_asked,
-    known,
     reason_option,
+    warned_if_unnamed,
     yes_option,
 )
 from demandops.cli.json_output import claim_data, output_option, show
@@ -63,7 +63,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
 ) -> None:
     """Release all claims of a node or a requester.
 
-    A node loses its applications, the inputs from it and the connections that end at it, for every
+    A node loses its applications, the inputs from it and the connections from and to it, for every
     requester; then you can delete it from the inventory. A requester loses all its claims, also
     the claims that it shares with other requesters. If NAME is both a node and a requester, both
     are decommissioned. At a terminal, the command shows the consequences first and asks.
@@ -84,7 +84,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
         show(output, row, _lines(row, True))
         if dry_run or row["outcome"] == "unchanged":
             return
-        confirmed("Continue?", yes, output)
+        confirm("Continue?", yes, output)
     row = _book(goal, by, state_repo, signing_key) or _row(goal, "unchanged", None, ())
     show(output, row, _lines(row, False))
 
@@ -94,17 +94,18 @@ def _book(
 ) -> dict[str, Any] | None:
     """Book the decommissioning; return the command's result as JSON data.
 
-    Return None, which is no error, if the inventory has the node but no claim concerns it.
+    Return None if no claim concerns the node but the inventory has it; that is no error.
     """
     with started_generator(state_repo, signing_key) as generator:
-        known(by)
+        warned_if_unnamed(by)
         try:
             ticket = generator.submit(goal)
             with busy("booking"):
                 await_answer(ticket.future)
             receipt = ticket.future.result()
         except Refused as error:
-            _require_nothing_held(error, goal, generator.snapshot)
+            if not _is_unclaimed_node(error, goal, generator.snapshot):
+                raise
             return None
     return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
 
@@ -115,18 +116,18 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
         try:
             decision = decide(snapshot.state, goal, REAL.now(), repo.file_reader())
         except Refused as error:
-            _require_nothing_held(error, goal, snapshot)
+            if not _is_unclaimed_node(error, goal, snapshot):
+                raise
             return None
     if output == "text":
         print_consequences(decision)
     return _row(goal, decision.outcome, None, decision.changes.claims)
 
 
-def _require_nothing_held(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> None:
-    """Raise the error, unless it reports that a node of the inventory holds nothing."""
+def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
+    """Return whether the only fault is that no claim concerns a node of the inventory."""
     codes = {each.code for each in error.faults}
-    if codes != {"not-held"} or goal["name"] not in snapshot.state.config.nodes:
-        raise error
+    return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 
 
 def _row(

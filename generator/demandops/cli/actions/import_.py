@@ -1,4 +1,4 @@
-"""``demandops import``: book what the reference manages as ordinary demands.
+"""``demandops import``: book the reference's applications and connections as ordinary demands.
 
 The reference is the application manager of the paper (docs/reference.md).
 """
@@ -41,8 +41,8 @@ from demandops.staterepo import reader
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Which application or connection each resource is. If the file does not exist, a proposal "
-    "is written to it, and nothing is booked.",
+    help="The map from the reference's names to applications and connections. If the file does not "
+    "exist, the command writes a proposal of it and books nothing.",
 )
 @dry_run_option
 @click.option(
@@ -69,9 +69,9 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Book the reference's applications and connections.
+    """Import bookings from the paper's application manager.
 
-    The reference is the application manager of the paper. FILE is a bookkeeping or versioning file
+    The options and docs call this manager the reference. FILE is a bookkeeping or versioning file
     of one of the reference's operators, or the reference's custom resources, printed by
     `kubectl get -o yaml`. Write - for standard input. docs/migration.md explains each step.
     Importing the same files again books nothing more.
@@ -91,7 +91,9 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     for warning in warnings:
         errors.print(f"warning: {warning}")
     if not joins:
-        message = "nothing to import: nobody holds anything in the given files"
+        message = (
+            "nothing to import: the given files name no requester of an application or a connection"
+        )
         raise InvalidInput([fault("", message)])
     if not map_file.exists():
         _propose(joins, found, map_file, state_repo, output)
@@ -110,7 +112,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return the reference's custom resources in a cluster: a list of one (origin, data) pair."""
+    """Return one (origin, data) pair, in a list: the reference's custom resources in a cluster."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

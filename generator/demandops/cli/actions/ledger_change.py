@@ -61,7 +61,7 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
 
 
 def print_consequences(decision: Decision) -> None:
-    """Print the releases that a decision changes and the files that it writes or removes."""
+    """Print the releases that a decision changes, and the files that it writes or removes."""
     out = console()
     for line in release_lines(decision.releases):
         out.print(f"  {line}", soft_wrap=True)

@@ -1,4 +1,4 @@
-"""``demandops override``: declare or end a deviation, by a commit in the caller's own name."""
+"""``demandops override``: create or end an override, by a commit in the caller's own name."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import click
 from demandops import strict_yaml
 from demandops.cli.actions.person_change import (
     Edit,
-    Way,
+    EditOptions,
     carry_out,
-    confirmed,
+    confirm,
     consequence,
     consequence_lines,
     editing,
@@ -50,7 +50,7 @@ def override() -> None:
 
 
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    """Return the name; raise BadParameter if the name is not valid for an override."""
+    """Return ``name``; raise BadParameter if an override cannot have it."""
     if not is_override_name(name):
         raise click.BadParameter(
             f"{quoted(name)} cannot name an override; use lower-case letters, digits and '-'"
@@ -61,7 +61,7 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @override.command()
 @click.argument("name", metavar="NAME", callback=_new_name)
 @selecting
-@click.option("--hold", is_flag=True, help="Keep the files as they are.")
+@click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
 @click.option("--keep", is_flag=True, help="Keep services running without a demand.")
 @click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the replicas.")
@@ -70,7 +70,9 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @click.option(
     "--values", "values_file", metavar="FILE", help="Patch Helm values with this YAML file."
 )
-@click.option("--priority", type=int, metavar="N", help="The higher one wins. Default: 0.")
+@click.option(
+    "--priority", type=int, metavar="N", help="If several match, the highest wins. Default: 0."
+)
 @click.option(
     "--expires", metavar="TIME", help="When it ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z."
 )
@@ -88,7 +90,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
     priority: int | None,
     expires: str | None,
     owner: str | None,
-    way: Way,
+    options: EditOptions,
     **selected: tuple[str, ...],
 ) -> None:
     """Create an override.
@@ -112,32 +114,32 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
         "keep": keep or None,
     }
     more = {"owner": owner, "priority": priority, "expires": ends_at(expires)}
-    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
-        text = new_override(repo, name, way, selected, {**more, **effects})
-        create_override(repo, Edit(name, text, f"Create override {name}", way.reason), way)
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        text = new_override(repo, name, options, selected, {**more, **effects})
+        create_override(repo, Edit(name, text, f"Create override {name}", options.reason), options)
 
 
 @override.command()
 @click.argument("name", metavar="NAME", shell_complete=names_of("overrides"))
 @editing
-def end(name: str, way: Way) -> None:
+def end(name: str, options: EditOptions) -> None:
     """End an override: remove its file.
 
-    The releases that the override changed return to what the demands ask for.
+    The releases that the override changed are rendered again without it.
 
     \b
     Examples:
       demandops override end calm -m "The demonstration is over"
       demandops override end calm --dry-run
     """
-    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
-        end_override(repo, Edit(name, None, f"End override {name}", way.reason), way)
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        end_override(repo, Edit(name, None, f"End override {name}", options.reason), options)
 
 
 def new_override(
     repo: Reader,
     name: str,
-    way: Way,
+    options: EditOptions,
     selected: dict[str, tuple[str, ...]],
     more: dict[str, Any],
 ) -> str:
@@ -146,17 +148,17 @@ def new_override(
     Args:
         repo: the open state repo.
         name: the name of the override.
-        way: the options of the command; the override takes the reason from them.
+        options: the options of the command; the override takes the reason from them.
         selected: the values of the options that select releases and claims.
         more: the effects and the other fields of the override; None leaves a field out.
     """
-    if not way.reason:
+    if not options.reason:
         raise click.UsageError("give the reason: -m TEXT")
     chosen = selector(selected)
     if not chosen:
         raise click.UsageError("select what it applies to, for example --node edge")
     fields = {
-        "reason": way.reason,
+        "reason": options.reason,
         **more,
         "owner": more.get("owner") or _owner(repo),
         "select": [chosen],
@@ -165,34 +167,34 @@ def new_override(
     return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
 
 
-def create_override(repo: Reader, edit: Edit, way: Way) -> None:
-    """Show what a new override does, ask for confirmation, and commit the override."""
+def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
+    """Show the effect of a new override, ask for confirmation, and commit the override."""
     if repo.file_reader()(edit.path) is not None:
         message = "exists already; end it first, or choose another name"
         raise InvalidInput.at("", message, file=edit.path)
     entry = consequence(repo, edit)
     warn_of_idle(entry)
-    _carry_out(repo, edit, entry, way)
+    _carry_out(repo, edit, entry, options)
 
 
-def end_override(repo: Reader, edit: Edit, way: Way) -> None:
-    """Show what the end of an override changes, ask for confirmation, and commit the removal."""
+def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
+    """Show the effect of ending an override, ask for confirmation, and commit the removal."""
     known = repo.last_valid_snapshot(repo.commit()).state.config.overrides
     if edit.name not in known:
         message = f"there is no override '{edit.name}'{suggestion(edit.name, known)}"
         raise InvalidInput.at("", message)
-    _carry_out(repo, edit, consequence(repo, edit), way)
+    _carry_out(repo, edit, consequence(repo, edit), options)
 
 
-def _carry_out(repo: Reader, edit: Edit, entry: Entry, way: Way) -> None:
-    if way.output == "text":
+def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> None:
+    if options.output == "text":
         errors.print(f"{edit.summary} ({edit.path})")
         for line in consequence_lines(edit, entry):
             errors.print(line)
-    if not way.dry_run:
-        confirmed("Continue?", way.yes, way.output)
-    made = None if way.dry_run else carry_out(repo, edit, way.propose)
-    print_edit(edit, entry, made, way.output)
+    if not options.dry_run:
+        confirm("Continue?", options.yes, options.output)
+    made = None if options.dry_run else carry_out(repo, edit, options.propose)
+    print_edit(edit, entry, made, options.output)
 
 
 def _values(file: str | None) -> dict[str, Any] | None:

@@ -63,8 +63,8 @@ def is_asked(yes: bool, output: str) -> bool:
     return not yes and output == "text" and sys.stdin.isatty()
 
 
-def confirmed(question: str, yes: bool, output: str) -> None:
-    """Ask the question if :func:`is_asked` returns true.
+def confirm(question: str, yes: bool, output: str) -> None:
+    """Ask the question, but only if :func:`is_asked` returns true.
 
     Raises:
         click.ClickException: the answer was no.
@@ -73,7 +73,7 @@ def confirmed(question: str, yes: bool, output: str) -> None:
         raise click.ClickException("nothing was changed")
 
 
-def known(person: Person) -> Person:
+def warned_if_unnamed(person: Person) -> Person:
     """Return ``person`` unchanged; warn if git's configuration does not name the person."""
     if not person.is_known:
         errors.print(
@@ -98,8 +98,8 @@ def writable(
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """The options that all commands for a person's edit share: state repo, reason and others."""
+class EditOptions:
+    """The values of the options common to all commands that create or end an override."""
 
     state_repo: str
     signing_key: Path | None
@@ -111,16 +111,18 @@ class Way:
 
 
 def editing(command: Command) -> Command:
-    """Return the command with the options of :class:`Way` added.
+    """Return the command with the options of :class:`EditOptions` added.
 
-    The command gets their values as one argument, ``way``.
+    The command gets their values as one argument, ``options``.
     """
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
         given["reason"] = " ".join((given["reason"] or "").split())
-        way = Way(**{field.name: given.pop(field.name) for field in fields(Way)})
-        return command(way=way, **given)
+        options = EditOptions(
+            **{field.name: given.pop(field.name) for field in fields(EditOptions)}
+        )
+        return command(options=options, **given)
 
     options = (
         reason_option,
@@ -156,7 +158,9 @@ class Edit:
 
 
 def consequence(repo: Reader, edit: Edit) -> Entry:
-    """Return what a new override will affect, or what the override to remove affects now.
+    """Return the override of an edit with the releases and claims that it affects.
+
+    For a new override, these are the releases and claims that it would affect now.
 
     Raises:
         InvalidInput: the new file is not valid.
@@ -178,7 +182,9 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     With ``propose``, the commit goes to a branch with a merge request, otherwise to main.
     """
     files = {edit.path: edit.text}
-    author = Author(known(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason))
+    author = Author(
+        warned_if_unnamed(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason)
+    )
     if not propose:
         return person_commit.commit_to_main(repo.repository, lambda _: files, author)
     branch = f"override/{edit.name}"
@@ -222,7 +228,7 @@ def _opened(repo: Reader, edit: Edit, branch: str) -> str:
 def print_edit(edit: Edit, entry: Entry, made: Published | None, output: str) -> None:
     """Print the outcome of the edit, and the releases and claims that the override applies to.
 
-    ``made`` is what was published; None if the edit is only shown.
+    ``made`` is the published commit; None if nothing was published.
     """
     data: Json = {
         "outcome": _outcome(made),
@@ -247,7 +253,7 @@ def _outcome(made: Published | None) -> str:
 def _lines(edit: Edit, data: Json) -> Iterator[str]:
     if data["outcome"] == "committed":
         yield f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}"
-        yield "a running generator carries it out; so does the next one that starts"
+        yield "a running generator carries it out, or else the next one that starts"
         yield from hint_to_pull()
     elif data["outcome"] == "proposed":
         yield f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()
@@ -259,7 +265,7 @@ def _lines(edit: Edit, data: Json) -> Iterator[str]:
 def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     """Return one line for each release and claim that the override affects.
 
-    If the edit removes the override, the lines name what it no longer affects.
+    If the edit removes the override, the lines say that it no longer affects them.
     """
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from demandops.cli.actions.approve import print_proposal, proposal_named
-from demandops.cli.actions.person_change import confirmed, writable, yes_option
+from demandops.cli.actions.person_change import confirm, writable, yes_option
 from demandops.cli.json_output import output_option, show
 from demandops.cli.name_completion import names_of
 from demandops.cli.target import writable_repo_option
@@ -31,7 +31,7 @@ def reject(name: str, yes: bool, state_repo: str, output: str) -> None:
     with writable(state_repo, None) as repo:
         proposal = proposal_named(repo, name)
         print_proposal(proposal, output)
-        confirmed("Turn it down?", yes, output)
+        confirm("Turn it down?", yes, output)
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}
     show(output, data, [f"turned down: {proposal.branch} is deleted"])

@@ -56,19 +56,21 @@ class Document:
 
 
 class _Answer(Future["Receipt | dict[str, str]"]):
-    """The future answer to a request: its receipt, or the proposal that awaits approval."""
+    """A future for the answer to a request: the receipt, or the proposal that awaits approval."""
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE…")
 @writable_repo_option
 @dry_run_option
-@click.option("--release", is_flag=True, help="Release what the documents demand, instead.")
+@click.option(
+    "--release", is_flag=True, help="Release the demands of the documents instead of booking them."
+)
 @click.option(
     "--wait",
     is_flag=True,
     help="Wait until demands that need approval are decided. Otherwise they are proposed, and "
-    "the next generator that starts on this machine follows them up.",
+    "the next generator that starts on this machine completes them after the decision.",
 )
 @signing_option
 @output_option
@@ -244,7 +246,7 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
 
 
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
-    """Submit a request; return the future answer.
+    """Submit a request; return a future for its answer.
 
     Without ``wait``, a proposal that awaits approval is an answer too.
     """
@@ -337,7 +339,7 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
         for warning in (*_unit_warnings(document.goal), *row["warnings"]):
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:
-            errors.print(f"  not held: {item}")
+            errors.print(f"  listed, but not held by the requester: {item}")
     if not dry_run and any(row["outcome"] in ("booked", "released") for row in rows):
         for line in hint_to_pull():
             errors.print(line)

@@ -5,7 +5,14 @@ from __future__ import annotations
 import click
 
 from demandops.cli.actions.override import end_override
-from demandops.cli.actions.person_change import Edit, Way, editing, selecting, selector, writable
+from demandops.cli.actions.person_change import (
+    Edit,
+    EditOptions,
+    editing,
+    selecting,
+    selector,
+    writable,
+)
 from demandops.cli.actions.suspend import described, name_of
 from demandops.cli.name_completion import names_of
 
@@ -14,7 +21,7 @@ from demandops.cli.name_completion import names_of
 @click.argument("name", required=False, metavar="[NAME]", shell_complete=names_of("overrides"))
 @selecting
 @editing
-def resume(name: str | None, way: Way, **selected: tuple[str, ...]) -> None:
+def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Run suspended applications and connections again.
 
     Give the same options as for `demandops suspend`, or NAME, the override's name.
@@ -27,5 +34,5 @@ def resume(name: str | None, way: Way, **selected: tuple[str, ...]) -> None:
     if bool(name) == bool(selector(selected)):
         raise click.UsageError("give the options that suspended it, or the override's name")
     summary = f"Resume {name or described(selected)}"
-    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
-        end_override(repo, Edit(name or name_of(selected), None, summary, way.reason), way)
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        end_override(repo, Edit(name or name_of(selected), None, summary, options.reason), options)

@@ -16,10 +16,10 @@ from demandops.cli.actions.ledger_change import (
     started_generator,
 )
 from demandops.cli.actions.person_change import (
-    confirmed,
+    confirm,
     is_asked,
-    known,
     reason_option,
+    warned_if_unnamed,
     yes_option,
 )
 from demandops.cli.json_output import claim_data, faults_of, output_option, show
@@ -78,7 +78,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
-        who = repo.operator() if dry_run else known(repo.operator())
+        who = repo.operator() if dry_run else warned_if_unnamed(repo.operator())
         goal = rollback_goal.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
         result: dict[str, Any] = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
@@ -90,7 +90,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     if not dry_run and not result["faults"]:
         if is_asked(yes, output) and result["outcome"] != "unchanged":
             show(output, None, _lines(result, True))
-            confirmed("Continue?", yes, output)
+            confirm("Continue?", yes, output)
         result |= _roll_back(state_repo, goal, signing_key, base)
     if result["faults"] and output == "text":
         print_refusal(f"the rollback to {to[:10]} is refused:", result["faults"])
@@ -124,8 +124,9 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    ``base`` is the commit for which the caller knows the consequences. The result contains them
-    only if they differ: the rollback was refused, changed nothing, or is based on a newer commit.
+    ``base`` is the commit for which the caller has computed the consequences. The result has
+    consequences only if others apply: the rollback was refused, changed nothing, or is based on a
+    newer commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:
@@ -159,5 +160,5 @@ def _lines(result: dict[str, Any], dry_run: bool) -> Iterator[str]:
     releases = (ReleaseChange(**each) for each in result["releases"])
     yield from (f"  {line}" for line in release_lines(releases, "release "))
     if result["configuration_since"]:
-        yield f"a rollback does not change configuration; changed since {to}:"
+        yield f"a rollback does not change the configuration; these files differ from {to}:"
         yield from (f"  {path}" for path in result["configuration_since"])

@@ -1,4 +1,4 @@
-"""``demandops suspend``: stop claims without releasing them, by an override that denies them."""
+"""``demandops suspend``: stop applications and connections by an override that denies them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,20 @@ import re
 import click
 
 from demandops.cli.actions.override import create_override, ends_at, new_override
-from demandops.cli.actions.person_change import Edit, Way, editing, selecting, selector, writable
+from demandops.cli.actions.person_change import (
+    Edit,
+    EditOptions,
+    editing,
+    selecting,
+    selector,
+    writable,
+)
 
 _LONGEST = 40
 
 
 def name_of(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return the name of the override that suspends a selection. Equal selections share a name."""
+    """Return the name of the override that suspends a selection; equal selections get one name."""
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
     slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:_LONGEST].rstrip("-")
@@ -30,7 +37,7 @@ def name_of(selected: dict[str, tuple[str, ...]]) -> str:
 @editing
 def suspend(
     expires: str | None,
-    way: Way,
+    options: EditOptions,
     **selected: tuple[str, ...],
 ) -> None:
     """Stop applications and connections without releasing them.
@@ -45,10 +52,12 @@ def suspend(
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
     effect = {"expires": ends_at(expires), "deny": True}
-    with writable(way.state_repo, way.signing_key, dry_run=way.dry_run) as repo:
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
         name = name_of(selected)
-        text = new_override(repo, name, way, selected, effect)
-        create_override(repo, Edit(name, text, f"Suspend {described(selected)}", way.reason), way)
+        text = new_override(repo, name, options, selected, effect)
+        create_override(
+            repo, Edit(name, text, f"Suspend {described(selected)}", options.reason), options
+        )
 
 
 def described(selected: dict[str, tuple[str, ...]]) -> str:

@@ -1,1 +1,1 @@
-"""Commands for a state repo as a whole: init, check, journal, schema, upgrade, verify."""
+"""Commands for a state repo as a whole, for its files, and for the program itself."""

@@ -104,7 +104,7 @@ def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return path → diff, up to ``most`` lines in all, and the number of omitted lines."""
+    """Return path → diff, at most ``most`` lines in all, and the number of lines left out."""
     shown: dict[str, str] = {}
     left = 0
     for file in files:
@@ -133,7 +133,7 @@ def _print(directory: Path, checked: CheckResult) -> None:
 
 def _lines(checked: CheckResult) -> Iterator[str]:
     for each in checked.suggestions:
-        yield f"\ninstead of editing {each.instead_of}, {each.file}:\n"
+        yield f"\ninstead of editing {each.instead_of}, write {each.file}:\n"
         yield from each.text.splitlines()
         if each.other_releases:
             yield f"\n(it also applies to {', '.join(each.other_releases)})"
@@ -149,7 +149,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
         since = f" since {checked.base[:10]}" if checked.base else ""
         yield f"\nwhat merging would do{since}:"
     if checked.base and not checked.base_valid:
-        yield "(its own files are not valid; compared with its last valid files)"
+        yield f"({checked.base[:10]} has invalid files, so their last valid versions are compared)"
     if consequence.releases:
         yield "\ndesired state:"
         yield from (f"  {line}" for line in release_lines(consequence.releases))

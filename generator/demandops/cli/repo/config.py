@@ -75,7 +75,7 @@ def set_context(
 ) -> None:
     """Add or change a context; the first one becomes the current one.
 
-    What is not given stays as it is. Paths become absolute.
+    Options that you leave out keep their values. Paths become absolute.
 
     \b
     Examples:

@@ -60,9 +60,9 @@ def init(
 ) -> None:
     """Create a state repo.
 
-    Its first commit has the skeleton, and the fleet and application of the example. To make a
-    cluster follow the state repo, install Flux or Argo CD there (docs/flux.md, docs/argocd.md) and
-    run:
+    Its first commit has the files that people edit, with the fleet and application of the example.
+    To make a cluster follow the state repo, install Flux or Argo CD there (docs/flux.md,
+    docs/argocd.md) and run:
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
 
@@ -90,9 +90,7 @@ def init(
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
-        lines.append(
-            "no cluster can follow it yet: write the url that clusters fetch to demandops.yaml"
-        )
+        lines.append("no cluster can follow it yet: set the url for the clusters in demandops.yaml")
     else:
         cluster = "c-its" if example == "experiment" else "CLUSTER"
         lines.append(

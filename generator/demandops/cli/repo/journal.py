@@ -28,10 +28,10 @@ from demandops.staterepo.write.slot import FoundJournal, find_journals
 def journal(state_repo: str, set_aside: bool, output: str) -> None:
     """List the accepted demands that are not published.
 
-    A generator on this machine accepted them, and the next one carries them out. A generator does
-    not start if a journal is damaged, because demands may be missing in it. Then use --set-aside,
-    and send again those of the listed demands that are still needed: --output json prints their
-    goals.
+    A generator on this machine accepted them, and the next one that starts here carries them out. A
+    generator does not start if a journal is damaged, because demands may be missing in it. Then use
+    --set-aside, and send again those of the listed demands that are still needed: --output json
+    prints their goals.
 
     \b
     Examples:

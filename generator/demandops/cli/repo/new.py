@@ -112,7 +112,7 @@ def application(  # noqa: PLR0913 - as many as options
         if domain := new_application.closed_domain(plan, config):
             then.insert(
                 0,
-                f"to let it be demanded: no rule of access domain '{domain.name}' allows it on "
+                f"to allow demands for it: no rule of access domain '{domain.name}' allows it on "
                 f"{plan.node}; widen one, such as '{domain.rules[0].name}', in "
                 f"{config.file_of(DOMAINS_FILE, domain.name)}",
             )
@@ -144,7 +144,9 @@ def node(id: str, type_: str, cluster: str, directory: Path, output: str) -> Non
 @new.command()
 @click.argument("name")
 @click.option("--namespace", default="", metavar="NAME", help="Default: the access domain's name.")
-@click.option("--node", "nodes", multiple=True, required=True, metavar="PATTERN", help="Its nodes.")
+@click.option(
+    "--node", "nodes", multiple=True, required=True, metavar="PATTERN", help="The ids of its nodes."
+)
 @click.option(
     "--requester",
     "requesters",
@@ -184,10 +186,14 @@ def policy(
 @click.argument("name")
 @click.option("-m", "--reason", required=True, metavar="TEXT", help="Why it is needed.")
 @click.option("--owner", required=True, metavar="NAME", help="Who is responsible for it.")
-@click.option("--service", "services", multiple=True, metavar="PATTERN", help="Selects services.")
-@click.option("--application", "apps", multiple=True, metavar="PATTERN", help="Selects by id.")
-@click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Selects by node.")
-@click.option("--hold", is_flag=True, help="Keep the files as they are.")
+@click.option(
+    "--service", "services", multiple=True, metavar="PATTERN", help="Select services by name."
+)
+@click.option(
+    "--application", "apps", multiple=True, metavar="PATTERN", help="Select applications by id."
+)
+@click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Select nodes by id.")
+@click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
 @click.option("--keep", is_flag=True, help="Keep services running without a demand.")
 @click.option("--replicas", type=click.IntRange(min=0), metavar="N", help="Set the replicas.")
@@ -236,10 +242,14 @@ def override(  # noqa: PLR0913 - as many as options
 @new.command()
 @click.argument("name")
 @click.option(
-    "--repository", required=True, metavar="HOST/PATH", help="Where the image is pushed to."
+    "--repository", required=True, metavar="HOST/PATH", help="The image's name with its registry."
 )
 @click.option(
-    "--state-repo", "url", required=True, metavar="URL", help="The state repo to propose it to."
+    "--state-repo",
+    "url",
+    required=True,
+    metavar="URL",
+    help="The state repo to which the image is proposed.",
 )
 @click.option(
     "--directory",

@@ -11,7 +11,7 @@ from demandops.settings import API_VERSION, data_folder
 _INHERITS = "inherits"
 _COMMON = {
     "apiVersion": ["Version of the format", API_VERSION],
-    "kind": ["What the file holds"],
+    "kind": ["Type of the file's content"],
 }
 
 

@@ -70,9 +70,11 @@ def upgrade(
         with _shown() as report:
             made = upgrading.plan(state_repo, request, now, report)
     if asks and not dry_run and made.handover.before:
-        show(output, None, _step_lines("before this, on the clusters:", made.handover.before))
+        show(
+            output, None, _step_lines("before the upgrade, on the clusters:", made.handover.before)
+        )
         if not click.confirm("Is this done?"):
-            raise click.ClickException("nothing was changed; do this first, or give --yes")
+            raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
         with _shown() as report:
             made = upgrading.upgrade(state_repo, request, now, report, signer)
@@ -81,7 +83,7 @@ def upgrade(
 
 @contextmanager
 def _shown() -> Iterator[Progress]:
-    """Yield a function that shows how much of the ledger is read, and later that files render."""
+    """Yield a function that shows the progress of reading the ledger, and then of rendering."""
     with busy("reading the state repo") as say:
 
         def report(done: int, total: int) -> None:
@@ -119,9 +121,11 @@ def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
         )
         return
     yield from _summary(made, dry_run)
-    title = "before this" if dry_run else "this had to be done before"
-    yield from _step_lines(f"{title}, on the clusters:", made.handover.before)
-    yield from _step_lines("after it, on the clusters:", made.handover.after)
+    before = "before the upgrade, on the clusters:"
+    if not dry_run:
+        before = "on the clusters, this had to be done before the upgrade:"
+    yield from _step_lines(before, made.handover.before)
+    yield from _step_lines("after the upgrade, on the clusters:", made.handover.after)
 
 
 def _summary(made: Upgrade, dry_run: bool) -> Iterator[str]:

@@ -26,7 +26,7 @@ from demandops.staterepo.audit.verification import Verdict
 )
 @output_option
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
-    """Render the ledger of commits again and compare the bytes.
+    """Render commits again from their ledger and compare the bytes.
 
     If the state repo has policy/allowed-signers, each later commit of the generator must have a
     good signature by a key in that file (docs/audit.md). REV, A and B are commits or times.
@@ -52,7 +52,7 @@ def _row(verdict: Verdict) -> dict[str, Any]:
 
 def _lines(verdicts: list[Verdict]) -> Iterator[str]:
     for verdict in verdicts:
-        word = "skipped" if verdict.skipped else "holds"
+        word = "skipped" if verdict.skipped else "verified"
         if not verdict.holds:
             differs = verdict.fault or verdict.differing or verdict.touched
             word = "DIFFERS" if differs else "UNSIGNED"
@@ -65,9 +65,9 @@ def _lines(verdicts: list[Verdict]) -> Iterator[str]:
         if verdict.signature:
             yield f"    it {verdict.signature}"
     skipped = sum(bool(verdict.skipped and verdict.holds) for verdict in verdicts)
-    hold = sum(verdict.holds for verdict in verdicts) - skipped
+    verified = sum(verdict.holds for verdict in verdicts) - skipped
     note = f", {skipped} skipped" if skipped else ""
-    yield f"{hold} of {len(verdicts)} commits hold{note}"
+    yield f"{verified} of {len(verdicts)} commits are verified{note}"
     signed = sum(verdict.signed for verdict in verdicts)
     if signed:
         good = sum(bool(verdict.signer) for verdict in verdicts)

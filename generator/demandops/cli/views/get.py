@@ -45,7 +45,7 @@ _COLORS = {
 
 
 def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
-    """Return the name of a kind in the plural; ``value`` may be the singular."""
+    """Return the kind that ``value`` names in the singular or plural, as a key of ``KINDS``."""
     if value is None:
         raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
     for name in (value, f"{value}s"):
@@ -71,7 +71,7 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
             f"--{name}",
             metavar="NAME",
             shell_complete=names_of(f"{name}s"),
-            help=f"Only what belongs to this {name}; * and ? stand for any text.",
+            help=f"Only items of this {name}; * and ? stand for any text.",
         )(command)
     return command
 
@@ -99,7 +99,7 @@ def get(
     proposal is a branch that a person merges to approve its demand, or deletes to refuse it.
     NAME and the filters may be patterns with * and ?. Of several filters, all must match. The
     state of an override is `in force`, `not rendered yet` (a generator has yet to write its files),
-    `held back` (a hold of another one keeps the files as they are), `expired` or `matches
+    `held back` (another override with hold keeps the files as they are), `expired` or `matches
     nothing`.
 
     \b
@@ -124,7 +124,7 @@ def get(
         _print(kind, source, items, output, watch)
         while watch:
             REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
-            if not _moved(repo, source) and kind != "proposals":
+            if not _has_newer_commit(repo, source) and kind != "proposals":
                 continue
             source = _read(repo, None)
             before, items = items, _matching(shown, shown.items(source), names, wanted)
@@ -132,7 +132,7 @@ def get(
                 _print(kind, source, items, output, watch)
 
 
-def _moved(repo: Reader, source: Source) -> bool:
+def _has_newer_commit(repo: Reader, source: Source) -> bool:
     """Return whether there is a newer commit; false if the remote cannot be reached."""
     try:
         return repo.refresh() != str(source.snapshot.commit)

@@ -34,7 +34,7 @@ Values = Callable[[Json], Iterable[str]]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The source of all lists: the state repo, its state at a commit, and the time."""
+    """The data for every list: the state repo, its state at a commit, and the time."""
 
     repo: Reader
     snapshot: Snapshot

@@ -1,4 +1,4 @@
-"""The meaning of a name that a person gives to ``demandops why``."""
+"""Finds the release, demand, node or other object that a name given to ``demandops why`` means."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Match:
 
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
-    """Return what a name or path identifies; ``kind`` limits the search to one kind.
+    """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
 
     Raises:
         StateRepoError: if the name identifies nothing, or several things.
@@ -56,7 +56,7 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         return _by_path(repo, snapshot, name)
     world = snapshot.state
     matches = [each for each in _by_name(repo, snapshot, name) if kind in (None, each.kind)]
-    matches = matches or list(_by_more(repo, snapshot, name, kind))
+    matches = matches or list(_by_looser_match(repo, snapshot, name, kind))
     running = [
         each
         for each in matches
@@ -66,7 +66,9 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         return (running or matches)[0]
     if matches:
         kinds = ", ".join(each.kind for each in matches)
-        raise StateRepoError(f"{quoted(name)} can mean several: {kinds}; choose one with --kind")
+        raise StateRepoError(
+            f"{quoted(name)} names several things: {kinds}; choose one with --kind"
+        )
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     running_names = {release.name for release in release_causes.releases(world)}
@@ -99,10 +101,13 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
             yield Match(kind.value[:-1], name, folder, subject=subject)
 
 
-def _by_more(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Iterator[Match]:
-    """Yield what a name identifies, if no release, application or connection has exactly this name.
+def _by_looser_match(
+    repo: Reader, snapshot: Snapshot, name: str, kind: str | None
+) -> Iterator[Match]:
+    """Yield the demand, node or other object of this name.
 
-    The name may then be a part of a release's name, or the first part of a demand's id.
+    If there is none, yield the release whose name contains ``name``, or the demand whose id begins
+    with it.
     """
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
@@ -140,7 +145,7 @@ def _release_with(part: str, world: World) -> Release | None:
         StateRepoError: if several releases have such a name.
     """
     found = {one.name: one for one in release_causes.releases(world) if part in one.name}
-    return found[_only(part, [*found])] if found else None
+    return found[_the_only_name(part, [*found])] if found else None
 
 
 def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator[Match]:
@@ -152,7 +157,7 @@ def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator
     commit = str(snapshot.commit)
     found = sorted(name for name in repo.stopped_release_names(commit) if part in name)
     if found:
-        name = _only(part, found)
+        name = _the_only_name(part, found)
         yield Match("release", name, repo.release_path(name, commit) or "")
 
 
@@ -163,10 +168,14 @@ def _demand_from(start: str, world: World) -> str | None:
         StateRepoError: if several demands have such an id.
     """
     found = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(start))
-    return _only(start, found, "demands have {} at the start of their id") if found else None
+    return (
+        _the_only_name(start, found, "demands have {} at the start of their id") if found else None
+    )
 
 
-def _only(part: str, names: list[str], what: str = "releases have {} in their name") -> str:
+def _the_only_name(
+    part: str, names: list[str], what: str = "releases have {} in their name"
+) -> str:
     if len(names) == 1:
         return names[0]
     listed = ", ".join(names[:_MOST_LISTED])

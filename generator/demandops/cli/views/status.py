@@ -98,7 +98,7 @@ def status(
     with reader.opened(state_repo) as repo:
         found = Status.of(repo, clusters, request_timeout)
         if wait:
-            found = _healthy(repo, clusters, found, timeout, request_timeout)
+            found = _wait_until_healthy(repo, clusters, found, timeout, request_timeout)
     show(output, found.data(), found.text())
     warn_of_not_rendered(found.not_rendered)
     for missing in dict.fromkeys((one.application, one.reason) for one in found.missing_inputs):
@@ -117,7 +117,7 @@ def status(
         raise click.exceptions.Exit(1)
 
 
-def _healthy(
+def _wait_until_healthy(
     repo: Reader,
     clusters: Mapping[str, clusters_file.ClusterAccess],
     found: Status,

@@ -78,7 +78,7 @@ def _screen(
     amiss = "; ".join(filter(None, (status.amiss(clusters), away)))
     health = painted(f"not well: {amiss}", "red") if amiss else painted("all is well", "green")
     if not clusters and not amiss:
-        health = "the clusters are unknown: give --clusters FILE"
+        health = "the health is unknown: give --clusters FILE"
     head = f"{repo.repository.address} at {status.commit[:10]}, {now:%H:%M:%S} UTC"
     counts = f"{len(status.rows)} releases, {len(held)} demands"
     releases = sorted(status.rows, key=lambda row: (row["health"] == "healthy", row["name"]))

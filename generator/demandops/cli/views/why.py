@@ -152,7 +152,7 @@ def _of_release(world: World, running: Release) -> dict[str, Any]:
 
 
 def _denied(world: World, match: Match) -> dict[str, Any]:
-    """Return JSON data on the override that denies a release, and on the release's place.
+    """Return JSON data on the override that denies a release, and on where the release would run.
 
     Return an empty mapping if ``match`` is not a release that an override denies.
     """

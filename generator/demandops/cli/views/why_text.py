@@ -26,7 +26,7 @@ def lines_of(answer: Json) -> Iterator[str]:
     for reason in answer["missing_inputs"]:
         yield f"  missing     {reason}"
     for path in answer["not_rendered"]:
-        yield f"  pending     {path} waits for a generator to write or remove it"
+        yield f"  pending     a generator has yet to write or remove {path}"
     if answer.get("denied_by"):
         yield f"  denied by   {_override_text(answer['denied_by'])}"
     for each in answer.get("releases", ()) if runs else ():
@@ -51,7 +51,7 @@ def _state(answer: Json) -> str:
     if kind in ("file", "claim") and not runs:
         return "no longer exists" if answer["stopped"] else "exists"
     if kind in ("demand", "requester"):
-        return "holds" if runs else "is suspended" if answer["claims"] else "holds nothing"
+        return "holds claims" if runs else "is suspended" if answer["claims"] else "holds nothing"
     if kind == "node":
         return "is used" if runs else "is not used"
     if kind == "override":

@@ -1,5 +1,5 @@
-// Keeps the page current, filters while a person types, and lets times age. Without it all links
-// and the filter still work.
+// Keeps the page current, filters while a person types, and updates texts like "3m ago". Without
+// this script all links and the filter still work.
 "use strict";
 
 const content = () => document.getElementById("page");
@@ -8,7 +8,7 @@ const field = document.getElementById("q");
 let shown = "";
 let asked = 0;
 
-// Replaces what the page shows by what the server has now; keeps focus, scroll and open details.
+// Replaces the content by the newest from the server; keeps focus, scroll and open details.
 async function show(address, isQuiet) {
   const turn = ++asked;
   const answer = await fetch(address, { headers: { Accept: "text/html" } });
@@ -33,7 +33,7 @@ async function show(address, isQuiet) {
   if (!isQuiet) say("updated");
 }
 
-// Where the focus is, so that it can be found in the new content.
+// Describes the focused element, so that find() can find it in the new content.
 function where(element) {
   if (!element || !content().contains(element)) return null;
   const same = element.id ? [] : [...content().querySelectorAll(element.tagName)].filter((one) => key(one) === key(element));
@@ -55,7 +55,7 @@ function say(text) {
   live.classList.toggle("current", /^(live|updated)$/.test(text));
 }
 
-// as config/durations.py writes it: 3h20m
+// Writes a duration like span() in config/durations.py: 3h20m
 function span(seconds) {
   const units = [[86400, "d"], [3600, "h"], [60, "m"], [1, "s"]], left = Math.floor(Math.abs(seconds));
   const place = units.findIndex(([size]) => left >= size || size === 1);
@@ -77,14 +77,15 @@ function follow(isAgain) {
   const events = new EventSource("/events");
   let first = !isAgain;
   events.addEventListener("change", () => {
-    // the first one tells what the page has, or after a break what it may have missed
+    // The first event has the version that the page shows. After a break it may be a newer one.
     if (!first) show(location.href, false).catch(() => say("not current: the server does not answer"));
     first = false;
     if (!live.textContent.startsWith("updated")) say("live");
   });
   events.addEventListener("error", () => {
     say("not current: waiting for the server");
-    // a browser asks again by itself, unless it got another answer, as a proxy's without its server
+    // The browser reconnects by itself, except after an answer that is no stream of events, such as
+    // a proxy's error page.
     if (events.readyState === EventSource.CLOSED) setTimeout(follow, 2000, true);
   });
 }
@@ -111,5 +112,5 @@ if (field) {
   });
 }
 if (live?.dataset.live === "yes") follow(false);
-else say("an earlier moment");
+else say("an earlier state");
 setInterval(age, 5000);

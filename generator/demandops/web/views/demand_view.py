@@ -21,9 +21,9 @@ from demandops.web.situation import Situation
 class Consequence:
     """What would change if a demand were released, and how to release it.
 
-    ``how`` is the way in words. ``file`` is the text of a file for ``demandops request``; it is
-    empty if ``how`` is another way. ``approval`` names the rules that require a person's approval.
-    ``refused`` is the reason why the generator would refuse, or empty.
+    ``how`` says in words how to release it. ``file`` is a file for ``demandops request`` that does
+    so; it is empty if the demand has to be released otherwise. ``approval`` names the rules that
+    require a person's approval. ``refused`` is the reason why the generator would refuse, or empty.
     """
 
     releases: tuple[ReleaseChange, ...]
@@ -50,17 +50,17 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
     Raises:
         StateRepoError: if the demand holds nothing.
     """
-    claims = now.moment.claims_of_demands.get(id)
+    claims = now.commit_state.claims_of_demands.get(id)
     if not claims:
         raise StateRepoError(f"demand {quoted(id)} holds nothing")
-    releases = now.moment.releases_of_demands.get(id, [])
+    releases = now.commit_state.releases_of_demands.get(id, [])
     return ExplainedDemand(
         id, claims, requesters_of(claims), releases, _consequence(now, reader, id)
     )
 
 
 def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
-    claims = now.moment.claims_of_demands[id]
+    claims = now.commit_state.claims_of_demands[id]
     goal = {
         "apiVersion": API_VERSION,
         "kind": "Demand",
@@ -72,8 +72,8 @@ def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
     is_by_id = how.startswith("send operation")
     file = strict_yaml.dump(goal) if is_by_id else ""
     try:
-        read = reader.file_reader(now.moment.commit)
-        decision = decide(now.moment.state, goal, now.now, read)
+        read = reader.file_reader(now.commit_state.commit)
+        decision = decide(now.commit_state.state, goal, now.now, read)
     except InvalidInput as error:
         return Consequence((), how, file, refused=str(error))
     return Consequence(decision.releases, how, file, decision.approval)

@@ -14,7 +14,7 @@ from demandops.config.inventory import Node
 from demandops.plan.release import ServiceRelease
 from demandops.web.situation import Situation
 from demandops.web.views.filtered_table import Filter, Row
-from demandops.web.views.health_word import PLACES, WORDS, word_of
+from demandops.web.views.health_word import RANKS, WORDS, word_of
 from demandops.web.views.lists import rows_of
 from demandops.web.views.map_layout import (
     HEAD,
@@ -95,10 +95,10 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     Args:
         now: the situation.
         wanted: the filter; services, connections and nodes that match are highlighted.
-        layout: ``place`` or ``cluster``. Any other value, or ``place`` without a node that has a
-            position, means ``place`` if most nodes have a position, else ``cluster``.
+        layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
+            position, else ``cluster``. Without any position, ``place`` means ``cluster``.
     """
-    config = now.moment.config
+    config = now.commit_state.config
     nodes = list(config.nodes.values())
     content = _contents(now, wanted)
     total, placed = len(nodes), [node for node in nodes if node.position]
@@ -145,7 +145,8 @@ def _apart(
 ) -> tuple[list[_Drawn], list[_Drawn]]:
     """Return the parts to draw together, and the parts to draw one by one.
 
-    At most ``most`` parts are drawn one by one: all, else the special ones, else none.
+    All parts are drawn one by one if they are at most ``most``. Otherwise only the special parts
+    are, or none if even these are more than ``most``.
     """
     if len(drawn) <= most:
         return [], drawn
@@ -184,9 +185,9 @@ def _lit_nodes(
 
 
 def _contents(now: Situation, wanted: Filter) -> dict[str, _Content]:
-    found = {id: _Content() for id in now.moment.config.nodes}
+    found = {id: _Content() for id in now.commit_state.config.nodes}
     lit = _lit_services(now, wanted)
-    for release, _ in now.moment.targets:
+    for release, _ in now.commit_state.targets:
         if isinstance(release, ServiceRelease) and release.node.id in found:
             word = word_of(now.status(release.name))
             of = release.key.source or ""
@@ -241,7 +242,7 @@ def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> lis
     lines = []
     for (source, target), rows in pairs.items():
         words = [row.cells["health"].parts[0].text for row in rows]
-        worst = min(words, key=PLACES.__getitem__)
+        worst = min(words, key=RANKS.__getitem__)
         topics = sum(len(row.cells["topic"].parts) for row in rows)
         names = ", ".join(row.cells["connection"].parts[0].text for row in rows[:3])
         title = f"{source} to {target}: {names}, {topics} topics, {worst}"

@@ -16,7 +16,7 @@ WORDS = {
 }
 """Word for a health → its color on the page, from the worst to the best health."""
 
-PLACES = {word: float(place) for place, word in enumerate(WORDS)}
+RANKS = {word: float(place) for place, word in enumerate(WORDS)}
 """Word → its index in ``WORDS``; a lower index means worse health."""
 
 
@@ -30,7 +30,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 
 def since_of(status: ReleaseStatus) -> datetime | None:
-    """Return since when a release has its state; None if the cluster does not report the time."""
+    """Return the time of the last change of a release's state; None if the cluster has none."""
     try:
         return datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
@@ -39,4 +39,4 @@ def since_of(status: ReleaseStatus) -> datetime | None:
 
 def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
     """Return the word for the worst health of several releases; ``unknown`` without a release."""
-    return min(map(word_of, statuses), key=PLACES.__getitem__, default="unknown")
+    return min(map(word_of, statuses), key=RANKS.__getitem__, default="unknown")

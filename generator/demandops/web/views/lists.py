@@ -15,26 +15,26 @@ from demandops.plan.planner import connection_topics
 from demandops.plan.release import ServiceRelease
 from demandops.plan.views import demand_list
 from demandops.subject import SubjectKind
-from demandops.web.situation import KnownRows, Moment, Situation
+from demandops.web.situation import CommitState, ReusableRows, Situation
 from demandops.web.views.filtered_table import Cell, Column, Link, Part, Row, cell, exactly
-from demandops.web.views.health_word import PLACES, WORDS, word_of, worst_word
+from demandops.web.views.health_word import RANKS, WORDS, word_of, worst_word
 
-Parts: TypeAlias = "tuple[Any, ...]"
+Values: TypeAlias = "tuple[Any, ...]"
 
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
     """A kind of list: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields the id and the parts of each entry. ``row`` makes a row from the parts; it is
-    called again only if a part of the entry has changed.
+    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values; it
+    is called again only if a value of the entry has changed.
     """
 
     name: str
     title: str
     about: str
     columns: tuple[Column, ...]
-    entries: Callable[[Situation], Iterator[tuple[str, Parts]]]
+    entries: Callable[[Situation], Iterator[tuple[str, Values]]]
     row: Callable[..., Row]
 
 
@@ -50,7 +50,7 @@ def demand_part(id: str) -> Part:
 
 def health_cell(word: str) -> Cell:
     """Return the cell for a health word; cells are sorted from the worst to the best health."""
-    return cell(word, tone=WORDS[word], order=PLACES[word])
+    return cell(word, tone=WORDS[word], order=RANKS[word])
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
@@ -62,11 +62,14 @@ def _requesters(of: Iterable[str]) -> Cell:
     return cell(*_filtered("demands", "requester", of))
 
 
-def _services(now: Situation) -> Iterator[tuple[str, Parts]]:
-    for release, _ in now.moment.targets:
+def _services(now: Situation) -> Iterator[tuple[str, Values]]:
+    for release, _ in now.commit_state.targets:
         if isinstance(release, ServiceRelease):
             name = release.name
-            yield name, (release, now.moment.behind[name], word_of(now.status(name)))
+            yield (
+                name,
+                (release, now.commit_state.claims_of_releases[name], word_of(now.status(name))),
+            )
 
 
 def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
@@ -88,8 +91,8 @@ def _service(world: World, release: ServiceRelease, claims: list[Claim], word: s
     )
 
 
-def _connections(now: Situation) -> Iterator[tuple[str, Parts]]:
-    ledger, carrying = now.moment.active.ledger, clients_of(now.moment)
+def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
+    ledger, carrying = now.commit_state.active.ledger, clients_of(now.commit_state)
     for id in ledger.subjects(SubjectKind.CONNECTION):
         claims, clients = ledger.connection_claims(id), carrying.get(id, [])
         if claims:  # not all are suspended
@@ -116,22 +119,22 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
     )
 
 
-def clients_of(moment: Moment) -> dict[str, list[str]]:
+def clients_of(commit_state: CommitState) -> dict[str, list[str]]:
     """Return id of a connection → the names of the releases that carry it."""
     found: dict[str, list[str]] = {}
-    for name, release in moment.releases.items():
+    for name, release in commit_state.releases.items():
         if not isinstance(release, ServiceRelease):
             for id in release.connections:
                 found.setdefault(id, []).append(name)
     return found
 
 
-def _demands(now: Situation) -> Iterator[tuple[str, Parts]]:
-    moment = now.moment
-    for id, claims in moment.claims_of_demands.items():
-        releases = moment.releases_of_demands.get(id, [])
+def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
+    commit_state = now.commit_state
+    for id, claims in commit_state.claims_of_demands.items():
+        releases = commit_state.releases_of_demands.get(id, [])
         yield id, (claims, releases, worst_word(map(now.status, releases)))
-    for one in moment.state.ledger.waiting.values():
+    for one in commit_state.state.ledger.waiting.values():
         yield f"waiting {one.demand}", (one, [], "waiting")
 
 
@@ -146,7 +149,7 @@ def _demand(
     if held.state == "suspended":
         health = cell("suspended", tone="bad", order=0.0)
     elif held.state == "waiting":
-        health = cell("waits for room", tone="busy", order=PLACES["waiting"])
+        health = cell("waits for room", tone="busy", order=RANKS["waiting"])
     return Row(
         {
             "demand": cell(demand_part(held.name)),
@@ -162,8 +165,8 @@ def _demand(
     )
 
 
-def _leases(now: Situation) -> Iterator[tuple[str, Parts]]:
-    for claim in now.moment.state.ledger:
+def _leases(now: Situation) -> Iterator[tuple[str, Values]]:
+    for claim in now.commit_state.state.ledger:
         if claim.lease is not None:
             yield f"{claim.subject} {claim.demand}", (claim,)
 
@@ -194,16 +197,18 @@ def _columns(*named: str) -> tuple[Column, ...]:
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; reuse the rows of an earlier moment whose parts are unchanged."""
-    moment, kind = now.moment, LISTS[name]
-    known = moment.rows.get(name, KnownRows(None, {}))
-    if known.made_for is not now.statuses:
-        made: dict[str, tuple[Parts, Row]] = {}
-        for id, parts in kind.entries(now):
+    """Return the rows of a list; reuse the rows of entries that have not changed."""
+    commit_state, kind = now.commit_state, LISTS[name]
+    known = commit_state.rows.get(name, ReusableRows(None, {}))
+    if known.statuses is not now.statuses:
+        made: dict[str, tuple[Values, Row]] = {}
+        for id, values in kind.entries(now):
             before = known.rows.get(id)
-            is_same = before is not None and before[0] == parts
-            made[id] = before if before and is_same else (parts, kind.row(moment.state, *parts))
-        known = moment.rows[name] = KnownRows(now.statuses, made)
+            is_same = before is not None and before[0] == values
+            made[id] = (
+                before if before and is_same else (values, kind.row(commit_state.state, *values))
+            )
+        known = commit_state.rows[name] = ReusableRows(now.statuses, made)
     return [row for _, row in known.rows.values()]
 
 

@@ -18,7 +18,7 @@ from demandops.plan.release import ServiceRelease
 from demandops.plan.views import release_causes
 from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.write.proposal_branch import PendingProposal
-from demandops.web.situation import Moment, Situation
+from demandops.web.situation import CommitState, Situation
 from demandops.web.views.filtered_table import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import WORDS, since_of, word_of, worst_word
 from demandops.web.views.remedy import KINDS, Kind, LastChange, Remedy, remedy_of
@@ -91,14 +91,14 @@ def causes(
     found = [
         *_unread(now),
         *_invalid(now, last_change),
-        *_suspended(now.moment, last_change),
-        *_denied(now.moment, last_change),
+        *_suspended(now.commit_state, last_change),
+        *_denied(now.commit_state, last_change),
         *_of_releases(now, last_change),
-        *map(_waits, in_turn(now.moment.state.ledger.waiting)),
+        *map(_waits, in_turn(now.commit_state.state.ledger.waiting)),
         *map(_proposed, now.proposals),
         *map(_unapplied, now.old_bootstraps),
         *map(_orphaned, now.orphans),
-        *(_pending(now.moment, sorted(pending)) if pending else ()),
+        *(_pending(now.commit_state, sorted(pending)) if pending else ()),
     ]
     places = {kind: place for place, kind in enumerate(KINDS)}
     latest = now.now.timestamp()
@@ -114,10 +114,10 @@ def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list
             by_application.setdefault(application, []).append(cause)
     statuses: dict[str, list[ReleaseStatus]] = {}
     rows: dict[str, Row] = {}
-    for name, release in now.moment.releases.items():
+    for name, release in now.commit_state.releases.items():
         for application in release.applications if isinstance(release, ServiceRelease) else ():
             statuses.setdefault(application, []).append(now.status(name))
-    for claim in now.moment.state.ledger:
+    for claim in now.commit_state.state.ledger:
         if claim.is_on_application:
             known = rows.get(claim.subject.id)
             who = {*claim.requesters, *(known.hidden["requester"] if known else ())}
@@ -149,7 +149,7 @@ def _unread(now: Situation) -> Iterator[Cause]:
 
 
 def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
-    for problem in now.moment.problems:
+    for problem in now.commit_state.problems:
         change = last_change(problem.file)
         author = problem.author if isinstance(problem, Problem) else ""
         author = author or (change.author if change else "")
@@ -169,9 +169,9 @@ def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
         )
 
 
-def _suspended(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
+def _suspended(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
     by_override: dict[str, tuple[Override, list[Claim]]] = {}
-    for claim, override in suspended_claims(moment.state):
+    for claim, override in suspended_claims(commit_state.state):
         by_override.setdefault(override.name, (override, []))[1].append(claim)
     for override, claims in by_override.values():
         names = [claim.subject.id for claim in claims]
@@ -182,20 +182,20 @@ def _suspended(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
             f"is booked, but {override.path} denies it",
             _by_owner(override),
             told=override.reason,
-            applications=tuple(dict.fromkeys(_applications_with(moment, claims))),
+            applications=tuple(dict.fromkeys(_applications_with(commit_state, claims))),
             requesters=requesters_of(claims),
             demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
             since=change.time if change else None,
         )
 
 
-def _denied(moment: Moment, last_change: LastChange) -> Iterator[Cause]:
+def _denied(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
     """Yield a cause for each release that an override denies.
 
     :func:`_suspended` yields the causes for claims that an override suspends as a whole.
     """
-    ledger = moment.active.ledger
-    for release, override in moment.denied:
+    ledger = commit_state.active.ledger
+    for release, override in commit_state.denied:
         claims = release_causes.claims_behind(ledger, release)
         change = last_change(override.path)
         yield Cause(
@@ -241,7 +241,7 @@ def _unapplied(old: OldBootstrap) -> Cause:
     return Cause(
         "decision",
         Part(old.file),
-        f"is not applied to cluster '{old.cluster}' as it is now",
+        f"is not applied to cluster '{old.cluster}' in its current version",
         Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
         told=f"access domains: {', '.join(old.domains)}",
     )
@@ -257,15 +257,18 @@ def _orphaned(left: Orphan) -> Cause:
     )
 
 
-def _pending(moment: Moment, paths: list[str]) -> Iterator[Cause]:
+def _pending(commit_state: CommitState, paths: list[str]) -> Iterator[Cause]:
     more = f" and {len(paths) - _MOST_LISTED} more" if len(paths) > _MOST_LISTED else ""
     yield Cause(
         "waiting",
         Part("1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"),
         f"{'waits' if len(paths) == 1 else 'wait'} for a generator to carry out a person's commit",
-        Remedy("the operator of the generator", "start one; it does so at its next fetch"),
+        Remedy(
+            "the operator of the generator",
+            "start a generator; one that runs does it at its next fetch",
+        ),
         told=", ".join(paths[:_MOST_LISTED]) + more,
-        since=moment.entry.time,
+        since=commit_state.entry.time,
     )
 
 
@@ -287,7 +290,7 @@ def _waits(waiting: WaitingDemand) -> Cause:
 def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
     """Yield a cause for each group of unhealthy releases with one state, reason and cluster."""
     together: dict[tuple[str, str, str, str], list[str]] = {}
-    for name, release in now.moment.releases.items():
+    for name, release in now.commit_state.releases.items():
         status = now.status(name)
         word = word_of(status)
         if word not in ("healthy", "unknown"):
@@ -295,7 +298,7 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
             key = (word, health.object, health.reason, release.node.cluster)
             together.setdefault(key, []).append(name)
     for (word, object, reason, cluster), names in together.items():
-        first = now.moment.releases[names[0]]
+        first = now.commit_state.releases[names[0]]
         several = len(names) > 1
         kind: Kind = "failing" if word == "failing" else "starting"
         if word == "waiting":
@@ -308,11 +311,11 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
             if several
             else Part(first.description, Link("release", {"name": names[0]})),
             _why(kind, object, several),
-            remedy_of(kind, first, now.moment.config, object, reason, last_change),
+            remedy_of(kind, first, now.commit_state.config, object, reason, last_change),
             since=_since(now.status(name) for name in names),
             told=f"{object}: {reason}" if object else reason,
             releases=tuple(names),
-            **_affected(now.moment, names),
+            **_affected(now.commit_state, names),
         )
 
 
@@ -331,20 +334,22 @@ def _why(kind: Kind, object: str, several: bool) -> str:
     return f"{verbs[2]}, and did not become ready yet"
 
 
-def _affected(moment: Moment, names: list[str]) -> dict[str, tuple[str, ...]]:
+def _affected(commit_state: CommitState, names: list[str]) -> dict[str, tuple[str, ...]]:
     """Return the applications, requesters and demands that releases affect.
 
     A connection affects the applications of the demands that hold it.
     """
     applications: dict[str, None] = {}
-    claims = [claim for name in names for claim in moment.behind[name]]
+    claims = [claim for name in names for claim in commit_state.claims_of_releases[name]]
     demands = dict.fromkeys(claim.demand for claim in claims)
     for name in names:
-        release = moment.releases[name]
+        release = commit_state.releases[name]
         if isinstance(release, ServiceRelease):
             applications |= dict.fromkeys(release.applications)
         else:
-            applications |= dict.fromkeys(_applications_with(moment, moment.behind[name]))
+            applications |= dict.fromkeys(
+                _applications_with(commit_state, commit_state.claims_of_releases[name])
+            )
     return {
         "applications": tuple(applications),
         "requesters": requesters_of(claims),
@@ -352,8 +357,8 @@ def _affected(moment: Moment, names: list[str]) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _applications_with(moment: Moment, claims: Iterable[Claim]) -> Iterator[str]:
+def _applications_with(commit_state: CommitState, claims: Iterable[Claim]) -> Iterator[str]:
     """Yield the ids of all applications of the demands to which these claims belong."""
     for demand in dict.fromkeys(claim.demand for claim in claims):
-        held = moment.claims_of_demands.get(demand, ())
+        held = commit_state.claims_of_demands.get(demand, ())
         yield from (one.subject.id for one in held if one.is_on_application)

@@ -72,7 +72,7 @@ def plots(
         if one.authored and one.first("Operation") in _BOOKED | _RELEASED
     ]
     ready = [Sample(one.time, one.lasted_s) for one in health if one.lasted_s is not None]
-    make = _Maker(start, span_s)
+    make = _PlotMaker(start, span_s)
     return [
         make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
         make.counts(
@@ -87,7 +87,7 @@ def plots(
         make.medians(
             "Until healthy again",
             ready,
-            "median time that releases were not healthy, as far as this page watched",
+            "median time that releases were not healthy, since this page was started",
         ),
     ]
 
@@ -96,7 +96,7 @@ def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
     return [one.entry.time for one in commits if one.entry.first("Operation") in operations]
 
 
-class _Maker:
+class _PlotMaker:
     """Makes plots of one span of time, which it divides into bins of equal length."""
 
     def __init__(self, start: datetime, span_s: float) -> None:

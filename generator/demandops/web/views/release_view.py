@@ -18,7 +18,7 @@ from demandops.quoting import quoted
 from demandops.render.gitops.paths import path_of
 from demandops.staterepo.history.commit_log import LogEntry, PathHistory
 from demandops.staterepo.reader import Reader
-from demandops.web.situation import Moment, Situation
+from demandops.web.situation import CommitState, Situation
 from demandops.web.views.health_word import WORDS, since_of, word_of
 
 MOST_CHANGES = 20
@@ -67,7 +67,7 @@ class Explained:
 
     @property
     def since(self) -> datetime | None:
-        """Since when the release has its state; None if the cluster does not report the time."""
+        """The time of the last change of the release's state; None if the cluster has none."""
         return since_of(self.status)
 
     @property
@@ -82,15 +82,15 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
     Raises:
         StateRepoError: if there is no such release and never was.
     """
-    moment = now.moment
-    release = moment.releases.get(name)
-    denied = None if release else release_causes.denied_release_named(moment.state, name)
+    commit_state = now.commit_state
+    release = commit_state.releases.get(name)
+    denied = None if release else release_causes.denied_release_named(commit_state.state, name)
     planned = release or (denied[0] if denied else None)
     path = path_of(planned) if planned else None
-    path = path or reader.release_path(name, moment.commit)
+    path = path or reader.release_path(name, commit_state.commit)
     if path is None:
         raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran")
-    history = reader.history(path, moment.commit, MOST_CHANGES)
+    history = reader.history(path, commit_state.commit, MOST_CHANGES)
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:
         last = history.stopped
@@ -100,24 +100,24 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
         release=release,
         denied_by=denied[1] if denied else None,
         status=now.status(name),
-        claims=tuple(moment.behind.get(name, ())),
-        files=tuple(release_causes.shaping_files(release, moment.config)) if release else (),
+        claims=tuple(commit_state.claims_of_releases.get(name, ())),
+        files=tuple(release_causes.shaping_files(release, commit_state.config)) if release else (),
         overrides=release.shaping.by if release else (),
-        text=reader.file_reader(moment.commit)(path) or "",
+        text=reader.file_reader(commit_state.commit)(path) or "",
         history=history,
         last_change=last,
         difference=tuple(_difference(reader, last, path)) if last else (),
-        stop_with_it=tuple(_others_stopped(moment, release)) if release else (),
+        stop_with_it=tuple(_others_stopped(commit_state, release)) if release else (),
     )
 
 
-def _others_stopped(moment: Moment, release: Release) -> Iterable[str]:
+def _others_stopped(commit_state: CommitState, release: Release) -> Iterable[str]:
     """Yield the names of the other releases that stop with ``release``.
 
     The override to stop ``release`` denies its service on its node or, for a client of connections,
     all its connections.
     """
-    for name, other in moment.releases.items():
+    for name, other in commit_state.releases.items():
         if name == release.name:
             continue
         if isinstance(release, ServiceRelease):

@@ -88,7 +88,7 @@ class Tick:
 class Strip:
     """The picture of the time line.
 
-    ``chosen`` is the x coordinate of the chosen moment; None if the picture does not show it.
+    ``chosen`` is the x coordinate of the chosen commit; None if the picture does not show it.
     """
 
     span: str
@@ -139,7 +139,7 @@ def strip(
         found: the events, newest first.
         now: the time at the end of the line.
         span: a key of ``SPANS``; any other value means the shortest span that has several events.
-        chosen: the time and the commit of the chosen moment; None if it is the present.
+        chosen: the time and the id of the chosen commit; None if no earlier commit is chosen.
     """
     if span not in SPANS:
         span = _span_with_some(found, now)
