@@ -144,24 +144,51 @@ class GoalSender:
         """
         lost = False
         while True:
-            sent = self._client.send_goal_async(
-                goal, feedback_callback=lambda message: on_feedback(message.feedback)
-            )
             try:
+                sent = self._start_sending(goal, on_feedback, deadline)
                 return self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S)), lost
             except DemandError:
                 if REAL.monotonic() >= deadline:
                     raise
                 lost = True
 
+    def _start_sending(
+        self,
+        goal: Any,  # noqa: ANN401
+        on_feedback: Callable[[Any], None],
+        deadline: float,
+    ) -> Any:  # noqa: ANN401 - a future of rclpy
+        """Send a goal from the thread that receives; return the future of the node's response.
+
+        rclpy 9.1 registers the future of a goal twice. If another thread sends, a response that
+        arrives in between resolves the first future only, and no caller has that.
+        """
+        sent: list[Any] = []
+        done = REAL.event()
+
+        def send() -> None:
+            sent.append(
+                self._client.send_goal_async(
+                    goal, feedback_callback=lambda message: on_feedback(message.feedback)
+                )
+            )
+            done.set()
+
+        self._thread.call(send)
+        if not done.wait(max(0.0, deadline - REAL.monotonic())):
+            raise self._no_answer()
+        return sent[0]
+
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = REAL.event()
         future.add_done_callback(lambda _: done.set())
         if not done.wait(max(0.0, deadline - REAL.monotonic())):
-            raise DemandError(
-                "timeout", f"no answer on {self._action_name} within {self.timeout_s:g} s"
-            )
+            raise self._no_answer()
         return future.result()
+
+    def _no_answer(self) -> DemandError:
+        text = f"no answer on {self._action_name} within {self.timeout_s:g} s"
+        return DemandError("timeout", text)
 
 
 class OtherServers:

@@ -33,6 +33,13 @@ class Client(ros.Client):
             assert time.monotonic() < end, "the condition did not hold in time"
             time.sleep(0.005)
 
+    def send(self, goal: Goal) -> Sent:
+        """Send a goal from the thread that spins; in another one, rclpy may lose the response."""
+        sent: list[Sent] = []
+        self.executor.create_task(lambda: sent.append(super(Client, self).send(goal)))
+        self.wait(lambda: bool(sent))
+        return sent[0]
+
     def call(self, sent: Goal) -> Sent:
         """Send a goal and wait for its result; send it again if no node accepts it in 3 s.
 

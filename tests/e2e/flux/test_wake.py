@@ -6,6 +6,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
+
 from tests.e2e.common import expected
 from tests.e2e.common.access import access_file, limited
 from tests.e2e.common.expected import CLUSTER, STEPS, WITHOUT_DEMANDS
@@ -35,31 +37,28 @@ ROUNDS = 3
 """How often the paper's eight demands are sent, one right after the other."""
 
 
-def start(world: World, rig: Rig) -> Domain:
-    """Let Flux fetch every ten minutes, and start a generator that may only wake and watch it."""
-    domain = world.bootstrap(CLUSTER, rig, interval="10m")
-    kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, {domain.namespace: RIGHTS})
-    file = access_file(world.folder, CLUSTER, kubeconfig=kubeconfig)
-    world.generator.start("--clusters", str(file))
-    return domain
+@pytest.fixture(scope="module")
+def world(make_world: MakeWorld, rig: Rig) -> World:
+    """A state repo that Flux fetches every ten minutes; its generator may wake and watch Flux."""
+    made = make_world()
+    domain = made.bootstrap(CLUSTER, rig, interval="10m")
+    kubeconfig = limited(rig.kube, rig.kubeconfig, made.folder, {domain.namespace: RIGHTS})
+    file = access_file(made.folder, CLUSTER, kubeconfig=kubeconfig)
+    made.generator.start("--clusters", str(file))
+    return made
 
 
-def test_a_trigger_saves_the_wait_for_the_next_fetch(
-    make_world: MakeWorld, rig: Rig, say: Report
-) -> None:
+def test_a_trigger_saves_the_wait_for_the_next_fetch(world: World, say: Report) -> None:
     """Flux fetches only every ten minutes, so only the trigger can bring the demand in time."""
-    world = make_world()
-    start(world, rig)
     table = Table("Triggered by the generator, next fetch after 10 minutes")
     table.add("joins", world.step(1, expected.after(1), wake=False))
     table.show(say)
     world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
 
 
-def test_flux_is_woken_only_while_it_is_idle(make_world: MakeWorld, rig: Rig) -> None:
+def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
     """If it were busy, it could forget what it is just creating, and never remove that."""
-    world = make_world()
-    domain = start(world, rig)
+    domain = world.domain
     with wakes(domain) as found:
         for step in (*STEPS,) * ROUNDS:
             sent = world.demand(expected.demand(step))
