@@ -36,7 +36,7 @@ _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
 
 @dataclass(frozen=True, slots=True)
 class LogEntry:
-    """One commit of the state repo, with the content of its message."""
+    """A commit of the state repo, with the parts of its message."""
 
     commit: str
     time: datetime
@@ -56,7 +56,7 @@ class LogEntry:
     """The author's time; for a demand's commit, the time when the demand was received."""
 
     def first(self, key: str) -> str:
-        """Return the first value of a trailer, or an empty text."""
+        """Return the first value of the trailer ``key``, or an empty text."""
         return next(iter(self.trailers.get(key, ())), "")
 
 
@@ -82,7 +82,8 @@ def _text(raw: bytes) -> str:
 def entry_of(commit: Commit) -> LogEntry:
     """Return the log entry of a commit.
 
-    Trailers and reason of a person's commit are left out, unless it merges a proposal.
+    If a person made the commit, its trailers and its reason are left out, unless it merges a
+    proposal.
     """
     text = message_format.parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
@@ -126,13 +127,17 @@ def person_commits(
     repo: Repository, tip: str | Oid, until: str | Oid | None = None
 ) -> Iterator[Commit]:
     """Yield the commits of :func:`commits` that people made."""
-    return (commit for commit, entry in _told_apart(repo, tip, until) if not entry.by_generator)
+    return (
+        commit
+        for commit, entry in _with_checked_signatures(repo, tip, until)
+        if not entry.by_generator
+    )
 
 
-def _told_apart(
+def _with_checked_signatures(
     repo: Repository, tip: str | Oid, until: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return what :func:`commits` yields, after a check of the signatures.
+    """Return what :func:`commits` yields, with the signatures of the generator's commits checked.
 
     ``LogEntry.by_generator`` is false if the commit lacks a valid signature that is required.
     """
@@ -152,12 +157,12 @@ def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
 
 
 Settled = Literal["unchanged", "waiting", "released", "refused"]
-"""The outcomes of demands that get no commit of their own; the next commit records them."""
+"""The outcome of a demand that gets no commit of its own; the next commit records it."""
 _Outcome = Literal["changed", Settled]
 
 
 def settled_trailer(outcome: Settled) -> str:
-    """Return the name of the trailer that records a demand without a commit of its own."""
+    """Return the trailer's name under which the next commit records a demand with ``outcome``."""
     return f"{outcome.capitalize()}-Operation-Id"
 
 
@@ -189,7 +194,7 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     except (pygit2.GitError, KeyError, ValueError):
         known = False
     outcomes = {}
-    for _, entry in _told_apart(repo, tip, base if known else None):
+    for _, entry in _with_checked_signatures(repo, tip, base if known else None):
         is_record = entry.by_generator or PROPOSAL in entry.trailers
         for key, outcome in _OUTCOMES.items() if is_record else ():
             waits = key == "Operation-Id" and entry.first("Operation") == "wait"
@@ -257,9 +262,9 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the release ``name``.
+    """Return the path of the file of the release ``name``.
 
-    If it does not exist, return the path of the last stopped release ``name``, or None.
+    If the release was stopped, return its last path. Return None if it never existed.
     """
     if not _NAME.fullmatch(name):
         return None
@@ -269,7 +274,7 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that ever stopped, from the whole history."""
+    """Return the names of all releases that were stopped at any time in the history."""
     removed = _removed(repo, tip, "*.yaml")
     return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
 

@@ -65,7 +65,7 @@ class LastValidConfig:
 
 
 def config_at(tree: Tree) -> Config:
-    """Return the configuration of one tree; raise every fault of every file."""
+    """Return the configuration of a tree; raise InvalidInput with the faults of all files."""
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
@@ -73,17 +73,17 @@ def config_at(tree: Tree) -> Config:
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:
-    """Return path → text of the markers of ended overrides."""
+    """Return path → text of the files that mark overrides as ended."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return override → end time, for each ended override."""
+    """Return name → end time of each ended override."""
     return ended_override_file.read(end_markers_at(tree))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise StateRepoError if a generator of another version writes this repo.
+    """Raise StateRepoError if generators of another render version write this repo.
 
     Generators of two render versions would undo each other's changes.
     """

@@ -1,4 +1,4 @@
-"""Runs the program ``helm`` on charts, and reads the output: kinds of objects, or faults.
+"""Runs the program ``helm`` on charts, and reads kinds of objects or faults from its output.
 
 Helm gets a home folder of its own. It has no access to a cluster or to chart repositories.
 """
@@ -49,7 +49,7 @@ class Helm:
     def find(home: Path) -> Helm | None:
         """Return the program ``helm`` that ``HELM_BIN`` names or ``PATH`` has, or None.
 
-        ``home`` is the folder for helm's files.
+        ``home`` is helm's home folder.
         """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
         return Helm(program, home) if program else None

@@ -98,9 +98,9 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise Unsound if an earlier write left the file in an unknown state; else do nothing.
+        """Raise Unsound if an earlier write left the file in an unknown state.
 
-        Every later write then raises the same error.
+        Every later write raises the same error.
         """
         if self._unsound is not None:
             raise self._unsound
@@ -195,7 +195,7 @@ class Journal:
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
     def _require_known(self, error: OSError) -> None:
-        """Raise Unsound if ``error`` leaves unknown what is on the disk; else do nothing."""
+        """Raise Unsound if the content of the disk is unknown after ``error``."""
         told = disk_error(error, f"the journal {self._path}")
         if isinstance(told, Unsound):
             self._unsound = told
@@ -285,7 +285,7 @@ def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> 
     if chain is not None:
         found = _SEALED.fullmatch(line)
         if found is None or _digest(found[1] + b"}", chain) != found[2].decode():
-            raise ValueError("another digest")
+            raise ValueError("the line has another digest")
         line, chain = found[1] + b"}", found[2].decode()
     _replay(line, pending)
     return chain
@@ -302,10 +302,10 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         entry = JournalEntry(**record, proposal=proposal)
         received = datetime.fromisoformat(entry.received)
         if received.tzinfo is None or not 1970 <= received.year < UNSTARTED.year:
-            raise ValueError("a time without a zone, or of no generator")
+            raise ValueError("the time has no zone, or no generator can have written it")
         pending[entry.operation] = entry
     except (TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise ValueError("not an entry") from error
+        raise ValueError("the line is not an entry") from error
 
 
 def _write_all(file: int, text: bytes) -> None:
