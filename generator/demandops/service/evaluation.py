@@ -100,7 +100,7 @@ class Evaluator:
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of the batch's demands that ``tip`` has already, oldest first.
+        """Return the results of the demands in ``batch`` that ``tip`` records, oldest first.
 
         An earlier attempt pushed these demands but did not answer them: the connection or the
         process ended after the remote accepted the push, or an fsync failed. This method writes

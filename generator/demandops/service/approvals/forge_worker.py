@@ -66,7 +66,7 @@ class ForgeWorker:
             self._enqueue(task)
 
     def has_answered(self, branch: str) -> bool:
-        """Return whether the forge's thread has queried a branch at least once, even in vain."""
+        """Return whether the forge was queried about a branch, even if it did not answer."""
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
