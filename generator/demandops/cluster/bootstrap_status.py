@@ -1,4 +1,4 @@
-"""Which bootstrap files clusters have: those of the state repo, or older ones."""
+"""Finds the clusters whose bootstrap file is older than the one in the state repo."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def old_bootstraps(
     Args:
         domains: the access domains on each cluster.
         caches: the objects that were read from each cluster.
-        read: returns the text of a file of the state repo, None if there is none.
+        read: returns the text of a file of the state repo, or None if the file is missing.
     """
     found = []
     for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
@@ -51,7 +51,7 @@ def old_bootstraps(
             domain.name
             for domain in domains
             if domain.cluster == cluster
-            and store.unread(domain) is None
+            and store.unknown_health(domain) is None
             and digest_of(objects.get(health_reader(domain).follower(domain)) or {}) != digest
         )
         if digest and old:
