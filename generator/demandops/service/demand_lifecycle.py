@@ -376,7 +376,7 @@ class Demands:
         try:
             self._journal.mark_done(operations, durably=durably)
         except StateRepoError as error:  # the next successful write makes the removal durable
-            log.error("a demand that is answered may be decided again after a crash: %s", error)
+            log.error("an answer cannot be journaled, so a crash may repeat the demand: %s", error)
             self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:

@@ -152,7 +152,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """The reason for each failed thread by its name, until the thread recovers.
+        """Thread name → error, for each thread that has failed and not recovered yet.
 
         Any thread may read this.
         """

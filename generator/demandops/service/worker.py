@@ -275,7 +275,7 @@ class Worker:
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended.
+        """Return a ticket for each demand whose lease has ended, to release its claims.
 
         Return no ticket while a demand waits, because that demand may renew a lease.
         """
@@ -286,13 +286,14 @@ class Worker:
     def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
         """Publish a commit batch and answer its demands; return False if another writer was first.
 
-        If the remote rejects the push for another reason, that is the answer to each demand with a
-        commit, and to each demand that was decided on top of such a commit.
+        If the remote rejects the push for another reason, this error is the answer to all demands
+        except the first ``certain`` ones.
 
         Args:
             commits: the commits of the demands.
             results: the demands and their results, in the order of evaluation.
-            certain: how many of the first results depend on no unpublished commit.
+            certain: how many demands were decided before the batch had a commit; their results
+                do not depend on the push.
         """
         try:
             published = commits.publish()

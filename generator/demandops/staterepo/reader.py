@@ -42,7 +42,7 @@ class Reader:
     """Reads a state repo at its newest commit, or a checkout at the commit that is checked out."""
 
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
-        """Read ``repository`` at the commit ``tip``; ``slot`` has the clone of a URL."""
+        """Read ``repository`` at the commit ``tip``; ``slot`` has the folder of its clone."""
         self.repository, self._tip, self._slot = repository, tip, slot
         self._objects = repository.objects
 
@@ -209,7 +209,7 @@ class Reader:
         return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
-        """Return the commits A and B of ``A..B``, or None and REV of ``REV``."""
+        """Return the ids of A and B if ``spec`` is ``A..B``; None and the id of REV for ``REV``."""
         first, dots, last = spec.partition("..")
         if not dots:
             return None, self.commit(first)
@@ -244,7 +244,7 @@ class Reader:
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
-        """Return the names of all releases that were ever stopped."""
+        """Return the names of all releases that were stopped up to a commit."""
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:

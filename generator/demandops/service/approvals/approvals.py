@@ -328,7 +328,7 @@ class Approvals:
             message = self._branches.message(proposal.record.commits[-1])
             body = pull_request_body(message, proposal.reasons)
             self._forge.open(forge, proposal.branch, title_of(message), body)
-            if not self._forge.has_answered(proposal.branch):
+            if not self._forge.was_queried(proposal.branch):
                 return True  # the requester is notified once the link is known
         request = self._forge.pull_request(proposal.branch)
         link = request.link if request else proposal.record.link

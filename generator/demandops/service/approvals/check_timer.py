@@ -9,9 +9,9 @@ CHECK_LOCAL_S = 1.0
 CHECK_REMOTE_S = 5.0
 """The seconds between two checks of a remote's branches; only a check detects a deleted branch."""
 _PAUSE_FACTOR = 9
-"""The pause before the check of a moved main, as a multiple of the last check's duration.
+"""When main moves, the next check waits this many times as long as the last check took.
 
-The pause ends at the latest with the interval.
+It waits no longer than the interval.
 """
 
 

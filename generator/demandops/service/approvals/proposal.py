@@ -188,7 +188,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a raw goal is a shutdown or a release."""
+    """Return whether a goal, as plain data, is a shutdown or a release."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 

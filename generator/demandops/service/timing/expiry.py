@@ -45,7 +45,7 @@ class LeaseExpiry:
         self._next_end: datetime | None = None
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended.
+        """Return a ticket for each demand whose lease has ended, to release its claims.
 
         A demand gets no new ticket in the minute after its last answered ticket. The tickets are
         correct only at the time of the call: later, a requester may have renewed a lease, or a

@@ -216,7 +216,7 @@ def _skip_reason(entry: LogEntry) -> str:
         return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
     version = entry.first("Render-Version")
     if version != str(RENDER_VERSION):
-        return f"rendered by version {version}, this is version {RENDER_VERSION}"
+        return f"rendered by version {version}, but this program renders version {RENDER_VERSION}"
     return ""
 
 

@@ -97,7 +97,7 @@ class LocalRepository(StateRepository):
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
         if self.tip() not in self.objects:
-            raise self._unreadable(f"its commit {self.tip()} is not there")
+            raise self._unreadable(f"its commit {self.tip()} is missing")
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:

@@ -107,12 +107,12 @@ def is_by_generator(repo: Repository, commit: Commit) -> bool:
 
 
 def commits(
-    repo: Repository, tip: str | Oid, until: str | Oid | None = None
+    repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield the commits that ``tip`` includes and ``until`` does not, newest first."""
+    """Yield the commits up to ``tip``, without those up to ``after``; newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
-    if until is not None:
-        hidden = commit_of(repo, until).id
+    if after is not None:
+        hidden = commit_of(repo, after).id
         walker.hide(hidden)
         found = list(walker)
         if any(len(commit.parent_ids) > 1 for commit in found):
@@ -124,24 +124,24 @@ def commits(
 
 
 def person_commits(
-    repo: Repository, tip: str | Oid, until: str | Oid | None = None
+    repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[Commit]:
     """Yield the commits of :func:`commits` that people made."""
     return (
         commit
-        for commit, entry in _with_checked_signatures(repo, tip, until)
+        for commit, entry in _with_checked_signatures(repo, tip, after)
         if not entry.by_generator
     )
 
 
 def _with_checked_signatures(
-    repo: Repository, tip: str | Oid, until: str | Oid | None
+    repo: Repository, tip: str | Oid, after: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
     """Return what :func:`commits` yields, with the signatures of the generator's commits checked.
 
     ``LogEntry.by_generator`` is false if the commit lacks a valid signature that is required.
     """
-    found = list(commits(repo, tip, until))
+    found = list(commits(repo, tip, after))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
     return [
         (each, replace(entry, by_generator=entry.by_generator and entry.commit not in faults))
@@ -162,7 +162,7 @@ _Outcome = Literal["changed", Settled]
 
 
 def settled_trailer(outcome: Settled) -> str:
-    """Return the trailer's name under which the next commit records a demand with ``outcome``."""
+    """Return the name of the trailer that records a demand with this outcome."""
     return f"{outcome.capitalize()}-Operation-Id"
 
 
@@ -234,10 +234,10 @@ class PathHistory:
 
 
 def changes_to(
-    repo: Repository, tip: str | Oid, path: str, until: str | None = None
+    repo: Repository, tip: str | Oid, path: str, after: str | None = None
 ) -> Iterator[PathChange]:
-    """Yield the commits after ``until`` that changed a path, newest first, as ``git log`` does."""
-    for revision in _git_log(repo, tip, until, "--format=%H", f":(literal){path}"):
+    """Yield the commits after ``after`` that changed a path, newest first, as ``git log`` does."""
+    for revision in _git_log(repo, tip, after, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
         yield PathChange(entry_of(commit), before, trees.entry(commit.tree, path) is not None)
@@ -285,10 +285,10 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 
 
-def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
+def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -> list[str]:
     """Return the items that ``git log`` prints; ``query`` has options for git, then the path."""
     *options, path = query
-    commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
+    commits = [str(commit_of(repo, tip).id), *([f"^{after}"] if after else [])]
     with git.Repo(repo.path) as opened:
         output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
     return [found for found in output.split("\0") if found]

@@ -50,7 +50,10 @@ def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None without a file; InvalidInput if it is not valid."""
+    """Return the claim at a path, or None if there is no file.
+
+    Raises InvalidInput if the file is not valid.
+    """
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 

@@ -160,7 +160,7 @@ class Journal:
                 self._file.truncate(self._size)
             except OSError:  # a restart could read demands that this process refuses
                 self._unsound = Unsound(
-                    f"the journal {self._path} cannot be written or cut back: {error.strerror}; "
+                    f"the journal {self._path} cannot be written or truncated: {error.strerror}; "
                     "check its disk, then start again"
                 )
                 self.require_sound()
