@@ -57,7 +57,7 @@ def statuses(
     a new commit does not hide the health of unchanged releases.
     """
     changed = cache(changed)
-    known = _Known(history)
+    known = _CachedHistory(history)
     objects = {name: store.objects() for name, store in caches.items()}
     unread: dict[ClusterDomain, Health | None] = {}
     found = []
@@ -87,8 +87,8 @@ def _is_among(paths: Collection[str], target: Target) -> bool:
     return any(path.endswith(end) for path in paths)
 
 
-class _Known:
-    """Caches the results of a history, because the releases of a domain need the same ones."""
+class _CachedHistory:
+    """Caches the results of a history, because all releases of a domain need the same ones."""
 
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)

@@ -135,7 +135,7 @@ class HealthReader(ABC):
         """
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return the health of a release of a commit.
+        """Return the health of a release at ``commit``.
 
         The state is ``waiting`` until the domain has applied the commit.
         """
@@ -147,7 +147,7 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a release of a commit that the domain has already applied.
+        """Return the health of a release at ``commit``, which the domain has applied already.
 
         A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
         gone.
@@ -219,7 +219,7 @@ class HealthReader(ABC):
 
 
 def name_of(key: Key) -> str:
-    """Return the name of an object for people: ``Deployment perception/od-edge``."""
+    """Return kind, namespace and name of an object as text: ``Deployment perception/od-edge``."""
     kind, namespace, name = key
     return f"{kind} {namespace}/{name}"
 

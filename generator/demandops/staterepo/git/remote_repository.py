@@ -228,7 +228,7 @@ class RemoteRepository(StateRepository):
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         except (pygit2.GitError, OSError) as error:  # the next fetch moves the reference
             log.warning(
-                "%s was pushed, but its clone %s cannot record this: %s",
+                "commit %s was pushed, but the clone %s cannot record this: %s",
                 commit,
                 self._folder,
                 error,

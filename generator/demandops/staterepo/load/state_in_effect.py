@@ -149,7 +149,10 @@ def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
 def recorded_state(
     repo: Repository, record: LogEntry, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at a commit of the generator; raise if the record is not valid."""
+    """Return the state in effect that a commit of the generator records.
+
+    Raises InvalidInput or StateRepoError if the record is not valid.
+    """
     commit = trees.commit_of(repo, record.commit)
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)
