@@ -101,7 +101,9 @@ class ObjectCache:
             self._unread = reason
 
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read the ``wanted`` objects now, in their order; one watch may lag behind another.
+        """Read the ``wanted`` objects now, one after the other.
+
+        Watches may lag behind each other, so the objects in the cache may be of different times.
 
         Raises:
             Exception: from the library, if the cluster does not answer.

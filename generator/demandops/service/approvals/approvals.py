@@ -409,9 +409,9 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return a demand's request if it is a release; None if not, or if it cannot be carried out.
+    """Return a demand's request if it is a release that can be carried out, else None.
 
-    It cannot be carried out if it is withdrawn, or if its goal is refused.
+    A demand that is withdrawn, or whose goal is refused, cannot be carried out.
     """
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None

@@ -114,7 +114,7 @@ def _demands(decision: Decision) -> Iterable[str]:
 
 
 def _list(head: str, items: Iterable[object]) -> list[str]:
-    """Return the lines of a paragraph, ``head`` and one for each item; none if it has no item."""
+    """Return ``head`` and a line for each item; without items, return no lines."""
     lines = [f"  {item}" for item in items]
     return [head, *lines] if lines else []
 

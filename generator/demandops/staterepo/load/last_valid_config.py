@@ -146,10 +146,10 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return the broken files, and all files that must apply together with them.
+    """Return the broken files, and all files that apply only together with them.
 
-    A file must apply together with the other files of a commit that changed it, and of its
-    application definition. This is repeated for each file that is found.
+    A file applies only together with all files of each commit that changed the file, and with all
+    files of its application definition. The search goes on with each file that is found.
     """
     together = set(broken)
     merges = [

@@ -208,7 +208,7 @@ class Judgement:
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
-        return self._without(self.advance, _together(faults, self.refused))
+        return self._without(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
         """Return the state in effect with the old configuration, and the accepted changes.
@@ -300,11 +300,11 @@ def judge(
     refused = refused_in(state) if held_back is None else _recorded(advance, held_back)
     if state.config == old.config:
         return Judgement(repo, before, advance, with_new, with_new, refused, old)
-    with_old = _together(faults_in(old), refused_in(old))
+    with_old = _merged(faults_in(old), refused_in(old))
     return Judgement(repo, before, advance, with_new, with_old, refused, old)
 
 
-def _together(one: Faults, other: Faults) -> Faults:
+def _merged(one: Faults, other: Faults) -> Faults:
     return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
 
 

@@ -110,17 +110,17 @@ def parsed_lint(out: str, chart: str) -> Report:
     for entry in re.split(r"\n(?=\[|\n)", out):
         match = _LINT.match(entry.strip())
         if match:
-            found[match["level"]].append(_told(entry.strip()[match.start("text") :], chart))
+            found[match["level"]].append(_fault(entry.strip()[match.start("text") :], chart))
     return Report(faults=tuple(found["ERROR"]), warnings=tuple(found["WARNING"]))
 
 
 def parsed_error(err: str, chart: str) -> Fault:
     """Return helm's error message as a fault, with the template and line that it names."""
     text = err.partition("Error: ")[2] or err
-    return _told(text.partition("\n\nUse --debug")[0].strip(), chart)
+    return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
 
 
-def _told(text: str, chart: str) -> Fault:
+def _fault(text: str, chart: str) -> Fault:
     places = [*_PLACE.finditer(text)]
     place = places[-1] if places else None
     file = place["path"] if place else chart

@@ -115,7 +115,7 @@ class Journal:
             with self._explained():
                 self._write([entry.record() for entry in entries], durably=True)
             self.pending.update((entry.operation, entry) for entry in entries)
-            self._bound()
+            self._rewrite_if_large()
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
@@ -134,7 +134,7 @@ class Journal:
         if done and not durably:
             with suppress(OSError):
                 self._write(records, durably=False)
-        self._bound()
+        self._rewrite_if_large()
 
     def close(self) -> None:
         """Close the journal; pending demands stay for the next process."""
@@ -167,7 +167,7 @@ class Journal:
             raise
         self._is_broken, self._chain, self._size = False, chain, self._size + len(text)
 
-    def _bound(self) -> None:
+    def _rewrite_if_large(self) -> None:
         if self._size > self._limit:
             with suppress(OSError):  # the next write tries again
                 self._rewrite()

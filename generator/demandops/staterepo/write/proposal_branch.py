@@ -115,7 +115,7 @@ class ProposalBranches:
         """Move or delete a branch; return the link that the server printed, or an empty text."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
-            self._set_here(reference, commit, expected)
+            self._set_reference(reference, commit, expected)
             return ""
         try:
             spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
@@ -130,7 +130,7 @@ class ProposalBranches:
                 raise BranchMoved(branch) from None
             raise self._remote.push_error(error) from None
 
-    def _set_here(self, reference: str, commit: Oid | None, expected: str) -> None:
+    def _set_reference(self, reference: str, commit: Oid | None, expected: str) -> None:
         references = self._repository.objects.references
         now = str(references[reference].target) if reference in references else ""
         if commit is None and not now:
