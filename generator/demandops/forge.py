@@ -69,15 +69,15 @@ class Forge(ABC):
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Return whether the forge's JSON is about a merged pull request.
+        """Return whether ``data``, the forge's JSON for a pull request, says that it is merged.
 
         Raises KeyError or TypeError if ``data`` is not about a pull request.
         """
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the pull request for a branch, in any state; open one if there is none.
+        """Return the branch's pull request, in any state; open one if there is none.
 
-        A branch gets only one pull request. If that one is closed, no other is opened.
+        A branch gets only one pull request: if the pull request is closed, no other is opened.
         """
         existing = self.find(branch, target)
         if existing is not None:
@@ -89,7 +89,7 @@ class Forge(ABC):
             existing = self.find(branch, target) if error.status == self.EXISTS else None
             if existing is None:
                 raise
-            return existing  # the answer to an earlier call was lost
+            return existing  # an earlier call opened it, but its answer was lost
 
     def close(self, request: PullRequest) -> None:
         """Close a pull request without merging it."""

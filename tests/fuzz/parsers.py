@@ -154,7 +154,7 @@ def file_of_the_reference(data: bytes) -> None:
     """What is read from a file of the reference can be mapped, and gives goals."""
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)
-    joins, _ = imported_goals.held(files)
+    joins, _ = imported_goals.remaining_joins(files)
     proposed, _ = reference_map.propose(joins, files, _config())
     text = strict_yaml.dump(proposed)
     mapped = parse_file(reference_map.ReferenceMap, text, "map.yaml")
@@ -589,8 +589,8 @@ def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
 def cluster_objects(objects: dict[Any, Any]) -> None:
     for place in (test_flux.PLACE, test_argocd.PLACE):
         reader = health_reader(place)
-        for by_helm, wanted in ((True, True), (True, False), (False, True), (False, False)):
-            target = ReleaseTarget(place, "od-edge", by_helm=by_helm, wanted=wanted)
+        for is_service, wanted in ((True, True), (True, False), (False, True), (False, False)):
+            target = ReleaseTarget(place, "od-edge", is_service=is_service, wanted=wanted)
             for judge in (reader.health, reader.release_health):
                 found = judge(target, "b", objects, Letters())
                 assert isinstance(found.reason, str)

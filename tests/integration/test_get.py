@@ -407,7 +407,7 @@ class TestStatus:
             assert ran.code == 1
             assert (
                 "cluster 'c-its' does not have the current bootstrap/c-its.yaml (access domains: "
-                "perception); an administrator of it applies it: git show "
+                "perception); an administrator of the cluster applies it: git show "
                 "main:bootstrap/c-its.yaml | kubectl apply -f -\n"
             ) in ran.out
             assert "clusters with an old bootstrap file: 1" in ran.err

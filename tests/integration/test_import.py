@@ -164,11 +164,12 @@ def test_a_broker_and_a_topic_that_only_the_cluster_knows_are_told(migration: Mi
         "warning: mqtt-connection-vehicle02-edge: its broker service-mqtt-broker-edge:1993 is not "
         "in inventory/brokers.yaml; add it there, or leave it to the program to choose one",
         "warning: mqtt-connection-vehicle02-edge: earlier requests also listed "
-        "/vehicles/vehicle02/ego_data; its clients may carry them, so add to the map what is still "
-        "needed",
+        "/vehicles/vehicle02/ego_data; its clients may still carry these topics, so add to the map "
+        "those that are needed",
     ]
 
 
+NO_VERSION = "is not a number; the keys of requests are the versions of the resource"
 UNKNOWN = (
     "is no file of the reference; give its operators' bookkeeping and versioning files, and its "
     "custom resources as `kubectl get -o yaml` prints them"
@@ -180,8 +181,9 @@ UNKNOWN = (
     [
         (
             "",
-            "is empty: an operator was stopped while it wrote it; leave the file out, or write in "
-            "it who holds what, such as 'mqtt-connection-vehicle00-edge: [vehicle00]'",
+            "is empty: an operator was stopped while it wrote the file; leave the file out, or "
+            "list in it who holds each resource, such as "
+            "'mqtt-connection-vehicle00-edge: [vehicle00]'",
         ),
         ("[]", UNKNOWN),
         ("vehicle00: [a]", f"vehicle00: {UNKNOWN}"),
@@ -191,17 +193,17 @@ UNKNOWN = (
             "kind: 'Pod' is not a kind of the reference: MqttConnection, ObjectDetection, "
             "ObjectFusion",
         ),
-        ("od-a: {'1x': {}}", "od-a.1x: is not the version of a resource, which is a number"),
+        ("od-a: {'1x': {}}", f"od-a.1x: {NO_VERSION}"),
         (
             f"od-a: {{'{'9' * 30}': {{}}}}",
-            f"od-a.{'9' * 30}: is not the version of a resource, which is a number",
+            f"od-a.{'9' * 30}: {NO_VERSION}",
         ),
         ("od-a: {'1': {requester: [a]}}", "od-a: 1: shutdown: is missing; add it"),
         ("of-a: {topicsEgoData: {}}", "of-a: topicsObjectlist: is missing; add it"),
         (
             "of-edge-object-detection-fusion: [a]",
-            "of-edge-object-detection-fusion: is in two files, which may be of different times; "
-            "give one of them",
+            "of-edge-object-detection-fusion: is in two files, which may be from different times; "
+            "give only one of them",
         ),
     ],
 )

@@ -140,8 +140,8 @@ def test_a_generator_without_a_key_warns_once_where_keys_are_listed(
 ) -> None:
     warning = (
         "policy/allowed-signers lists who may sign, but this generator has no key; `verify` will "
-        "refuse its commits, and generators will take them for a person's; start the generator "
-        "with --signing-key"
+        "refuse its commits, and generators will treat them as commits by a person; start the "
+        "generator with --signing-key"
     )
     with rig.running(bare) as generator:
         rig.book(generator, rig.goal(1))

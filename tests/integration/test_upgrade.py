@@ -398,7 +398,7 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
         assert (ran.code, ran.out, ran.err) == (1, "", f"error: {OLDER}\n")
     assert newer("bookkeeping").code == 0
     assert [row["skipped"] for row in json.loads(newer("verify", "--output", "json").out)] == [
-        "rendered by version 2, this is version 3"
+        "rendered by version 2, but this program renders version 3"
     ]
     assert state.tip == before
 

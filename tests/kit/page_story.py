@@ -95,7 +95,7 @@ class Story:
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)
         for release, target in self.follower.at(commit).commit_state.targets:
-            if target.by_helm:
+            if target.is_service:
                 fault = FAULT if release.name == FAILING and not mended else ""
                 self.api.service(NAMESPACE, release.name, fault, since)
             else:

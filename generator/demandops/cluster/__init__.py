@@ -1,4 +1,4 @@
-"""Stage 8: the clusters that follow the state repo.
+"""Stage 8: wakes the controllers of the clusters, and follows the state of releases there.
 
 Only this folder knows the Kubernetes API.
 """

@@ -1,4 +1,4 @@
-"""Which bootstrap files clusters have: those of the state repo, or older ones."""
+"""Finds the clusters whose bootstrap file is older than the one in the state repo."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class OldBootstrap:
         """Return a sentence about the cluster, with the remedy."""
         return (
             f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
-            f"{', '.join(self.domains)}); an administrator of it applies it: {self.command}"
+            f"{', '.join(self.domains)}); an administrator of the cluster applies it: "
+            f"{self.command}"
         )
 
 
@@ -40,7 +41,7 @@ def old_bootstraps(
     Args:
         domains: the access domains on each cluster.
         caches: the objects that were read from each cluster.
-        read: returns the text of a file of the state repo, None if there is none.
+        read: returns the text of a file of the state repo, or None if the file is missing.
     """
     found = []
     for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
@@ -51,7 +52,7 @@ def old_bootstraps(
             domain.name
             for domain in domains
             if domain.cluster == cluster
-            and store.unread(domain) is None
+            and store.unknown_health(domain) is None
             and digest_of(objects.get(health_reader(domain).follower(domain)) or {}) != digest
         )
         if digest and old:

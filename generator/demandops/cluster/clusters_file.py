@@ -1,8 +1,8 @@
-"""The operator's file with the access to each cluster. It is optional and not in the state repo.
+"""Reads the operator's file with the access to each cluster (``serve --clusters``).
 
-With a kubeconfig, the generator reads a cluster's objects and wakes its controller after a push.
-With a webhook of Flux or Argo CD, it can only wake the controller. The secret that signs webhook
-calls is in a separate file.
+The file is optional, and not in the state repo. With a kubeconfig, the generator reads a cluster's
+objects and wakes its controller after a push. With a webhook of Flux or Argo CD, the generator can
+only wake the controller. The secret that signs webhook calls is in a separate file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
-    """Raised when the operator's files give no usable access; the message contains no secret."""
+    """Raised when the operator's files give no usable access; its text contains no secret."""
 
 
 class ClusterAccess(FrozenModel):

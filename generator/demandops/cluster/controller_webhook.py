@@ -44,7 +44,7 @@ def call_argocd(
         repo: the URL from which Argo CD fetches the state repo.
         before: the commit of the last call; empty if there was none.
         after: the commit that was pushed.
-        paths: the changed files; with ``None``, Argo CD refreshes all Applications of the repo.
+        paths: the changed files; with None, Argo CD refreshes all Applications of the repo.
 
     Raises:
         NoAccess: if the repo's URL names no host; Argo CD needs the host to identify the repo.
@@ -77,14 +77,14 @@ def web_address(repo: str) -> str:
         host, path = parts.hostname or "", parts.path.removeprefix("/")
     if not host:
         raise NoAccess(
-            "the state repo's URL names no host, by which Argo CD knows it; write "
+            "the state repo's URL names no host, but Argo CD needs it to recognize the repo; write "
             "https://HOST/PATH or ssh://USER@HOST/PATH in demandops.yaml: argocd.url"
         )
     return f"https://{host}/{path.removesuffix('.git')}"
 
 
 def signature(secret: bytes, body: bytes) -> str:
-    """Return the HMAC of a body in the format of both controllers."""
+    """Return the HMAC of a body, in the format that Flux and Argo CD expect."""
     return f"sha256={hmac.new(secret, body, hashlib.sha256).hexdigest()}"
 
 

@@ -1,9 +1,9 @@
 """Leadership: of several generators for one state repo, the leader answers the ROS actions.
 
 Any number of generators may write to a state repo, but only one node may serve an action's name. So
-the processes compete for a Kubernetes Lease. Its holder, the leader, renews it; the others stand
-by. Nothing depends on the clocks of other machines: a process counts the time since it saw the
-Lease change.
+the processes compete for a Kubernetes Lease. The holder of the Lease is the leader, and renews it;
+the others stand by. Nothing depends on the clocks of other machines: a process counts the time
+since it saw the Lease change.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ log = logging.getLogger("demandops")
 _LEASE_S = 15
 """How many seconds a Lease is valid if nobody renews it."""
 _RENEW_S = 10
-"""How many seconds a leader tries to renew its Lease. If it fails, its process ends."""
+"""How many seconds a leader tries to renew its Lease. If that fails, its process ends."""
 _CALL_S = 2
 """How many seconds a call of the API may take. A renewal has two calls, and must end in time:
 ``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
@@ -83,7 +83,7 @@ class Leadership:
         self._thread = runtime.keep_running("leader-lease", self._run)
 
     def close(self) -> None:
-        """Stop competing. A leader releases the Lease, so another process leads at once."""
+        """Stop competing; a leader releases the Lease, so that another process leads at once."""
         self._closed.set()
         self._thread.join(2 * _CALL_S)
         if self.is_leader:
@@ -91,7 +91,7 @@ class Leadership:
             try:
                 self._write(self._read(), "")
             except Exception as error:  # the Lease expires on its own
-                log.warning("the Lease %s is not released: %s", self._lease, _reason(error))
+                log.warning("the Lease %s could not be released: %s", self._lease, _reason(error))
 
     def _run(self) -> None:
         while not self._closed.is_set():

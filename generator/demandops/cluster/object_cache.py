@@ -1,4 +1,4 @@
-"""A cache of a cluster's objects. Background watches keep it current, so reading it never waits."""
+"""A cache of a cluster's objects; watches keep it current, so that reading it never waits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """The objects of one cluster that callers asked for."""
+    """The objects of one cluster that :meth:`watch` or :meth:`read_once` was called for."""
 
     def __init__(
         self,
@@ -62,12 +62,12 @@ class ObjectCache:
             self._runtime.keep_running(name, partial(self._keep_watching, selector))
 
     def objects(self) -> dict[Key, dict[str, Any]]:
-        """Return the objects that are known now."""
+        """Return the objects that have been read so far, by kind, namespace and name."""
         with self._lock:
             return dict(self._objects)
 
     def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
-        """Return why some of the objects are unknown now; empty if all are known."""
+        """Return why some of the ``wanted`` objects are unknown now; empty if all are known."""
         with self._lock:
             for selector in wanted:
                 if selector in self._errors:
@@ -76,8 +76,8 @@ class ObjectCache:
                     return self._unread
         return ""
 
-    def unread(self, domain: ClusterDomain) -> Health | None:
-        """Return a health that says why a domain's objects are unknown; None if they are known."""
+    def unknown_health(self, domain: ClusterDomain) -> Health | None:
+        """Return a health with the reason why a domain's objects are unknown; None if known."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
@@ -96,15 +96,14 @@ class ObjectCache:
                 self._errors[selector] = _reason(selector, error)
 
     def give_up(self, reason: str) -> None:
-        """Stop waiting for objects that have not been read yet.
-
-        :meth:`why_unknown` then returns ``reason`` for these objects.
-        """
+        """Have :meth:`why_unknown` return ``reason`` for objects that have not been read yet."""
         with self._lock:
             self._unread = reason
 
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read objects again, in the given order, because one watch may lag behind another.
+        """Read the ``wanted`` objects now, one after the other.
+
+        Watches may lag behind each other, so the objects in the cache may be of different times.
 
         Raises:
             Exception: from the library, if the cluster does not answer.
@@ -209,7 +208,7 @@ class ObjectCache:
 
 
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    """Return the arguments of an API call that selects objects.
+    """Return the arguments of an API call that lists or watches the selected objects.
 
     A call for a single object needs fewer rights than one for a namespace.
     """
@@ -222,7 +221,7 @@ def _request(selector: ObjectSelector) -> dict[str, str]:
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether an error is an answer of the cluster, so that the cluster is reachable."""
+    """Return whether the cluster answered with this error, so that it is reachable."""
     return bool(getattr(error, "status", None))
 
 

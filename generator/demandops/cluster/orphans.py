@@ -61,7 +61,7 @@ def orphans(
     needed = {(target.domain, health_reader(target.domain).key(target)) for target in targets}
     for domain in sorted(domains, key=lambda one: (one.cluster, one.name)):
         store = caches.get(domain.cluster)
-        if store is None or store.unread(domain):
+        if store is None or store.unknown_health(domain):
             continue
         read, objects = health_reader(domain), store.objects()
         if not read.domain_health(domain, commit, objects, history).reaches("reconciled"):

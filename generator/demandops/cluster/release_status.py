@@ -20,7 +20,7 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class ReleaseStatus:
-    """What a cluster reports about a release.
+    """The health of a release, as its cluster reports it.
 
     ``seen`` is the commit that the cluster has applied. ``since`` is the time when the state last
     changed. Both are empty if the cluster does not report them.
@@ -40,7 +40,7 @@ _NO_ACCESS = ReleaseStatus(Health("waiting", "no access to this cluster"))
 
 
 ChangedPaths = Callable[[str, str], "Collection[str] | None"]
-"""Returns the paths in which two commits differ; None if that is not known."""
+"""A function of two commits that returns the paths in which they differ; None if unknown."""
 
 
 def statuses(
@@ -52,12 +52,12 @@ def statuses(
 ) -> list[ReleaseStatus]:
     """Return the status of each release at a commit, from the caches of the clusters.
 
-    If the cluster has applied only an earlier commit, ``changed`` is asked for the paths in which
-    the two commits differ. If the release's file is not among them, the release counts as applied.
-    So a new commit does not hide the health of unchanged releases.
+    If a cluster has applied only an earlier commit, ``changed`` returns the paths in which the two
+    commits differ. If a release's file is not among these paths, the release counts as applied. So
+    a new commit does not hide the health of unchanged releases.
     """
     changed = cache(changed)
-    known = _Known(history)
+    known = _CachedHistory(history)
     objects = {name: store.objects() for name, store in caches.items()}
     unread: dict[ClusterDomain, Health | None] = {}
     found = []
@@ -68,7 +68,7 @@ def statuses(
             found.append(_NO_ACCESS)
             continue
         if domain not in unread:
-            unread[domain] = store.unread(domain)
+            unread[domain] = store.unknown_health(domain)
         if reason := unread[domain]:
             found.append(ReleaseStatus(reason))
             continue
@@ -87,11 +87,8 @@ def _is_among(paths: Collection[str], target: Target) -> bool:
     return any(path.endswith(end) for path in paths)
 
 
-class _Known:
-    """Caches the answers of a history.
-
-    All releases of a domain ask the same questions.
-    """
+class _CachedHistory:
+    """Caches the results of a history, because all releases of a domain need the same ones."""
 
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)

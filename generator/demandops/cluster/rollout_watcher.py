@@ -118,7 +118,7 @@ class RolloutWatcher:
         return rollout.future
 
     def close(self) -> None:
-        """Stop; open futures are resolved with the current health."""
+        """Stop all watches, and resolve the open futures with the current health."""
         self._closed = True
         self._changed.set()
         self._thread.join(5)
@@ -173,7 +173,7 @@ class RolloutWatcher:
         rollout.confirmed = True
 
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
-        """Resolve a rollout whose timeout is over; add what is known to the reason.
+        """Resolve a rollout whose timeout is over; add causes that are known to the reason.
 
         If a Deployment is not available, the reason also says why its pods do not run. If the
         controller is retrying, the reason also says why the last attempt failed.
@@ -204,7 +204,7 @@ class RolloutWatcher:
     def _health(self, rollout: _Rollout, objects: Mapping[str, Objects]) -> Health:
         def of(target: Target) -> Health:
             cluster = target.domain.cluster
-            return self._caches[cluster].unread(target.domain) or health_reader(
+            return self._caches[cluster].unknown_health(target.domain) or health_reader(
                 target.domain
             ).health(target, rollout.commit, objects[cluster], self._history)
 

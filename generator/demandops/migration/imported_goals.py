@@ -1,4 +1,4 @@
-"""Goals of the reference's action that book what its requesters still hold."""
+"""Goals of the reference's action that book again all that its requesters still hold."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from demandops.migration.remaining_joins import Join, remaining, replayed
 _MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # the numbers of these types in ROS messages
 
 
-def held(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
-    """Return resource → the joins whose holds are not shut down yet, and warnings.
+def remaining_joins(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
+    """Return resource → the joins that no shutdown has undone yet, and warnings.
 
-    Detections are left out, because the applications that use their object lists need them.
+    Detections are left out: a goal for a fusion brings the detections that the fusion needs.
 
     Raises:
         InvalidInput: if the files do not say who holds a resource.
@@ -82,10 +82,10 @@ def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
 
 
 def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list[dict[str, Any]]:
-    """Return goals, oldest first: one for each set of requesters, with all that they hold.
+    """Return goals, oldest first: one for each set of requesters, with all that they hold together.
 
-    If requesters hold the same thing twice, they get a second goal with another id, because the
-    ledger counts a repeated goal once.
+    If requesters hold a resource twice, they get a second goal with another id, because the ledger
+    counts a repeated goal once.
 
     Raises:
         InvalidInput: if the map in ``file`` has no entry for a resource or a topic.

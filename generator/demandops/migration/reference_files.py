@@ -48,7 +48,7 @@ class _Part(BaseModel):
 
 
 class Request(_Part):
-    """The fields of a request that an operator reads."""
+    """A request to an operator: the fields that the operator reads."""
 
     requester: list[str]
     shutdown: bool
@@ -56,7 +56,7 @@ class Request(_Part):
     topics_objectlist: list[str] = Field(default_factory=list, alias="topicsObjectlist")
 
     def holds(self) -> Counter[Hold]:
-        """Return the holds that the request adds, or removes if it is a shutdown."""
+        """Return the holds that the request adds; those that it removes if it is a shutdown."""
         topics = [*self.topics_ego_data, *self.topics_objectlist] or [""]
         return Counter((topic, who) for who in self.requester for topic in topics)
 
@@ -179,7 +179,7 @@ class _FusionBook(_Part):
 
 @dataclass
 class ReferenceFiles:
-    """The content of all files: the spec, the bookkeeping and the requests of each resource."""
+    """The content of all files: the spec, bookkeeping and requests of each resource, by name."""
 
     specs: dict[str, Spec] = field(default_factory=dict)
     books: dict[str, Counter[Hold]] = field(default_factory=dict)
@@ -188,7 +188,7 @@ class ReferenceFiles:
     """The prefixes of the resources whose bookkeeping was given, even if it is empty."""
 
     def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
-        """Return resource name → spec for the resources of one kind."""
+        """Return resource name → spec, for the resources with a spec of this class."""
         return {name: spec for name, spec in sorted(self.specs.items()) if isinstance(spec, kind)}
 
     def names(self) -> list[str]:
@@ -216,8 +216,9 @@ def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
 def _read(found: ReferenceFiles, file: str, document: object) -> None:
     if document is None:
         message = (
-            "is empty: an operator was stopped while it wrote it; leave the file out, or write in "
-            "it who holds what, such as 'mqtt-connection-vehicle00-edge: [vehicle00]'"
+            "is empty: an operator was stopped while it wrote the file; leave the file out, or "
+            "list in it who holds each resource, such as "
+            "'mqtt-connection-vehicle00-edge: [vehicle00]'"
         )
         raise InvalidInput.at("", message, file=file)
     if not isinstance(document, dict):
@@ -266,7 +267,7 @@ def _read_entry(found: ReferenceFiles, file: str, name: str, value: object) -> N
         entries = {}
         for version, request in value.items():
             if not _NUMBER.fullmatch(version):
-                message = "is not the version of a resource, which is a number"
+                message = "is not a number; the keys of requests are the versions of the resource"
                 raise InvalidInput([fault(f"{name}.{version}", message).within(file)])
             entries[int(version)] = parse(Request, request, f"{file}: {name}: {version}")
         _add(found.versions, name, dict(sorted(entries.items())), file)
@@ -281,6 +282,6 @@ Value = TypeVar("Value")
 
 def _add(known: dict[str, Value], name: str, value: Value, file: str) -> None:
     if name in known:
-        message = "is in two files, which may be of different times; give one of them"
+        message = "is in two files, which may be from different times; give only one of them"
         raise InvalidInput([fault(name, message).within(file)])
     known[name] = value

@@ -81,7 +81,7 @@ class ReferenceMap(FileModel):
 
 
 def slug(id: str) -> str:
-    """Return an id in the form that it has in names of the reference's resources."""
+    """Return an id as the names of resources contain it: with ``-`` for each ``_`` and ``/``."""
     return id.replace("_", "-").replace("/", "-")
 
 
@@ -97,12 +97,12 @@ def is_host(broker: Broker, host: str, port: object) -> bool:
 def propose(
     joins: Mapping[str, list[Join]], files: ReferenceFiles, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return a map as plain data, and warnings.
+    """Return a proposed map as plain data, and warnings.
 
-    A field whose value is not known is empty, and a person fills it in.
+    If the value of a field is not known, the field is empty, and a person fills it in.
 
     Args:
-        joins: resource → the joins whose holds are not shut down yet.
+        joins: resource → the joins that no shutdown has undone yet.
         files: has the resources' specs.
         config: has the nodes and brokers of the inventory.
     """
@@ -120,7 +120,7 @@ def propose(
 
 
 class _Inventory:
-    """Reads nodes and brokers from the resources, and guesses the rest from the inventory."""
+    """Finds nodes, topics and brokers for the map in the resources, else in the inventory."""
 
     def __init__(self, files: ReferenceFiles, config: Config) -> None:
         self._connections = files.specs_of(MqttConnection)
@@ -182,7 +182,7 @@ class _Inventory:
             if more := spec.other_topics():
                 self.warnings.append(
                     f"{name}: earlier requests also listed {', '.join(more)}; its clients may "
-                    "carry them, so add to the map what is still needed"
+                    "still carry these topics, so add to the map those that are needed"
                 )
         return {
             "id": f"{source}/{target}" if source and slug(f"{source}/{target}") == id else "",

@@ -1,4 +1,4 @@
-"""The joins that are still held, from what the reference's operators recorded.
+"""The joins that no shutdown has undone yet, from the records of the reference's operators.
 
 The bookkeeping records who holds what, and how often. The versioning file has the requests that led
 to these holds. But for connections and detections the operator later changes the recorded first
@@ -90,7 +90,7 @@ def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
 
 
 def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
-    """Return the bookkeeping that requests result in, if no operator changed a request."""
+    """Return the bookkeeping after these requests, if no operator changed them later."""
     book = Counter[Hold]()
     for request in requests.values():
         if request.shutdown:

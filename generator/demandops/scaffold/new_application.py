@@ -1,7 +1,7 @@
 """A new application: its definition, values, chart, registry entries, README and example demand.
 
-Its services form a chain: the first reads the inputs, each further service reads the outputs of the
-service before. Launch files of one image start all of them. Pure.
+The application's services form a chain: the first reads the inputs, each further one reads the
+outputs of the service before. Launch files of one image start all services. Pure.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ class ServicePlan:
 
 @dataclass(frozen=True, slots=True)
 class ApplicationPlan:
-    """The application to write.
+    """The description of an application to write.
 
-    ``inputs`` maps roles to message types. ``node`` is the node of the example demand.
+    ``inputs`` maps the name of each input to its message type. ``node`` is the node of the example
+    demand.
     """
 
     name: str
@@ -54,7 +55,7 @@ class ApplicationPlan:
 
 
 def refuse_name(name: str, config: Config) -> None:
-    """Refuse an invalid name, and a name that an application, a chart or an image already has.
+    """Refuse a name that is not valid, or that an application, a chart or an image has already.
 
     Raises:
         InvalidInput: if the name is refused.
@@ -99,7 +100,7 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with its inputs: role → an input of the application, or another output."""
+    """Yield each service with its inputs: name → an application's input or a service's output."""
     inputs = {role: role for role in plan.inputs}
     for service in plan.services:
         yield service, inputs
@@ -334,6 +335,6 @@ def _demand(plan: ApplicationPlan, config: Config) -> str:
     path = f"appdefs/{plan.name}/demand.yaml"
     note = (
         f"An example: demandops request {path}\n"
-        "requesters are who asks, by any name that the rules of the access domain allow."
+        "`requesters` lists who demands this, by names that the rules of the access domain allow."
     )
     return document(path, "demand", "Demand", fields, note)

@@ -1,4 +1,4 @@
-"""The container file and the pipelines for the repository of a person's own ROS package.
+"""Writes a container file and pipelines for the repository of a ROS package.
 
 The pipelines test the package, build its image, and propose the image to the state repo, pinned by
 its digest. Pure.
@@ -13,7 +13,7 @@ from demandops.config.repo_settings import as_git_url
 from demandops.errors import InvalidInput
 from demandops.quoting import quoted
 
-_PLACES = {
+_PATHS = {
     "Containerfile": "Containerfile",
     "github-workflow.yml": ".github/workflows/image.yml",
     "gitlab-ci.yml": ".gitlab-ci.yml",
@@ -48,6 +48,6 @@ def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str])
         raise InvalidInput.at("--state-repo", message)
     given = {"NAME": name, "REPOSITORY": repository, "HOST": image["host"], "STATE_REPO": url}
     return {
-        _PLACES[file]: re.sub("@([A-Z_]+)@", lambda found: given[found[1]], text)
+        _PATHS[file]: re.sub("@([A-Z_]+)@", lambda found: given[found[1]], text)
         for file, text in texts.items()
     }

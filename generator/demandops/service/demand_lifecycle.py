@@ -1,4 +1,4 @@
-"""The demands under way: each is in one state, and each change of state is one method.
+"""The demands under way: their states, with a method for each change of state.
 
 | state | the demand | next |
 | --- | --- | --- |
@@ -51,7 +51,7 @@ _NEXT: dict[State, tuple[State, ...]] = {
 
 
 class Demands:
-    """The demands without an answer, and the journal.
+    """The demands that have no answer yet, and the journal.
 
     ``blocked`` is the reason why no demand can be published now; it is empty if demands can be
     published. The text of a :class:`QueueFull` quotes this reason.
@@ -77,7 +77,7 @@ class Demands:
         self._closed = self._woken = False
         self.blocked = ""
 
-    # ---- questions ----
+    # ---- queries ----
 
     @property
     def operations(self) -> tuple[str, ...]:
@@ -87,13 +87,13 @@ class Demands:
 
     @property
     def proposed(self) -> list[Ticket]:
-        """The demands with a proposal."""
+        """The demands on a branch that a person may merge, even those withdrawn since."""
         with self._changed:
             return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
 
     @property
     def unpublished(self) -> int:
-        """How many demands are in the journal and do not await approval."""
+        """The number of demands in the journal that do not await approval."""
         with self._changed:
             return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
 
@@ -110,7 +110,7 @@ class Demands:
     # ---- waiting for demands ----
 
     def close(self) -> None:
-        """Accept no further demands; those that have arrived are still carried out."""
+        """Accept no further demands; the demands that have arrived are still carried out."""
         self._take_in()
         with self._changed:
             self._closed = True
@@ -135,9 +135,10 @@ class Demands:
             return self.has_waiting or not self._closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
-        """Wait for a demand; return the new demands since the last call or :meth:`take`.
+        """Wait for a new demand; return all demands that arrived since the last call.
 
-        The list is empty if ``timeout`` seconds, a withdrawal or :meth:`wake` ended the wait.
+        Demands that :meth:`take` has seen are left out. The list is empty if ``timeout`` seconds,
+        a withdrawal or :meth:`wake` ended the wait.
 
         Raises:
             Unsound: if a failed write left the journal in an unknown state.
@@ -154,7 +155,7 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal the demands that arrived, and fill ``batch`` with up to ``limit`` demands.
+        """Journal the demands that arrived, and fill ``batch`` up to ``limit`` demands.
 
         Raises:
             Unsound: if a failed write left the journal in an unknown state.
@@ -262,7 +263,7 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Put demands that no longer need approval back into the state ``waiting``.
+        """Return demands that no longer need approval to the state ``waiting``.
 
         Each demand is marked as maybe published, because a person may have merged it meanwhile.
         """
@@ -315,7 +316,8 @@ class Demands:
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer the demands that were withdrawn while waiting, and remove them from the batch.
 
-        Withdrawn demands of a proposal are not answered here, but after its branch is deleted.
+        A demand that was withdrawn while it awaited approval is answered later: after its branch is
+        deleted.
         """
         with self._changed:
             withdrawn, self._taken_back = self._taken_back, []
@@ -374,7 +376,7 @@ class Demands:
         try:
             self._journal.mark_done(operations, durably=durably)
         except StateRepoError as error:  # the next successful write makes the removal durable
-            log.error("a demand that was answered may be decided again after a crash: %s", error)
+            log.error("an answer cannot be journaled, so a crash may repeat the demand: %s", error)
             self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
@@ -393,7 +395,7 @@ class Demands:
         self._waiting.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
-        """Stop counting a demand towards its requester's limit, once it is answered or proposed."""
+        """Stop counting a demand towards the limit of its requester."""
         if ticket.proposal is None:
             self._of_requester -= Counter([requester_of(ticket.goal)])
 

@@ -80,15 +80,15 @@ class Evaluator:
                 ticket.notify("committed", f"committed {commit}")
             else:
                 waits = decision.outcome == "waiting"  # the demand waited already
-                commits.note_settled(ticket.operation, "waiting" if waits else "unchanged")
+                commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
                 commit = str(commits.head.commit)
             return receipt_of(ticket, decision, commit, targets)
         except InvalidInput as error:
             if ticket.has_released:  # the demand released a proposal, which had no claims yet
-                commits.note_settled(ticket.operation, "released")
+                commits.record_in_next_commit(ticket.operation, "released")
                 commit = str(commits.head.commit)
                 return Receipt(ticket.operation, ticket.name, "released", commit)
-            commits.note_settled(ticket.operation, "refused")
+            commits.record_in_next_commit(ticket.operation, "refused")
             return error
         except SigningFailed as error:
             return error
@@ -100,7 +100,7 @@ class Evaluator:
             return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of the batch's demands that ``tip`` has already, oldest first.
+        """Return the results of the demands in ``batch`` that ``tip`` records, oldest first.
 
         An earlier attempt pushed these demands but did not answer them: the connection or the
         process ended after the remote accepted the push, or an fsync failed. This method writes

@@ -2,9 +2,9 @@
 
 A demand takes the turn of its first requester. Demands that share an application, a connection or
 a demand id keep their order. Goals of the reference's action that share a requester also keep their
-order, because a join between two equal shutdowns gives the second one an effect. If the next demand
-must follow another demand, the queue returns the other demand first. A rollback or a decommission
-may touch any subject: no demand overtakes it, and it overtakes no demand.
+order, because the second of two equal shutdowns has an effect only if a join came between them. If
+the next demand must follow another demand, the queue returns the other demand first. A rollback or
+a decommission may touch any subject: no demand overtakes it, and it overtakes no demand.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from typing import Any
 from demandops.service.ticket import Ticket
 
 _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
-"""Fields of ordinary goals: a goal with one of them lists the subjects that it touches."""
+"""A goal with any of these fields lists the subjects that it touches."""
 
 
 @dataclass(eq=False)
-class _Place:
-    """The place of a demand in the queue.
+class _Queued:
+    """A demand in the queue.
 
-    ``number`` counts the arrivals. ``subjects`` is None if the demand may touch any subject.
-    ``is_left``: the demand has left the queue.
+    ``number`` is higher for each later arrival. ``subjects`` is None if the demand may touch any
+    subject. ``has_left``: the demand is no longer in the queue.
     """
 
     number: int
     ticket: Ticket
     subjects: frozenset[tuple[str, str]] | None
-    is_left: bool = False
+    has_left: bool = False
 
 
 class FairQueue:
@@ -42,34 +42,34 @@ class FairQueue:
 
     def __init__(self, *, in_order: bool = False) -> None:
         self._in_order = in_order
-        self._places: dict[Ticket, _Place] = {}
-        self._lanes: dict[str, deque[_Place]] = {}
-        self._subjects: dict[tuple[str, str], deque[_Place]] = {}
-        self._barriers: deque[_Place] = deque()
+        self._queued: dict[Ticket, _Queued] = {}
+        self._lanes: dict[str, deque[_Queued]] = {}
+        self._subjects: dict[tuple[str, str], deque[_Queued]] = {}
+        self._barriers: deque[_Queued] = deque()
         self._arrived = 0
 
     def __len__(self) -> int:
         """Return how many demands wait."""
-        return len(self._places)
+        return len(self._queued)
 
     def append(self, ticket: Ticket) -> None:
         """Add a demand at the end of the queue."""
         self._arrived += 1
-        place = _Place(self._arrived, ticket, subjects_of(ticket.goal))
-        self._places[ticket] = place
+        queued = _Queued(self._arrived, ticket, subjects_of(ticket.goal))
+        self._queued[ticket] = queued
         lane = "" if self._in_order else requester_of(ticket.goal)
-        self._lanes.setdefault(lane, deque()).append(place)
-        for subject in place.subjects or ():
-            self._subjects.setdefault(subject, deque()).append(place)
-        if place.subjects is None:
-            self._barriers.append(place)
+        self._lanes.setdefault(lane, deque()).append(queued)
+        for subject in queued.subjects or ():
+            self._subjects.setdefault(subject, deque()).append(queued)
+        if queued.subjects is None:
+            self._barriers.append(queued)
 
     def remove(self, tickets: Collection[Ticket]) -> None:
         """Remove demands; ignore those that are not in the queue."""
         for ticket in tickets:
-            place = self._places.pop(ticket, None)
-            if place is not None:
-                place.is_left = True
+            queued = self._queued.pop(ticket, None)
+            if queued is not None:
+                queued.has_left = True
 
     def popleft(self) -> Ticket:
         """Remove and return the next demand.
@@ -82,7 +82,7 @@ class FairQueue:
             lane = self._lanes.pop(requester)
             first = _next_in(lane)
             if first is not None:
-                self._lanes[requester] = lane  # at the end: the others come first
+                self._lanes[requester] = lane  # add it at the end, so that the others come first
                 break
         while True:
             before = self._before(first)
@@ -92,31 +92,31 @@ class FairQueue:
                 return first.ticket
             first = before
 
-    def _before(self, place: _Place) -> _Place | None:
-        """Return the place of a demand that must leave the queue before ``place``, or None."""
+    def _before(self, queued: _Queued) -> _Queued | None:
+        """Return a demand that must leave the queue before ``queued``, or None."""
         barrier = _next_in(self._barriers)
-        if barrier is not None and barrier.number < place.number:
+        if barrier is not None and barrier.number < queued.number:
             return barrier
-        if place.subjects is None:
-            oldest = next(iter(self._places.values()))
-            return oldest if oldest is not place else None
-        for subject in place.subjects:
+        if queued.subjects is None:
+            oldest = next(iter(self._queued.values()))
+            return oldest if oldest is not queued else None
+        for subject in queued.subjects:
             first = _next_in(self._subjects[subject])
-            if first is not None and first is not place:
+            if first is not None and first is not queued:
                 return first
         return None
 
-    def _forget(self, place: _Place) -> None:
+    def _forget(self, queued: _Queued) -> None:
         """Forget the subjects of a removed demand, except those that a waiting demand touches."""
-        for subject in place.subjects or ():
+        for subject in queued.subjects or ():
             if _next_in(self._subjects[subject]) is None:
                 del self._subjects[subject]
 
 
-def _next_in(places: deque[_Place]) -> _Place | None:
-    while places and places[0].is_left:
-        places.popleft()
-    return places[0] if places else None
+def _next_in(lane: deque[_Queued]) -> _Queued | None:
+    while lane and lane[0].has_left:
+        lane.popleft()
+    return lane[0] if lane else None
 
 
 def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data

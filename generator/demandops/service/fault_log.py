@@ -1,4 +1,4 @@
-"""Logs the problems of the state repo, each once."""
+"""Logs each problem of the state repo once."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class FaultLog:
         self._logged: frozenset[Fault] = frozenset()
         self._warned_of_signers = False
 
-    def tell(self, problems: Iterable[Fault]) -> None:
-        """Log each new fault, and each file that is valid again."""
+    def log_changes(self, problems: Iterable[Fault]) -> None:
+        """Log each fault of ``problems`` that is new, and each file that is valid again."""
         current = list(dict.fromkeys(problems))
         for problem in current:
             if problem not in self._logged:
@@ -39,7 +39,7 @@ class FaultLog:
             self._warned_of_signers = True
             log.warning(
                 "%s lists who may sign, but this generator has no key; `verify` will refuse its "
-                "commits, and generators will take them for a person's; start the generator with "
-                "--signing-key",
+                "commits, and generators will treat them as commits by a person; start the "
+                "generator with --signing-key",
                 allowed_signers.ALLOWED_SIGNERS,
             )

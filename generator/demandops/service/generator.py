@@ -29,8 +29,8 @@ from demandops.staterepo.write.slot import Slot
 log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
-_LAST_S = 5.0
-"""The seconds that a stop still waits for the worker after the timeout of the stop.
+_GRACE_S = 5.0
+"""How many more seconds a stop waits for the worker when the timeout of the stop is over.
 
 A running call of git or ssh-keygen ends sooner.
 """
@@ -60,8 +60,8 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many demands of one requester may be queued. None is for a single
-                client: there is no limit, and all demands keep their order.
+            requester_limit: how many demands of one requester may be queued. With None there is no
+                limit, and all demands keep their order; this is for a single client.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
             with_targets: whether receipts list the releases that a demand needs.
             fetch_interval: seconds between two fetches while no demand arrives. 0 means no fetches
@@ -134,12 +134,15 @@ class Generator:
 
     @property
     def remote_status(self) -> RemoteStatus:
-        """Whether the remote can be reached; any thread may read it."""
+        """Whether the remote can be reached, and why not; any thread may read it."""
         return self._worker.remote.status
 
     @property
     def unpublished(self) -> int:
-        """How many demands are in the journal and await no approval; any thread may read it."""
+        """The number of demands in the journal that do not await approval.
+
+        Any thread may read this.
+        """
         return self._demands.unpublished
 
     @property
@@ -149,7 +152,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """The reason for each failed thread by its name, until the thread recovers.
+        """Thread name → error, for each thread that has failed and not recovered yet.
 
         Any thread may read this.
         """
@@ -231,7 +234,7 @@ class Generator:
 
         Returns:
             A future that returns whether everything was published. It is ready once the worker has
-            ended, or :data:`_LAST_S` after the timeout.
+            ended, or :data:`_GRACE_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:
@@ -245,7 +248,7 @@ class Generator:
         self._thread.join(timeout)
         if self._thread.is_alive():
             self._worker.end_soon()
-            self._thread.join(_LAST_S)
+            self._thread.join(_GRACE_S)
         if self._thread.is_alive():  # the worker may still hold locks
             log.error("the generator did not end; its demands stay in the journal")
             finished.set_result(False)

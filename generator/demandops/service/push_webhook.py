@@ -39,7 +39,7 @@ _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
 
 
 class PushWebhook:
-    """A running server, in a thread of its own; it answers ``/`` for health checks."""
+    """The server of the webhook, in a thread of its own; it answers ``/`` for health checks."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
         """Start the server.

@@ -1,4 +1,4 @@
-"""Whether the remote can be reached, for logs and diagnostics."""
+"""Records whether the remote can be reached, for logs and diagnostics."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A rollback as a goal: plain data that passes through queue and journal like a demand.
 
 Only the command line makes this goal; actions and request files cannot contain it. The goal is
-evaluated on the newest tip, so a rollback works while others write. A claim that is booked before
-this evaluation is newer than the commit to roll back to, like any other later claim.
+evaluated on the newest tip, so a rollback works while others write. A claim that others book before
+this evaluation counts as newer than the commit to roll back to.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dic
 
     Args:
         to: the commit whose claims are booked again.
-        drop_newer: whether the rollback may undo newer claims; if not, newer claims are a fault.
+        drop_newer: whether the rollback may undo newer claims; if not, it fails if there are any.
         reason: why the person rolls back.
         who: the person's name and e-mail address.
     """

@@ -1,4 +1,4 @@
-"""The releases that a demand needs or removes, whose rollout the clusters report."""
+"""The releases that a demand needs or removes, as targets whose rollout can be followed."""
 
 from __future__ import annotations
 
@@ -55,11 +55,14 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
 def domains_of_state(state: State) -> list[ClusterDomain]:
     """Return every access domain of each cluster, including domains without releases."""
     settings = state.config.repo_settings
-    return [place_of(cluster, domain, settings) for cluster, domain in domains_in_use(state.config)]
+    return [
+        cluster_domain(cluster, domain, settings)
+        for cluster, domain in domains_in_use(state.config)
+    ]
 
 
-def place_of(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
-    """Return an access domain on a cluster.
+def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
+    """Return an access domain on a cluster, as :mod:`demandops.cluster` reads it.
 
     With Argo CD, the result names the Application that applies the folder of the domain.
     """
@@ -71,5 +74,5 @@ def place_of(cluster: str, domain: AccessDomain, repository: RepoSettings) -> Cl
 
 def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True) -> Target:
     """Return the target of a release; ``wanted`` says whether its cluster should run it."""
-    place = place_of(release.node.cluster, release.domain, repository)
-    return Target(place, release.name, isinstance(release, ServiceRelease), wanted)
+    domain = cluster_domain(release.node.cluster, release.domain, repository)
+    return Target(domain, release.name, isinstance(release, ServiceRelease), wanted)

@@ -21,11 +21,19 @@ log = logging.getLogger("demandops")
 Stage = Literal[
     "away", "admitted", "booked", "waiting", "committed", "proposed", "pushed", "refused"
 ]
-"""``away``: the state repo cannot be reached or written; the text says why.
+"""A stage of a demand; the demand's listener is called with each.
+
+``away``: the state repo cannot be reached or written now.
+
+``admitted``: the demand is valid. ``booked``: its claims are computed, but not committed yet.
 
 ``waiting``: no node has room for the demand, so it will be booked later.
 
-``refused``: the demand gets an error as its answer, with this text.
+``committed``: the demand has a commit. ``pushed``: this commit is published.
+
+``proposed``: the demand awaits a person's approval.
+
+``refused``: the answer to the demand is an error.
 """
 Listener = Callable[[Stage, str], None]
 
@@ -57,7 +65,7 @@ class Receipt:
 
 @dataclass(eq=False)
 class Ticket:
-    """A demand under way. ``future`` returns its receipt or raises its error.
+    """A demand under way; ``future`` returns its receipt or raises its error.
 
     ``journaled`` returns True as soon as the journal has the demand; from then on, a crash does not
     lose the demand. ``journaled`` returns False if the demand is refused before that; ``future``
@@ -86,7 +94,7 @@ class Ticket:
 
     @property
     def name(self) -> str:
-        """The id in the goal, even in an invalid one; empty if the goal has no id."""
+        """The id that the goal names, even if the goal is not valid; empty if it names none."""
         fields = self.goal if isinstance(self.goal, dict) else {}
         keys = ("id", "request", "demand", "name")
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
@@ -141,7 +149,7 @@ def receipt_of(
 
 
 def reason_of(error: DemandOpsError) -> str:
-    """Return why a demand was refused, for people."""
+    """Return the error of a refused demand as text for people."""
     return error.text_with_codes() if isinstance(error, InvalidInput) else str(error)
 
 

@@ -18,7 +18,7 @@ from demandops.service.evaluation import Evaluator
 from demandops.service.fault_log import FaultLog
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Ticket
-from demandops.service.timing.backoff import LIMIT_EMBEDDED, LIMIT_REMOTE, Backoff
+from demandops.service.timing.backoff import LIMIT_LOCAL, LIMIT_REMOTE, Backoff
 from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.service.timing.own_work import OwnWork
 from demandops.service.timing.polling import PollTimer
@@ -64,13 +64,11 @@ class Worker:
         self._repository, self._demands, self._approvals = repository, demands, approvals
         self._runtime = repository.runtime
         self._evaluator = Evaluator(repository, demands, approvals, with_targets)
-        self._timer = PollTimer(
-            fetch_interval, repository.runtime, embedded=repository.always_current
-        )
+        self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
         self._lease_expiry = LeaseExpiry(repository.runtime)
         self._own_work = OwnWork(repository.runtime)
         self._ahead = ReadAhead()
-        self._batch_limit = LIMIT_EMBEDDED if repository.always_current else LIMIT_REMOTE
+        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._log = FaultLog(repository)
@@ -81,7 +79,7 @@ class Worker:
     # ---- from any thread ----
 
     def fetch_now(self) -> None:
-        """Make a fetch due now."""
+        """Have the worker fetch as soon as no demand waits."""
         self._timer.request()
         self._demands.wake()
 
@@ -95,7 +93,7 @@ class Worker:
 
     def run(self) -> None:
         """Publish demands, until no further demand is accepted and no demand waits."""
-        # people may have decided proposals before the start; a stop must not skip these answers
+        # people may have decided proposals before the start: answer their demands before a stop
         if self._demands.proposed:
             self._work()
         while self._demands.wait(self._seconds_until_due()):
@@ -112,7 +110,7 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                if self.snapshot.problems:  # a released demand may have made a change valid
+                if self.snapshot.problems:  # a change may be valid now, after a release
                     self._try_to_carry_out_changes()
             elif not self._rest:
                 self._follow()
@@ -129,7 +127,7 @@ class Worker:
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
-        """Answer a batch with an error; if the batch is empty, pause following the state repo.
+        """Answer a batch with an error; if the batch is empty, stop fetching for a while.
 
         Raises:
             Unsound: if ``error`` is this error; the process must end, and the journal is kept.
@@ -144,12 +142,12 @@ class Worker:
         if not batch or not isinstance(error, DemandOpsError):
             self._runtime.failed(_NAME, error)
         if not batch:
-            self._take_a_rest()
+            self._begin_rest()
         if not isinstance(error, DemandOpsError):
             error = StateRepoError(f"internal error of the generator: {error!r}; see its log")
         self._demands.fail(batch, error)
 
-    def _take_a_rest(self) -> None:
+    def _begin_rest(self) -> None:
         """Stop following the state repo for a while after a failure."""
         if self._rest.follows_success:
             self._renew_clone_if_damaged()
@@ -187,7 +185,7 @@ class Worker:
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
         while batch or self._ended_leases(self.snapshot):
-            self._require_time()
+            self._require_not_ending()
             try:
                 wait = self._attempt(batch, backoff)
             except Exception as error:
@@ -205,14 +203,14 @@ class Worker:
                 continue
             # wait before the fetch, not after it: the push must follow the fetch closely
             self._wait_to_retry(batch, wait)
-            self._require_time()
+            self._require_not_ending()
             self._demands.take(batch, self._batch_limit)
 
-    def _require_time(self) -> None:
-        """Raise an error if :meth:`end_soon` was called.
+    def _require_not_ending(self) -> None:
+        """Return only if :meth:`end_soon` was not called.
 
         Raises:
-            ShuttingDown: the message says that the next start resumes the demand.
+            ShuttingDown: after :meth:`end_soon`; the next start resumes the demands.
         """
         if self._ends_soon.is_set():
             reason = self._demands.blocked or "the generator stops"
@@ -243,7 +241,7 @@ class Worker:
             return None
         began = self._runtime.monotonic()
         for ticket in part:
-            self._require_time()
+            self._require_not_ending()
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluated(commits, ticket))
             if commits.is_empty:
@@ -277,7 +275,7 @@ class Worker:
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended.
+        """Return a ticket for each demand whose lease has ended, to release its claims.
 
         Return no ticket while a demand waits, because that demand may renew a lease.
         """
@@ -288,13 +286,14 @@ class Worker:
     def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
         """Publish a commit batch and answer its demands; return False if another writer was first.
 
-        If the remote rejects the push for another reason, that is the answer to each demand with a
-        commit, and to each demand that was decided on top of such a commit.
+        If the remote rejects the push for another reason, this error is the answer to all demands
+        except the first ``certain`` ones.
 
         Args:
             commits: the commits of the demands.
             results: the demands and their results, in the order of evaluation.
-            certain: how many of the first results rest on published commits alone.
+            certain: how many demands were decided before the batch had a commit; their results
+                do not depend on the push.
         """
         try:
             published = commits.publish()
@@ -336,7 +335,7 @@ class Worker:
     def _follow(self) -> None:
         """Fetch if a fetch is due, carry out the commits of others, and do own work that is due.
 
-        Own work is the end of an override, a drain, a scale-down or a waiting demand. The worker
+        Own work ends overrides, drains nodes, scales down or books waiting demands. The worker
         reads a repository on this disk each time, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
@@ -362,7 +361,7 @@ class Worker:
             if heads.main != str(self.snapshot.commit):
                 self._repository.refresh()
                 self._try_to_carry_out_changes()
-            # a deleted branch may have been merged; only a main as new as ``heads`` shows that
+            # a deleted branch may be merged, which only a main as new as ``heads`` shows
             if self._repository.includes(str(self.snapshot.commit), heads.main):
                 self._approvals.check(self.snapshot, heads)
         except (Unavailable, PushDenied) as error:
@@ -391,7 +390,7 @@ class Worker:
     def _new_commit_batch(self) -> CommitBatch:
         """Return a commit batch on the newest known tip.
 
-        The batch starts with the effects of people's changes and with own work that is due.
+        Its first commits render people's changes and do own work that is due (:meth:`_follow`).
         """
         tip = self._repository.tip()
         before = self.snapshot
@@ -401,7 +400,7 @@ class Worker:
             advance = self._ahead.advance(self._repository.objects, before, tip)
             commits = CommitBatch(self._repository, advance.snapshot)
             commits.follow(advance, before, self._runtime.now())
-            self._log.tell(commits.head.problems)
+            self._log.log_changes(commits.head.problems)
         self._own_work.commit_due(commits)
         return commits
 

@@ -1,4 +1,4 @@
-"""``demandops init``: a new state repo from the skeleton, rendered once."""
+"""``demandops init``: makes a new state repo from the skeleton, with its rendered files."""
 
 from __future__ import annotations
 
@@ -33,17 +33,16 @@ def init(  # noqa: PLR0913 - what a state repo begins with
     """Make a state repo and return its first commit.
 
     Args:
-        target: a folder that does not exist or is empty; else nothing is written.
+        target: the folder of the state repo; it must be empty or not exist.
         bare: make a bare repository, which the generator can use in place.
         gitops: the GitOps controller, ``flux`` or ``argocd``.
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
-        schemas: name → JSON Schema of a kind of file that people write; for the folder
-            ``schemas/``.
+        schemas: name → JSON Schema, which is written to the folder ``schemas/``.
         signer: signs the first commit.
 
     Raises:
-        StateRepoError: the folder cannot be used.
+        StateRepoError: the folder is not empty or cannot be made; nothing was written.
         InvalidInput: clusters cannot fetch from ``url``.
     """
     target = target.resolve()
@@ -59,7 +58,7 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         shutil.rmtree(partial, ignore_errors=True)
         try:
             commit = _write(partial, content, now, bare, signer)
-            if target.exists():  # it may be the current folder of a shell, so it stays
+            if target.exists():  # keep the folder, because a shell may be in it
                 for part in partial.iterdir():
                     part.rename(target / part.name)
             else:
@@ -77,7 +76,7 @@ def _write(
 ) -> str:
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
-    repo.config["receive.fsckObjects"] = True  # libgit2 cannot read every object that git accepts
+    repo.config["receive.fsckObjects"] = True  # refuse objects that libgit2 cannot read
     repo.config["gc.auto"] = 0  # the generator joins the packs in the background
     objects = NewObjects(repo)
     tree = trees.write(objects, None, content)

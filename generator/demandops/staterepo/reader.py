@@ -1,4 +1,4 @@
-"""Reading a state repo: its commits, snapshots, history and proposals, for the command line."""
+"""Reads a state repo for the command line and the web page: commits, states and history."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from demandops.staterepo.write.slot import Slot
 
 
 class Reader:
-    """An open state repo at its newest commit; a checkout is read at its checked-out commit."""
+    """Reads a state repo at its newest commit, or a checkout at the commit that is checked out."""
 
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
-        """Read from ``repository`` at ``tip``; ``slot`` has the clone, if the repo has a URL."""
+        """Read ``repository`` at the commit ``tip``; ``slot`` has the folder of its clone."""
         self.repository, self._tip, self._slot = repository, tip, slot
         self._objects = repository.objects
 
@@ -50,8 +50,8 @@ class Reader:
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
         """Return a reader of the state repo at an address.
 
-        A URL is cloned, and the clone stays on the disk for later readers. ``only_read`` also
-        allows the folder of a checkout.
+        A URL is cloned, and the clone stays on the disk for later readers. The folder of a checkout
+        is allowed only with ``only_read``.
         """
         slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         try:
@@ -79,8 +79,8 @@ class Reader:
             raise StateRepoError(f"{self.repository.address} cannot be read: {error}") from None
         return str(self._tip)
 
-    def beside(self) -> Reader:
-        """Return another reader of the same fetched commits, for another thread.
+    def for_another_thread(self) -> Reader:
+        """Return a new reader at the same commit, without a fetch, for use in another thread.
 
         Raises:
             StateRepoError: if the state repo cannot be read.
@@ -93,11 +93,11 @@ class Reader:
         return other
 
     def refuse_other_render_version(self) -> None:
-        """Raise a StateRepoError with the remedy if the repo has another render version."""
+        """Raise StateRepoError if the repo has another render version than this program."""
         last_valid_config.refuse_other_render_version(self._tree())
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the id of the commit that a revision or a time names, by default the newest.
+        """Return the id of the commit that a revision or a time names; by default the newest.
 
         Raises StateRepoError if there is no such commit.
         """
@@ -154,7 +154,7 @@ class Reader:
         return self.problems(str(snapshot.commit)) or snapshot.problems
 
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
-        """Return the generated files that a generator has yet to write or remove.
+        """Return the paths of the generated files that a generator has yet to write or remove.
 
         There can be such files only after a commit by a person. If the state cannot be rendered,
         the set is empty.
@@ -176,12 +176,12 @@ class Reader:
         return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        """Return a function from a path to the file's text at a commit, or None."""
+        """Return a function that reads the files of a commit: path → text, None if missing."""
         tree = self._tree(revision)
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        """Return the configuration at the newest commit; raise if it is not valid."""
+        """Return the configuration at the newest commit; raise InvalidInput if it is not valid."""
         return last_valid_config.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
@@ -209,7 +209,7 @@ class Reader:
         return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
-        """Return the commits A and B of ``A..B``, or None and REV of ``REV``."""
+        """Return the ids of A and B if ``spec`` is ``A..B``; None and the id of REV for ``REV``."""
         first, dots, last = spec.partition("..")
         if not dots:
             return None, self.commit(first)
@@ -226,8 +226,8 @@ class Reader:
     ) -> list[Verdict]:
         """Return a verdict on the files and the signature of each of ``commits``.
 
-        ``commits`` are listed oldest first. With ``whole``, each commit is verified whole, and none
-        by its differences from an earlier commit.
+        ``commits`` are listed oldest first. With ``whole``, all files of each commit are rendered
+        again. Otherwise most commits are verified only by their differences from the one before.
         """
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
@@ -240,11 +240,11 @@ class Reader:
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of the release ``name``, or of the last stopped one, or None."""
+        """Return the path of a release's file, even if the release was stopped; else None."""
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
-        """Return the names of all releases that were ever stopped."""
+        """Return the names of all releases that were stopped up to a commit."""
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:
@@ -271,9 +271,10 @@ class Reader:
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
-        """Return the newest ``most`` commits by people that a follow commit renders, newest first.
+        """Return the commits by people whose changes the generator's commit ``entry`` renders.
 
-        If ``entry`` is not a follow commit, return an empty list.
+        The list has the newest ``most`` commits, newest first. It is empty if ``entry`` does not
+        render changes by people.
         """
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
@@ -282,7 +283,7 @@ class Reader:
         return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
     def restoration(self, to: str, **more: object) -> Restoration:
-        """Return the request to roll back to a commit; ``more`` has further fields."""
+        """Return the request to roll back to the commit ``to``; ``more`` are its other fields."""
         return ledger_files.restoration(self._objects, to, **more)
 
     def operator(self) -> Person:
@@ -294,7 +295,7 @@ class Reader:
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
     """Yield a reader of the state repo at an address, and close it after the block.
 
-    ``only_read`` also allows the folder of a checkout.
+    The folder of a checkout is allowed only with ``only_read``.
     """
     try:
         with closing(Reader.of(address, only_read=only_read)) as reader:
@@ -305,7 +306,7 @@ def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
 
 @contextmanager
 def opened_offline(address: str) -> Iterator[Reader | None]:
-    """Yield a reader that does not use the network, or None if the URL was never cloned."""
+    """Yield a reader that does not use the network; None for a URL that was never cloned."""
     if not is_url(address):
         with opened(address) as found:
             yield found

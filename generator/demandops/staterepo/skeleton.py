@@ -51,7 +51,7 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 
 def files_of_library(folder: str) -> dict[str, str]:
-    """Return path → text of the library chart in a folder of a new state repo.
+    """Return path → text of the library chart that ``init`` puts into ``folder``.
 
     Other charts depend on a library chart.
     """

@@ -1,8 +1,8 @@
 """``demandops upgrade``: one commit that renders everything again with this program's version.
 
 The state repo changes to another render version or GitOps controller in this one commit, so two
-versions never undo each other's files. The commit is published like any other: on top of the
-current tip, made again if the tip moves, and never with a forced push.
+versions never undo each other's files. If the tip moves meanwhile, the commit is made again on the
+new tip. It is never pushed by force.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class Upgrade:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """An upgrade, the batch to commit it in, the state after it, and the claims that may change."""
+    """An upgrade, its commit batch, the state after it, and the claims that it may change."""
 
     upgrade: Upgrade
     batch: CommitBatch
@@ -114,14 +114,14 @@ def upgrade(
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.
-        request: the GitOps controller to change to, if any.
+        request: the GitOps controller and the URL to change to, if any.
         now: the time of the commit.
         progress: called with (files read, all files) while the ledger is read.
         signer: signs the commit, if given.
 
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
-        StateRepoError: the state repo cannot be read or written, or other writers moved it at each
+        StateRepoError: the state repo cannot be read or written, or got other commits during each
             attempt.
     """
     with reader.opened(address) as repo:
@@ -181,7 +181,7 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return path → new text of the ledger files whose text this program writes differently."""
+    """Return path → new text of the ledger files whose format this program changes."""
     written = {}
     for path, text in files.items():
         new = text
@@ -196,9 +196,9 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
 
 
 def _refuse_held(state: State) -> None:
-    """Raise InvalidInput if an override holds the file of a release.
+    """Raise InvalidInput if an override with ``hold`` keeps the file of a release unchanged.
 
-    The file would stay as it is, rendered for the old controller.
+    The file would stay rendered for the old controller.
     """
     faults = [
         fault(

@@ -91,7 +91,7 @@ class Follower:
 
     def reader(self) -> Reader:
         """Return a reader of the state repo that the calling thread may use."""
-        return self._reader.beside()
+        return self._reader.for_another_thread()
 
     def at(self, revision: str) -> Situation:
         """Return the situation at a revision, which is a commit or a time.

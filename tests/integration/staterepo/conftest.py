@@ -38,7 +38,7 @@ def http(server: Server) -> str:
 @pytest.fixture
 def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
     """A person who approves demands; all demands need approval, and generators check often."""
-    monkeypatch.setattr(check_timer, "CHECK_EMBEDDED_S", 0.05)
+    monkeypatch.setattr(check_timer, "CHECK_LOCAL_S", 0.05)
     monkeypatch.setattr(check_timer, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")
     return person

@@ -39,7 +39,7 @@ def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_
         assert branches(bare) == [branch]
         assert branch.startswith("demand/demand-1-")
         assert rig.tip(bare) == before and not proposed.ticket.future.done()
-        assert "(asked for by access domain '" in proposed.told[-1][1]
+        assert "(required by access domain '" in proposed.told[-1][1]
         [commit] = rig.commits(bare, f"main..{branch}")
         assert dict(commit.trailers)["Proposal"] == branch
         assert commit.one("Operation-Id") == "op-1"
@@ -512,7 +512,9 @@ def test_gitlab_is_asked_for_a_merge_request_by_push_options(
         "  merge_request.target=main",
         "  merge_request.title=Join edge/fusion-1, vehicle01/edge",
     ]
-    assert options[4].startswith("  merge_request.description=A demand that needs approval, asked")
+    assert options[4].startswith(
+        "  merge_request.description=This demand needs approval, as required"
+    )
     assert "Why: request 'demand-1', received" in options[4]
     assert options[5:] == [
         "  merge_request.remove_source_branch",

@@ -85,10 +85,10 @@ def test_a_pull_request_is_opened_and_its_link_told(
         proposed = Proposed(generator, goal(1))
         branch = proposed.branch
         [pull] = hub.pulls
-        assert f"{branch} {pull['html_url']} (asked for by" in proposed.told[-1][1]
+        assert f"{branch} {pull['html_url']} (required by" in proposed.told[-1][1]
         assert (pull["head"], pull["base"]) == (branch, "main")
         assert pull["title"] == "Join edge/fusion-1, vehicle01/edge"
-        assert "A demand that needs approval, asked for by access domain" in pull["body"]
+        assert "This demand needs approval, as required by access domain" in pull["body"]
         assert "```text\nJoin edge/fusion-1, vehicle01/edge\n" in pull["body"]
         petra.merge(branch)
         assert proposed.outcome() == "booked"

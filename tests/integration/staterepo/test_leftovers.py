@@ -95,7 +95,7 @@ def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> N
     [
         ("", "refs/heads/main: corrupted loose reference file: refs/heads/main"),
         ("x" * 40 + "\n", "refs/heads/main: corrupted loose reference file: refs/heads/main"),
-        ("1" * 40 + "\n", f"its commit {'1' * 40} is not there"),
+        ("1" * 40 + "\n", f"its commit {'1' * 40} is missing"),
     ],
 )
 def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(

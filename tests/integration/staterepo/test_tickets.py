@@ -353,7 +353,7 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
         journal = generator._slot.journal
         file, journal._file = journal._file, Path("/dev/full").open("ab", buffering=0)  # noqa: SIM115
         ticket = generator.submit(goal(1))
-        with pytest.raises(Unsound, match=r"cannot be written or cut back"):
+        with pytest.raises(Unsound, match=r"cannot be written or truncated"):
             rig.receipt(ticket)
         assert ended.wait(rig.PATIENCE_S)
         assert isinstance(runtime.unsound, Unsound)

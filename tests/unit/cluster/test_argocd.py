@@ -20,9 +20,9 @@ URL = "https://git.example/fleet.git"
 COMMITS = Letters()
 PLACE = ClusterDomain("c-its", "perception", "ns", ObjectName("argocd", "demandops-perception"))
 ARGOCD = health_reader(PLACE)
-SERVICE = Target(PLACE, "od-edge", by_helm=True)
-CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
-GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
+SERVICE = Target(PLACE, "od-edge", is_service=True)
+CLIENT = Target(PLACE, "mqtt-a", is_service=False)
+GONE = Target(PLACE, "od-edge", is_service=True, wanted=False)
 FOLDER = {"repoURL": URL, "path": "clusters/c-its/perception", "targetRevision": "main"}
 CHART = "appdefs/od/charts/od"
 OVER = ("Application", "argocd", "demandops-perception")

@@ -147,6 +147,6 @@ def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, pa
 
 def test_a_repository_without_a_host_cannot_be_named() -> None:
     with pytest.raises(
-        clusters_file.NoAccess, match=r"names no host, by which .*; write https://HOST/PATH or "
+        clusters_file.NoAccess, match=r"names no host, but .*; write https://HOST/PATH or "
     ):
         controller_webhook.web_address("file:///srv/fleet.git")

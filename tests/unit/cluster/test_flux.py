@@ -19,9 +19,9 @@ from tests.kit.cluster import Letters, condition, deployment
 
 COMMITS = Letters()
 PLACE = ClusterDomain("c-its", "perception", "ns")
-SERVICE = Target(PLACE, "od-edge", by_helm=True)
-CLIENT = Target(PLACE, "mqtt-a", by_helm=False)
-GONE = Target(PLACE, "od-edge", by_helm=True, wanted=False)
+SERVICE = Target(PLACE, "od-edge", is_service=True)
+CLIENT = Target(PLACE, "mqtt-a", is_service=False)
+GONE = Target(PLACE, "od-edge", is_service=True, wanted=False)
 FLUX = health_reader(PLACE)
 
 

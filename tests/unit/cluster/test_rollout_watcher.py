@@ -19,7 +19,7 @@ def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: P
     file = kubeconfig(tmp_path, AWAY)
     status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
     try:
-        target = Target(ClusterDomain("away", "d", "ns"), "r", by_helm=True)
+        target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
         start = time.monotonic()
         health = status.follow("a" * 40, [target], "healthy", timeout=0.5).result(30)
         assert time.monotonic() - start >= 0.5
@@ -45,7 +45,7 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
 def test_closing_answers_what_is_still_followed(tmp_path: Path) -> None:
     file = kubeconfig(tmp_path, AWAY)
     status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
-    target = Target(ClusterDomain("away", "d", "ns"), "r", by_helm=True)
+    target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()
     assert followed.result(10).state == "waiting"

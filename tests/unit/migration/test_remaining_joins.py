@@ -68,14 +68,14 @@ def test_the_stand_in_keeps_the_books_of_the_recorded_run() -> None:
 
 
 def test_the_versioning_files_tell_who_joined_together() -> None:
-    joins, warnings = imported_goals.held(read(experiment(6), ".yml"))
+    joins, warnings = imported_goals.remaining_joins(read(experiment(6), ".yml"))
     pairs = [("vehicle03", "station00"), ("vehicle02", "station00")]
     assert who(joins[CONNECTION]) == who(joins[FUSION]) == pairs
     assert warnings == []
 
 
 def test_without_them_the_counts_are_kept() -> None:
-    joins, _ = imported_goals.held(read(experiment(6), "bookkeeping"))
+    joins, _ = imported_goals.remaining_joins(read(experiment(6), "bookkeeping"))
     assert who(joins[CONNECTION]) == [("vehicle03", "station00", "vehicle02"), ("station00",)]
 
 
@@ -85,7 +85,7 @@ def test_after_any_goals_the_holds_are_those_of_the_bookkeeping(chance: Random) 
     reference = after(*_goals(chance))
     books = read(reference, "bookkeeping").books
     for wanted in ("bookkeeping", ".yml", ""):
-        joins, warnings = imported_goals.held(read(reference, wanted))
+        joins, warnings = imported_goals.remaining_joins(read(reference, wanted))
         assert {name: holds(joins[name]) for name in joins} == {
             name: book for name, book in books.items() if not name.startswith("od-")
         }
@@ -123,7 +123,7 @@ def _goals(chance: Random) -> list[dict[str, Any]]:
 
 
 def test_the_versioning_of_a_fusion_is_enough() -> None:
-    joins, _ = imported_goals.held(read(experiment(6), "object_fusion_versioning"))
+    joins, _ = imported_goals.remaining_joins(read(experiment(6), "object_fusion_versioning"))
     assert who(joins[FUSION]) == [("vehicle03", "station00"), ("vehicle02", "station00")]
 
 
@@ -136,7 +136,7 @@ def test_the_versioning_of_a_connection_is_not() -> None:
     first, *_ = files.versions[CONNECTION].values()
     assert first.requester == ["vehicle00", "station00", "vehicle01", "station00"]
     with pytest.raises(InvalidInput) as refused:
-        imported_goals.held(files)
+        imported_goals.remaining_joins(files)
     assert str(refused.value) == (
         f"{CONNECTION}: has requests, but no bookkeeping. The requests alone do not tell who holds "
         "it, because the operator adds later requesters to the first one. Give "
@@ -149,11 +149,11 @@ def test_what_was_deleted_is_forgotten_although_its_versions_are_kept() -> None:
     reference = experiment(8)
     files = read(reference, "")
     assert FUSION in files.versions
-    assert imported_goals.held(files) == ({}, [])
+    assert imported_goals.remaining_joins(files) == ({}, [])
 
 
 def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
-    joins, warnings = imported_goals.held(read(experiment(5), "resources"))
+    joins, warnings = imported_goals.remaining_joins(read(experiment(5), "resources"))
     assert {name: who(found) for name, found in joins.items()} == {
         f"mqtt-connection-vehicle0{number}-edge": [(f"vehicle0{number}", "station00")]
         for number in (1, 2, 3)

@@ -61,10 +61,10 @@ def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock)
 
 
 def test_a_repository_on_this_disk_is_looked_at_every_second(clock: Clock) -> None:
-    made = PollTimer(30, clock, embedded=True)
+    made = PollTimer(30, clock, local=True)
     made.finished(reached=True)
     assert made.seconds_until_due() == 1
-    off = PollTimer(0, clock, embedded=True)
+    off = PollTimer(0, clock, local=True)
     assert off.seconds_until_due() is None
 
 

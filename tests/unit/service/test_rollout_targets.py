@@ -25,7 +25,7 @@ def test_a_place_knows_by_which_controller_it_is_kept(
     found = rollout_targets.targets_of_state(decide(state, goal, NOW, files.get).state)
     assert {target.name for release, target in found} == {release.name for release, _ in found}
     assert {target.domain.application for _, target in found} == {application}
-    assert {target.by_helm for _, target in found} == {True, False}
+    assert {target.is_service for _, target in found} == {True, False}
 
 
 def test_a_demand_waits_for_no_release_that_only_others_need() -> None:

@@ -57,7 +57,7 @@ def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:
         "Why: request 'intersection', received 2026-03-01 12:00:07 UTC, asks for 1 application in "
         "the name of vehicle01.\n"
         "\n"
-        "Desired state: unchanged; it runs already, or still for other requesters.\n"
+        "Desired state: unchanged; the releases run already, or still run for other requesters.\n"
         "\n"
         "Operation: join\n"
         "Operation-Id: op-2\n"

@@ -87,7 +87,7 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     if not documents:
         raise click.UsageError("nothing to import: give FILE or --cluster")
     found = reference_files.read(documents)
-    joins, warnings = imported_goals.held(found)
+    joins, warnings = imported_goals.remaining_joins(found)
     for warning in warnings:
         errors.print(f"warning: {warning}")
     if not joins:

@@ -24,7 +24,7 @@ from demandops.cluster.health.release_health import (
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""How many failed objects of a sync a reason lists at most."""
+"""How many failed objects of a sync the reason of a health lists at most."""
 
 
 class ArgoCd(HealthReader):
@@ -40,7 +40,7 @@ class ArgoCd(HealthReader):
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far the Application of a domain's folder has applied a commit."""
+        """Return the health of a domain, from the Application of the domain's folder."""
         name = name_of(self.follower(domain))
         app = objects.get(self.follower(domain))
         if app is None:
@@ -126,7 +126,7 @@ def _applied_commits(app: Object) -> list[str]:
 def _why_outdated(
     domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
 ) -> str:
-    """Return why a status is not about the current spec and commit; empty if it is."""
+    """Return why a service's Application has not applied ``commit`` yet; empty if it has."""
     sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
     if not sync:
         return "has not been compared yet"
@@ -202,7 +202,7 @@ def _sync_message(operation: Object) -> str:
 
 
 def _error(app: Object) -> str:
-    """Return the first condition that is an error, as text; empty if there is none.
+    """Return the first condition of an Application that is an error, as text, or an empty text.
 
     The conditions that are not errors are warnings.
     """

@@ -46,7 +46,7 @@ class Flux(HealthReader):
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return how far a domain's Kustomization has applied a commit."""
+        """Return the health of a domain, from the domain's Kustomization."""
         kustomization = objects.get(self.follower(domain))
         name = name_of(self.follower(domain))
         if kustomization is None:
@@ -114,7 +114,7 @@ class Flux(HealthReader):
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health:
-        del commit, history  # the domain's health has checked the commit
+        del commit, history  # domain_health has checked the commit
         name = name_of(self.key(target))
         status = item.get("status") or {}
         ready = condition(status, "Ready")

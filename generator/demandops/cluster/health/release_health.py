@@ -46,21 +46,21 @@ class ClusterDomain:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A release, and whether it should run.
+    """A release, and whether it should run (``wanted``).
 
-    With ``by_helm``, the release is a service. Otherwise it is the Deployment of a communication
+    With ``is_service``, the release is a service. Otherwise it is the Deployment of a communication
     client.
     """
 
     domain: ClusterDomain
     name: str
-    by_helm: bool
+    is_service: bool
     wanted: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """The state of a domain or a release.
+    """The health of a domain or a release.
 
     ``reason`` says why the next level is not reached, if possible in the controller's words.
     ``object`` is the object that the reason comes from. ``failing`` says whether the reason is a
@@ -78,7 +78,7 @@ class Health:
 
 
 Key = tuple[str, str, str]
-"""Kind, namespace, name."""
+"""The kind, namespace and name of an object."""
 Object = Mapping[str, Any]
 Objects = Mapping[Key, Object]
 
@@ -96,7 +96,7 @@ class History(Protocol):
 
 
 def worst(healths: list[Health]) -> Health:
-    """Return the least advanced health; if several are equal, prefer a failing one.
+    """Return the health with the lowest state; among equal states, a failing one.
 
     The result for an empty list is healthy.
     """
@@ -135,7 +135,7 @@ class HealthReader(ABC):
         """
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return the health of a release of a commit.
+        """Return the health of a release at ``commit``.
 
         The state is ``waiting`` until the domain has applied the commit.
         """
@@ -147,7 +147,7 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a release of a commit that the domain has already applied.
+        """Return the health of a release at ``commit``, which the domain has applied already.
 
         A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
         gone.
@@ -158,7 +158,7 @@ class HealthReader(ABC):
             return self._removal_health(target, item, objects)
         if item is None:
             return Health("reconciled", "does not exist yet", name_of(key))
-        if not target.by_helm:
+        if not target.is_service:
             return deployment_health(item)
         return self._service_health(target, item, commit, objects, history)
 
@@ -175,7 +175,7 @@ class HealthReader(ABC):
 
     def key(self, target: Target) -> Key:
         """Return the key of the object that represents a release."""
-        kind = self.service_kind if target.by_helm else "Deployment"
+        kind = self.service_kind if target.is_service else "Deployment"
         return kind, target.domain.namespace, target.name
 
     @abstractmethod
@@ -185,7 +185,7 @@ class HealthReader(ABC):
     def last_transition(self, target: Target, objects: Objects) -> str:
         """Return when the state of a release last changed; empty if the cluster does not say."""
         status = (objects.get(self.key(target)) or {}).get("status") or {}
-        state = self._service_state(status) if target.by_helm else condition(status, "Available")
+        state = self._service_state(status) if target.is_service else condition(status, "Available")
         return str(state.get("lastTransitionTime", ""))
 
     @abstractmethod
@@ -200,7 +200,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def _made(self, target: Target, deployment: Object) -> bool:
-        """Return whether the controller made a Deployment for a service."""
+        """Return whether a Deployment belongs to the release of a service."""
 
     def _why_not_removed(self, item: Object) -> str:
         """Return why the controller fails to remove a service; empty if no failure is known."""
@@ -216,15 +216,15 @@ class HealthReader(ABC):
         ]
 
     def _removal_health(self, target: Target, item: Object | None, objects: Objects) -> Health:
-        if item is None and not (target.by_helm and self._deployments(target, objects)):
+        if item is None and not (target.is_service and self._deployments(target, objects)):
             return Health("healthy")
-        message = self._why_not_removed(item or {}) if target.by_helm else ""
+        message = self._why_not_removed(item or {}) if target.is_service else ""
         reason = f"is still being removed; {message}" if message else "is still being removed"
         return Health("reconciled", reason, name_of(self.key(target)), failing=bool(message))
 
 
 def name_of(key: Key) -> str:
-    """Return the name of an object for people: ``Deployment perception/od-edge``."""
+    """Return kind, namespace and name of an object as text: ``Deployment perception/od-edge``."""
     kind, namespace, name = key
     return f"{kind} {namespace}/{name}"
 
@@ -251,7 +251,7 @@ def deployment_health(deployment: Object) -> Health:
 
 
 def why_unavailable(pods: Iterable[Any]) -> str:
-    """Return why pods do not run: a container waits, or no node fits; empty if not known."""
+    """Return why pods do not run: a container waits, or no node fits; empty if unknown."""
     for pod in pods:
         for container in pod.status.container_statuses or ():
             waiting = container.state.waiting if container.state else None

@@ -1,4 +1,4 @@
-"""The proposals that await approval, and how each one ends.
+"""The proposals that await approval, and the answers to their demands.
 
 This code runs in the worker thread. A proposal is booked once main has its claims, after a merge
 commit, a squash or a rebase. Until then the worker rebuilds the branch on each new main, so that
@@ -64,7 +64,7 @@ Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Decision]
 
 
 class Approvals:
-    """The proposals that await approval."""
+    """Keeps, updates and ends the proposals that await approval."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class Approvals:
         self._with_targets = with_targets
         self._branches = ProposalBranches(repository)
         self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
-        self._timer = CheckTimer(repository.runtime, embedded=repository.always_current)
+        self._timer = CheckTimer(repository.runtime, local=repository.always_current)
         self._proposals: dict[Key, Proposal] = {}
         self._changed: deque[str] = deque()
         for ticket in demands.proposed:
@@ -103,7 +103,7 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Withdraw each proposal that a demand of the batch releases, and delete its branch.
+        """Withdraw each proposal that a demand of ``batch`` releases, and delete its branch.
 
         The worker calls this before it evaluates the batch. After the deletion nobody can merge
         the proposal. If a person merged it earlier, the batch is evaluated on a tip that includes
@@ -124,11 +124,11 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw each earlier demand of the batch that needs approval and that ``by`` releases.
+        """Withdraw the demands in ``earlier`` that need approval and that ``by`` releases.
 
         Args:
-            earlier: the evaluated demands of the batch. The result of a withdrawn demand becomes
-                :class:`Withdrawn`, in place.
+            earlier: the demands of the batch that are evaluated already, with their results. For a
+                withdrawn demand, the result is replaced by :class:`Withdrawn`.
             by: the next demand of the batch, which may be a release.
             state: the state on which ``by`` will be evaluated.
         """
@@ -152,7 +152,7 @@ class Approvals:
             message = f"'{request.demand}' is a demand of {owners}; choose another demand id"
             self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
             return
-        if proposal is None and (full := self._requester_with_most(request)):
+        if proposal is None and (full := self._requester_over_limit(request)):
             message = (
                 f"{PROPOSAL_LIMIT} demands of {quoted(full)} await approval already; release some, "
                 "or ask a person to decide about them"
@@ -174,8 +174,8 @@ class Approvals:
         proposal.requests.append(request)
         self._changed.append(proposal.branch)
 
-    def _requester_with_most(self, request: DemandRequest) -> str:
-        """Return a requester of ``request`` that has too many proposals, or an empty text."""
+    def _requester_over_limit(self, request: DemandRequest) -> str:
+        """Return a requester of ``request`` with too many proposals already, or an empty text."""
         counts = Counter(name for each in self._proposals.values() for name in each.requesters())
         full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
         return next(full, "")
@@ -295,7 +295,7 @@ class Approvals:
     def _leave_out(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
-        """Update the branch so that it holds only the demands that still need approval.
+        """Update the branch so that it contains only the demands that still need approval.
 
         Returns:
             False if the proposal must be checked again. The proposal then keeps all its demands.
@@ -328,7 +328,7 @@ class Approvals:
             message = self._branches.message(proposal.record.commits[-1])
             body = pull_request_body(message, proposal.reasons)
             self._forge.open(forge, proposal.branch, title_of(message), body)
-            if not self._forge.has_answered(proposal.branch):
+            if not self._forge.was_queried(proposal.branch):
                 return True  # the requester is notified once the link is known
         request = self._forge.pull_request(proposal.branch)
         link = request.link if request else proposal.record.link
@@ -387,7 +387,7 @@ class Approvals:
         self._forget(proposal, close=True)
 
     def _forget(self, proposal: Proposal, *, close: bool) -> None:
-        """Forget a proposal; ``close``: also close its pull request if it is open."""
+        """Forget a proposal; with ``close``, also close its pull request if it is open."""
         self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
         self._forge.forget(proposal.branch, close=close)
 
@@ -409,9 +409,9 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a demand that is a release, or None.
+    """Return a demand's request if it is a release that can be carried out, else None.
 
-    Return None as well if the demand is withdrawn or its goal is refused.
+    A demand that is withdrawn, or whose goal is refused, cannot be carried out.
     """
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None

@@ -4,29 +4,30 @@ from __future__ import annotations
 
 from demandops.runtime import Runtime
 
-CHECK_EMBEDDED_S = 1.0
+CHECK_LOCAL_S = 1.0
+"""The seconds between two checks of the branches in a repository on this disk."""
 CHECK_REMOTE_S = 5.0
-"""The seconds between two checks of the branches; only a check detects a deleted branch."""
+"""The seconds between two checks of a remote's branches; only a check detects a deleted branch."""
 _PAUSE_FACTOR = 9
-"""The pause before the check of a moved main, as a multiple of the last check's duration.
+"""When main moves, the next check waits this many times as long as the last check took.
 
-The pause ends at the latest with the interval.
+It waits no longer than the interval.
 """
 
 
 class CheckTimer:
-    """Decides when the next check is due. After a failed check, it is due after the interval."""
+    """Decides when the next check is due; after a failed check, when the interval has passed."""
 
-    def __init__(self, runtime: Runtime, *, embedded: bool) -> None:
+    def __init__(self, runtime: Runtime, *, local: bool) -> None:
         self._runtime = runtime
-        self._interval = CHECK_EMBEDDED_S if embedded else CHECK_REMOTE_S
+        self._interval = CHECK_LOCAL_S if local else CHECK_REMOTE_S
         self._checked_at: str | None = ""
         self._began = self._rest_until = self._next = 0.0
 
     def is_due(self, tip: str, *, has_news: bool) -> bool:
         """Return whether to check now, with main at ``tip``.
 
-        If ``has_news``, because a proposal changed, a check is due at once, unless the last check
+        ``has_news``: a proposal has changed. A check is then due at once, unless the last check
         failed.
         """
         if has_news and self._checked_at is not None:

@@ -58,15 +58,15 @@ class ForgeWorker:
         self._due.set()
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
-        """Have the forge's thread open a pull request, unless the branch already has a request."""
+        """Have the forge's thread open a pull request, unless the branch already has one."""
         if branch not in self._wanted:
             task = _Task(forge, branch, title, body)
             with self._lock:
                 self._wanted[branch] = task
             self._enqueue(task)
 
-    def has_answered(self, branch: str) -> bool:
-        """Return whether the forge's thread has queried a branch at least once, even in vain."""
+    def was_queried(self, branch: str) -> bool:
+        """Return whether the forge was queried about a branch, even if it did not answer."""
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:

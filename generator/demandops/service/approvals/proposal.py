@@ -188,7 +188,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a raw goal is a shutdown or a release."""
+    """Return whether a goal, as plain data, is a shutdown or a release."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 
@@ -202,10 +202,10 @@ def admit_or_none(state: State, goal: object) -> DemandRequest | None:
 
 
 def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
-    """Return the feedback for a requester while the demand awaits approval."""
+    """Return the text that a requester gets while the demand awaits approval."""
     branch_and_link = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
-    return one_line(f"{_PREFIX}{branch_and_link}" + (f" (asked for by {why})" if why else ""))
+    return one_line(f"{_PREFIX}{branch_and_link}" + (f" (required by {why})" if why else ""))
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
@@ -216,15 +216,15 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 
 
 def pull_request_body(message: str, reasons: Iterable[str]) -> str:
-    """Return the text of a pull request with a commit's message.
+    """Return the text of a pull request; it contains the commit's message.
 
     The message is in a code block, because requesters choose the ids in it. Outside of a code
     block, an id could become a link or a mention.
     """
     fence = _fence(message, 3)
     return (
-        f"{_asked_for_by(reasons)} Merging carries it out; closing it or deleting the branch turns "
-        f"it down.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
+        f"{_required_by(reasons)} Merging carries the demand out; closing this pull request or "
+        f"deleting the branch turns it down.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
     )
 
 
@@ -233,8 +233,8 @@ def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) ->
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = _fence(why, 1)
     description = (
-        f"{_asked_for_by(reasons)} {fence} {why} {fence} Merging carries it out; deleting the "
-        "branch turns it down."
+        f"{_required_by(reasons)} {fence} {why} {fence} Merging carries the demand out; deleting "
+        "the branch turns it down."
     )
     return [
         "merge_request.create",
@@ -251,9 +251,9 @@ def title_of(message: str) -> str:
     return message.split("\n", 1)[0]
 
 
-def _asked_for_by(reasons: Iterable[str]) -> str:
+def _required_by(reasons: Iterable[str]) -> str:
     why = one_line(", ".join(reasons)) or "an access policy"
-    return f"A demand that needs approval, asked for by {why}."
+    return f"This demand needs approval, as required by {why}."
 
 
 def _fence(text: str, shortest: int) -> str:

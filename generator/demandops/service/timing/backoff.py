@@ -17,9 +17,10 @@ LONGEST_TURN_S = 0.4
 
 A writer with a longer delay would lose again to writers that wait less.
 """
-LIMIT_EMBEDDED = 20
+LIMIT_LOCAL = 20
+"""How many demands to publish together at most, in a repository on this disk."""
 LIMIT_REMOTE = 200
-"""How many demands to publish together at most.
+"""How many demands to publish together at most, with one push to a remote.
 
 The limit is higher for a remote, because a push takes about 50 ms. Moving a branch of a repository
 on this disk takes less than 1 ms.
@@ -34,7 +35,7 @@ class Backoff:
         self.published()
 
     def published(self) -> None:
-        """Reset the delays, because commits were published."""
+        """Reset the delays and ``max_demands``, because commits were published."""
         self.max_demands = self._limit
         """How many demands the next attempt may publish."""
         self._turn = self._away = FIRST_PAUSE_S

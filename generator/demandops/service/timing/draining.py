@@ -37,7 +37,7 @@ class Draining:
                 self._tried[node] = tried
                 self._warn(node, map(str, error.faults))
                 continue
-            # a commit may still lose to another writer, so only a try without commit is recorded
+            # a commit may fail to be published, so only a try without commit is recorded
             if not decision.files:
                 self._tried[node] = tried
             for moved in decision.placed:
@@ -52,7 +52,7 @@ class Draining:
         self._logged[node] = texts
 
     def is_due(self, world: World) -> bool:
-        """Return whether to drain a node now."""
+        """Return whether applications are to be moved off a node now."""
         return bool(self._due(world, self._runtime.now()))
 
     def _due(self, world: World, now: datetime) -> list[str]:

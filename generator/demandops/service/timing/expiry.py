@@ -34,7 +34,7 @@ _RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
 class LeaseExpiry:
-    """Decides which leases have ended, and makes the demands that release their claims."""
+    """Decides which leases have ended, and makes a demand to release the claims of each."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -45,7 +45,7 @@ class LeaseExpiry:
         self._next_end: datetime | None = None
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended.
+        """Return a ticket for each demand whose lease has ended, to release its claims.
 
         A demand gets no new ticket in the minute after its last answered ticket. The tickets are
         correct only at the time of the call: later, a requester may have renewed a lease, or a
@@ -73,10 +73,10 @@ class LeaseExpiry:
         return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the current time, and the claims whose lease has ended, sorted by the end.
+        """Return the current time, and the claims whose lease has ended, sorted by their ends.
 
-        The ended claims of one demand are released together. If one of them gets more time after
-        a jump of the clock, none of them is returned.
+        A demand's ended claims are released together. If one of them gets more time after a jump of
+        the clock, none of them is returned.
         """
         now = self._read_clocks()
         ended = ledger.ended_claims(now)
@@ -90,7 +90,7 @@ class LeaseExpiry:
         if its release failed, or if it gets more time after a jump of the clock.
         """
         first = ledger.first_to_end()
-        if first is not self._first:  # computed once, because many leases may end in one minute
+        if first is not self._first:  # a search is slow if many leases end at one time
             self._first, self._next_end = first, ledger.next_lease_end()
         end = self._next_end
         return longest if end is None else _seconds_until(end, self._read_clocks(), longest)

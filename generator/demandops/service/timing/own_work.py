@@ -11,7 +11,7 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 
 class OwnWork:
-    """Ends overrides, scales down, empties drained nodes and books demands that waited."""
+    """Ends overrides, scales down, drains nodes, and books waiting demands that fit now."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -21,7 +21,7 @@ class OwnWork:
         self._waiting_turns = WaitingTurns(runtime)
 
     def commit_due(self, commits: CommitBatch) -> None:
-        """Commit what is due; retry later what failed."""
+        """Commit all work that is due; retry later the work that failed."""
         self._override_expiry.end_due(commits, self._runtime.now())
         self._scale_down.end_due(commits, self._runtime.now())
         self._draining.move_due(commits)
@@ -37,7 +37,7 @@ class OwnWork:
         self._scale_down.postpone(self._runtime.now())
 
     def is_due(self, state: State) -> bool:
-        """Return whether to commit anything now."""
+        """Return whether any such work is due now."""
         now = self._runtime.now()
         return (
             self._override_expiry.is_due(state, now)

@@ -13,7 +13,7 @@ from demandops.runtime import Runtime
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5
-_EMBEDDED_S = 1.0
+_LOCAL_S = 1.0
 """The longest interval for a repository on this disk, because a check reads only one file."""
 
 
@@ -31,20 +31,20 @@ def parse_interval(text: str) -> float:
 
 
 class PollTimer:
-    """The times of the fetches: on request and at an interval that grows while fetches fail.
+    """Decides when to fetch: on request, and at an interval that grows while fetches fail.
 
     Any thread may call :meth:`request`. Only one thread may call the other methods.
     """
 
-    def __init__(self, interval: float, runtime: Runtime, *, embedded: bool = False) -> None:
+    def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
         """Start the timer; the first fetch is due at once.
 
         Args:
             interval: seconds between two fetches; with 0, only :meth:`request` makes a fetch due.
             runtime: provides the time.
-            embedded: whether the repository is on this disk.
+            local: whether the repository is on this disk.
         """
-        self._interval = min(interval, _EMBEDDED_S) if embedded else interval
+        self._interval = min(interval, _LOCAL_S) if local else interval
         self._runtime = runtime
         self._pause = self._interval
         self._last = runtime.monotonic() - _SHORTEST_GAP_S

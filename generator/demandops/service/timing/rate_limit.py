@@ -49,7 +49,7 @@ class RateLimit:
         """
         self._forget_idle(received)
         seen = self._seen.pop(key, None) or deque()
-        self._seen[key] = seen  # at the end, so that the longest idle come first
+        self._seen[key] = seen  # move it to the end: idle requesters come first
         while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
         operations = [known for _, known in seen]

@@ -1,4 +1,4 @@
-"""How long to stop following the state repo after an error; demands are still published."""
+"""How long not to fetch from the state repo after an error; demands are still published."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Rest:
 
     @property
     def follows_success(self) -> bool:
-        """Whether no rest has begun since the last success."""
+        """Whether the last attempt succeeded, so no rest has begun since."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:

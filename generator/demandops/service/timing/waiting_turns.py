@@ -1,7 +1,7 @@
 """When the demands that wait for room are tried again, and in which order.
 
-When a state may have room, the generator tries the waiting demands before it decides new demands.
-So no demand gets the room for which an earlier demand, or a demand of higher priority, was waiting.
+If there may be room, the generator tries the waiting demands before it decides new demands. So no
+demand gets the room for which an earlier demand, or a demand of higher priority, was waiting.
 """
 
 from __future__ import annotations

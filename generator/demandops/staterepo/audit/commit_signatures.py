@@ -1,4 +1,4 @@
-"""Adds to each verdict whether an allowed key has signed the generator's commit."""
+"""Adds the check of the commit's signature to each verdict."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demandops.staterepo.history.commit_log import entry_of
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
     """Return the verdicts, with the result of the check of each commit's signature.
 
-    A verdict no longer holds if a required signature is missing or not valid.
+    If a required signature is missing or not valid, ``holds`` becomes false.
     """
     found = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = allowed_signers.checks(

@@ -46,7 +46,7 @@ class Verdict:
     """The result of verifying one commit.
 
     ``holds`` is true if no fault was found. ``skipped`` is the reason why the commit was not
-    compared, or empty. ``fault`` is the error of rendering the commit again, or empty.
+    verified, or empty. ``fault`` is the error of rendering the commit again, or empty.
     ``differing`` lists the generated files that differ from the rendered ones. ``touched`` lists
     the files that the commit changed, but may not change. ``signature`` is the reason why a
     required signature is not valid, or empty. ``signer`` names who signed the commit, or is empty.
@@ -65,7 +65,7 @@ class Verdict:
 
 
 class _Proof:
-    """The rendered files of a commit; :meth:`advance` reuses them for a later commit."""
+    """The rendered files of a commit; :meth:`advance` keeps those that a later commit needs too."""
 
     def __init__(self, state: State, commit: Commit) -> None:
         self.state, self._commit = state, commit
@@ -110,7 +110,7 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Plan and render the releases that are affected, and render those that overrides hold.
+        """Plan and render the affected releases, and render again those with an override ``hold``.
 
         The affected releases are those of the claims in ``changes`` and of the instances ``kept``.
         """
@@ -150,7 +150,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
     Args:
         repo: the repository.
         commits: the commits to verify, oldest first.
-        whole: verify each commit whole, and none by differences.
+        whole: whether each commit is verified whole, and none by differences.
     """
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
@@ -175,7 +175,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         except _Unreadable as error:
             why = f"a file was not valid then: {error}"
             yield replace(verdict, skipped=why, holds=not verdict.touched)
-        except InvalidInput as error:  # the generator could render it, so a verification must too
+        except InvalidInput as error:  # a fault, because the generator rendered the commit
             yield replace(verdict, holds=False, fault=str(error.faults[0]))
         except StateRepoError as error:
             yield replace(verdict, holds=False, fault=str(error))
@@ -216,7 +216,7 @@ def _skip_reason(entry: LogEntry) -> str:
         return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
     version = entry.first("Render-Version")
     if version != str(RENDER_VERSION):
-        return f"rendered by version {version}, this is version {RENDER_VERSION}"
+        return f"rendered by version {version}, but this program renders version {RENDER_VERSION}"
     return ""
 
 

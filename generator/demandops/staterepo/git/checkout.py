@@ -1,4 +1,4 @@
-"""A checkout of a state repo, for reading: the commit that a person has checked out."""
+"""State repos that are only read: a person's checkout, and the last fetch of a URL."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def is_checkout(folder: Path) -> bool:
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the checkout of a state repo that ``folder`` is or is inside of, or None."""
+    """Return the checkout of a state repo that is or contains ``folder``, or None."""
     return next((one for one in (folder, *folder.parents) if is_checkout(one)), None)
 
 
@@ -57,7 +57,7 @@ class Checkout(LocalRepository):
 
 
 class LastFetch(LocalRepository):
-    """The clone of a URL as it was last fetched, for readers that must not wait for the network."""
+    """The clone of a URL at its last fetch, for readers that must not wait for the network."""
 
     main_reference = f"refs/remotes/origin/{MAIN_BRANCH}"
     branches = "refs/remotes/origin/"

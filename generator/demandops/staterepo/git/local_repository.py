@@ -97,15 +97,15 @@ class LocalRepository(StateRepository):
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
         if self.tip() not in self.objects:
-            raise self._unreadable(f"its commit {self.tip()} is not there")
+            raise self._unreadable(f"its commit {self.tip()} is missing")
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Return the tip, which is always current."""
+        """Return the tip, which is always current; there is nothing to fetch."""
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Move the branch from ``expected`` to ``commit``; return whether this succeeded."""
+        """Move the branch to ``commit``; return False if it is no longer at ``expected``."""
         reference = self.objects.references[MAIN]
         if reference.target != expected:
             return False
@@ -115,7 +115,7 @@ class LocalRepository(StateRepository):
         except (pygit2.GitError, OSError) as error:
             reason = disk_error(error, self.address)
             if isinstance(reason, PushDenied) and self.tip() != expected:
-                return False  # the new tip may be ``commit`` itself, written but not synced
+                return False  # even if the new tip is ``commit``: it may not be synced
             if reason is not None:
                 raise reason from None
             self._break_stale_lock()
@@ -125,7 +125,7 @@ class LocalRepository(StateRepository):
         return True
 
     def write_anew(self, since: str) -> None:
-        """Write the branch, and the commits after ``since``, to new files; sync these files."""
+        """Write the branch and the commits after ``since`` to new files, and sync these files."""
         branch = Path(self.objects.path) / MAIN
         lock = branch.with_name(f"{branch.name}.lock")
         try:

@@ -55,7 +55,7 @@ A remembered folder never becomes outdated, because an id always means the same 
 
 
 class NewObjects(pygit2.OdbBackend):
-    """The objects that were written but not packed yet; the repository reads them like others."""
+    """Objects that are in memory but not in a pack yet; the repository reads them like others."""
 
     def __init__(self, repo: Repository) -> None:
         super().__init__()
@@ -88,7 +88,7 @@ class NewObjects(pygit2.OdbBackend):
         return _entries_of(self.repo[oid].peel(Tree).read_raw()) if known is None else known
 
     def add_folder(self, entries: Entries) -> Oid:
-        """Keep a folder like :meth:`add`, and return its id.
+        """Keep a folder in memory until it is packed, and return its id.
 
         The caller must not change ``entries`` afterwards.
         """
@@ -224,7 +224,7 @@ class NewObjects(pygit2.OdbBackend):
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return type, content and id of the new object with this full id; find no shortened id."""
+        """Return the type, content and id of a new object; shortened ids are not found."""
         kind, data = self._known[oid]
         return kind, data, oid
 

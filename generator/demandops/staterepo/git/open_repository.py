@@ -76,7 +76,7 @@ def connect(
 
 
 def _check_url(url: str) -> None:
-    """Raise StateRepoError if a URL has another scheme, holds a password or token, or no host."""
+    """Raise StateRepoError if a URL has an unknown scheme, a password, a token or no host."""
     scheme = _SCHEME.match(url)
     if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
         raise StateRepoError(

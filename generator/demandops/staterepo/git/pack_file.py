@@ -105,7 +105,7 @@ def _sha1(parts: Iterable[bytes]) -> bytes:
 def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
     """Write and sync a new file that is read-only, like git's packs."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)
-    with open(handle, "wb") as file:  # noqa: PTH123 - of the handle
+    with open(handle, "wb") as file:  # noqa: PTH123 - opens a file descriptor
         file.writelines(parts)
         file.flush()
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""The state repo behind a URL: a bare clone, git's fetches and pushes, and its errors."""
+"""The state repo behind a URL: a bare clone, fetches, pushes, and the errors of git."""
 
 from __future__ import annotations
 
@@ -124,7 +124,8 @@ class RemoteRepository(StateRepository):
         self._folder = folder
         self._aborted = False
         self._process: subprocess.Popen[bytes] | None = None
-        for lock in folder.rglob("*.lock"):  # of a killed process: only this one uses the folder
+        # only this process uses the folder, so a killed process left these locks
+        for lock in folder.rglob("*.lock"):
             lock.unlink(missing_ok=True)
         if not self._is_usable():
             self._clone(notify)
@@ -226,7 +227,12 @@ class RemoteRepository(StateRepository):
         try:
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         except (pygit2.GitError, OSError) as error:  # the next fetch moves the reference
-            log.warning("%s was pushed, but not noted in %s: %s", commit, self._folder, error)
+            log.warning(
+                "commit %s was pushed, but the clone %s cannot record this: %s",
+                commit,
+                self._folder,
+                error,
+            )
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
@@ -339,7 +345,7 @@ class RemoteRepository(StateRepository):
         process = guard.proc
         assert process is not None  # noqa: S101 - it was started just now
         self._process = process
-        if self._aborted:  # by another thread, since the first check
+        if self._aborted:  # another thread has called abort since the first check
             self.abort()
         slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
         try:

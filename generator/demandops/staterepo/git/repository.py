@@ -62,7 +62,7 @@ _TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objec
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
-    """Return the error to raise if the disk caused ``error``, which prevented a write, else None.
+    """Return the error to raise if a write failed with ``error`` because of the disk, else None.
 
     libgit2 gives the system's error only as text, so this function recognizes the text. For an
     I/O error it returns Unsound, because the content of the disk is then unknown.
@@ -86,10 +86,9 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
 
 
 def access_error(error: Exception, address: str) -> Exception:
-    """Return the error to raise if a folder or state repo could not be read or written.
+    """Return the error to raise if reading or writing ``address`` failed with ``error``.
 
-    Only an error of the system or of libgit2 is replaced. Any other error is returned unchanged,
-    because it is a fault of the program.
+    Only an error of the system or of libgit2 is replaced. Any other error is returned unchanged.
     """
     if not isinstance(error, OSError | pygit2.GitError):
         return error

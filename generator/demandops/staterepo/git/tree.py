@@ -161,12 +161,12 @@ def _differences_at(
 
 
 def is_readme(path: str) -> bool:
-    """Return whether this is a README, which people may put next to generated files."""
+    """Return whether a path is a README's, which people may put next to generated files."""
     return path.rsplit("/", 1)[-1] == "README.md"
 
 
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Add a copy of ``base`` with ``files`` changed (``None`` removes a file); return its id.
+    """Write a tree that is ``base`` with ``files`` changed (None removes a file); return its id.
 
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
@@ -175,7 +175,7 @@ def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None
 
 
 def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None]) -> Oid | None:
-    """Add a folder and return its id; ``None`` if it is empty."""
+    """Write a folder with all below it; return its id, or None if the folder is empty."""
     entries = objects.folder(base) if base is not None else {}
     below: dict[bytes, dict[str, str | None]] = {}
     here: dict[bytes, str | None] = {}

@@ -32,9 +32,9 @@ class Check(NamedTuple):
 
 
 _good: dict[str, Check] = {}
-"""Commit → check, for each commit whose signature was found valid.
+"""Commit → result of the check, for each commit whose signature was found valid.
 
-A check stays true, because a commit, its signature and its parent never change.
+A result stays true, because a commit, its signature and its parent never change.
 """
 
 
@@ -54,7 +54,7 @@ def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
 
 
 def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
-    """Return commit → check of each commit whose parent lists the keys."""
+    """Check the signature of each commit whose parent lists the allowed keys: commit → result."""
     signatures, found = dict[str, str](), dict[str, Check]()
     lists: dict[str, list[str]] = {}
     for commit in commits:

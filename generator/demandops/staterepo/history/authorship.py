@@ -1,7 +1,8 @@
 """Authors: who made the commits by people, and who runs this program.
 
-A follow commit renders what people committed. It names their commits, and has their authors as its
-author. A commit is by a person if no generator on any machine made it (:mod:`.commit_log`).
+A follow commit is a commit of the generator that renders what people committed. It names their
+commits, and has their authors as its author. A commit is by a person if no generator on any machine
+made it (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -50,10 +51,11 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return a function from a path to the commit and author of people's last change to the path.
+    """Return a function that finds the commit by a person that caused a fault in a file.
 
-    The function considers the commits after ``known`` up to ``to``. If none of them changed the
-    path, it returns people's last change to any path. If there is none, it returns None.
+    The function gets the file's path, and returns id and author of the last commit by a person that
+    changed the file. It searches the commits after ``known`` up to ``to``. If none of them changed
+    the file, it returns the last commit by a person that changed any file, else None.
     """
 
     @cache  # the commits are read only when needed: most problems are already in the report

@@ -36,7 +36,7 @@ _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
 
 @dataclass(frozen=True, slots=True)
 class LogEntry:
-    """One commit of the state repo, with the content of its message."""
+    """A commit of the state repo, with the parts of its message."""
 
     commit: str
     time: datetime
@@ -56,7 +56,7 @@ class LogEntry:
     """The author's time; for a demand's commit, the time when the demand was received."""
 
     def first(self, key: str) -> str:
-        """Return the first value of a trailer, or an empty text."""
+        """Return the first value of the trailer ``key``, or an empty text."""
         return next(iter(self.trailers.get(key, ())), "")
 
 
@@ -82,7 +82,8 @@ def _text(raw: bytes) -> str:
 def entry_of(commit: Commit) -> LogEntry:
     """Return the log entry of a commit.
 
-    Trailers and reason of a person's commit are left out, unless it merges a proposal.
+    If a person made the commit, its trailers and its reason are left out, unless it merges a
+    proposal.
     """
     text = message_format.parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
@@ -106,12 +107,12 @@ def is_by_generator(repo: Repository, commit: Commit) -> bool:
 
 
 def commits(
-    repo: Repository, tip: str | Oid, until: str | Oid | None = None
+    repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield the commits that ``tip`` includes and ``until`` does not, newest first."""
+    """Yield the commits up to ``tip``, without those up to ``after``; newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
-    if until is not None:
-        hidden = commit_of(repo, until).id
+    if after is not None:
+        hidden = commit_of(repo, after).id
         walker.hide(hidden)
         found = list(walker)
         if any(len(commit.parent_ids) > 1 for commit in found):
@@ -123,20 +124,24 @@ def commits(
 
 
 def person_commits(
-    repo: Repository, tip: str | Oid, until: str | Oid | None = None
+    repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[Commit]:
     """Yield the commits of :func:`commits` that people made."""
-    return (commit for commit, entry in _told_apart(repo, tip, until) if not entry.by_generator)
+    return (
+        commit
+        for commit, entry in _with_checked_signatures(repo, tip, after)
+        if not entry.by_generator
+    )
 
 
-def _told_apart(
-    repo: Repository, tip: str | Oid, until: str | Oid | None
+def _with_checked_signatures(
+    repo: Repository, tip: str | Oid, after: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return what :func:`commits` yields, after a check of the signatures.
+    """Return what :func:`commits` yields, with the signatures of the generator's commits checked.
 
     ``LogEntry.by_generator`` is false if the commit lacks a valid signature that is required.
     """
-    found = list(commits(repo, tip, until))
+    found = list(commits(repo, tip, after))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
     return [
         (each, replace(entry, by_generator=entry.by_generator and entry.commit not in faults))
@@ -152,12 +157,12 @@ def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
 
 
 Settled = Literal["unchanged", "waiting", "released", "refused"]
-"""The outcomes of demands that get no commit of their own; the next commit records them."""
+"""The outcome of a demand that gets no commit of its own; the next commit records it."""
 _Outcome = Literal["changed", Settled]
 
 
 def settled_trailer(outcome: Settled) -> str:
-    """Return the name of the trailer that records a demand without a commit of its own."""
+    """Return the name of the trailer that records a demand with this outcome."""
     return f"{outcome.capitalize()}-Operation-Id"
 
 
@@ -189,7 +194,7 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     except (pygit2.GitError, KeyError, ValueError):
         known = False
     outcomes = {}
-    for _, entry in _told_apart(repo, tip, base if known else None):
+    for _, entry in _with_checked_signatures(repo, tip, base if known else None):
         is_record = entry.by_generator or PROPOSAL in entry.trailers
         for key, outcome in _OUTCOMES.items() if is_record else ():
             waits = key == "Operation-Id" and entry.first("Operation") == "wait"
@@ -229,10 +234,10 @@ class PathHistory:
 
 
 def changes_to(
-    repo: Repository, tip: str | Oid, path: str, until: str | None = None
+    repo: Repository, tip: str | Oid, path: str, after: str | None = None
 ) -> Iterator[PathChange]:
-    """Yield the commits after ``until`` that changed a path, newest first, as ``git log`` does."""
-    for revision in _git_log(repo, tip, until, "--format=%H", f":(literal){path}"):
+    """Yield the commits after ``after`` that changed a path, newest first, as ``git log`` does."""
+    for revision in _git_log(repo, tip, after, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
         yield PathChange(entry_of(commit), before, trees.entry(commit.tree, path) is not None)
@@ -257,9 +262,9 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the release ``name``.
+    """Return the path of the file of the release ``name``.
 
-    If it does not exist, return the path of the last stopped release ``name``, or None.
+    If the release was stopped, return its last path. Return None if it never existed.
     """
     if not _NAME.fullmatch(name):
         return None
@@ -269,7 +274,7 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that ever stopped, from the whole history."""
+    """Return the names of all releases that were stopped at any time in the history."""
     removed = _removed(repo, tip, "*.yaml")
     return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
 
@@ -280,10 +285,10 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 
 
-def _git_log(repo: Repository, tip: str | Oid, until: str | None, *query: str) -> list[str]:
+def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -> list[str]:
     """Return the items that ``git log`` prints; ``query`` has options for git, then the path."""
     *options, path = query
-    commits = [str(commit_of(repo, tip).id), *([f"^{until}"] if until else [])]
+    commits = [str(commit_of(repo, tip).id), *([f"^{after}"] if after else [])]
     with git.Repo(repo.path) as opened:
         output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
     return [found for found in output.split("\0") if found]

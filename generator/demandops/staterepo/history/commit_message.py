@@ -77,9 +77,9 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 
 
 def of_decision(
-    decision: Decision, operation: str, received: datetime, settled: Iterable[tuple[str, str]] = ()
+    decision: Decision, operation: str, received: datetime, more: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``settled`` has further trailers."""
+    """Return the message of a demand's commit; ``more`` are further trailers."""
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     title, why = _title_and_why(decision, received)
@@ -94,8 +94,8 @@ def of_decision(
     trailers = [
         ("Operation", request.operation),
         ("Operation-Id", operation),
-        *settled,
-        *_of_request(decision),
+        *more,
+        *_operation_trailers(decision),
         *(("Demand-Id", demand) for demand in _demands(decision)),
         *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
@@ -114,7 +114,7 @@ def _demands(decision: Decision) -> Iterable[str]:
 
 
 def _list(head: str, items: Iterable[object]) -> list[str]:
-    """Return a paragraph with a line for each item; nothing if there are none."""
+    """Return ``head`` and a line for each item; without items, return no lines."""
     lines = [f"  {item}" for item in items]
     return [head, *lines] if lines else []
 
@@ -129,7 +129,7 @@ _VERBS = {
 
 
 def _requesters(decision: Decision) -> tuple[str, ...]:
-    """Return the requesters that a request names, else the requesters of the changed claims."""
+    """Return the requesters that the request names, else those of the changed claims."""
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
     if isinstance(decision.request, Decommission):  # the requester is in the old claims only
@@ -177,7 +177,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
         )
     if not changes:
         return f"Release {', '.join(decision.changes.waiting)}", (
-            f"request '{request.id}', received {time}, gives up what waited for room."
+            f"request '{request.id}', received {time}, releases demands that waited for room."
         )
     waited = [one for one in decision.changes.waiting if one == request.demand]
     only_leases = all(
@@ -193,8 +193,8 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     return f"{title} {subjects}", why + placed
 
 
-def _of_request(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailers that only a rollback, a drain or a decommission has."""
+def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
+    """Return the trailers that only a rollback, a drain or a decommission has, else none."""
     request = decision.request
     if isinstance(request, Restoration):
         return [("Restores", request.to), ("Reason", request.reason)]
@@ -223,7 +223,7 @@ def of_follow(
     Args:
         releases: the releases that the commit changes.
         cause: the newest commit by people that is rendered.
-        since: the commit of the state before people's changes.
+        since: the commit that was in effect before people's changes.
         problems: the faults of invalid files.
         more: further trailers.
         reports: whether the commit changes the problem report.
@@ -301,25 +301,27 @@ def of_scale_down(
 
 
 def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the trailers that name overrides, by the paths of their files."""
+    """Return a trailer for each override, given by the path of its file."""
     return [("Override", path) for path in sorted(set(paths))]
 
 
 def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
-    """Return the files of the ``keep`` overrides that add these claims."""
+    """Return the paths of the ``keep`` overrides that add these claims."""
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
-    """Return the trailers that name the demands of claims; claims of overrides have none."""
+    """Return a trailer for each demand of these claims; an override's claim has no demand."""
     demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
     return [("Demand-Id", demand) for demand in sorted(demands)]
 
 
 def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
     if not releases:
-        return ["Desired state: unchanged; it runs already, or still for other requesters."]
+        return [
+            "Desired state: unchanged; the releases run already, or still run for other requesters."
+        ]
     lines = ["Desired state:"]
     for release in releases:
         lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.what})")

@@ -1,6 +1,6 @@
 """The text of commit messages: paragraphs of lines, and trailers in the last paragraph.
 
-This module alone writes and reads messages. A line of a paragraph is for people: its text is
+Only this module writes and reads messages. A line of a paragraph is for people: its text is
 escaped and shortened. A trailer is for programs: its value is read back exactly. A value of visible
 characters is written unchanged, so ``git log --format='%(trailers:key=Requester)'`` shows it; any
 other value is written in double quotes with escapes like ``\\u202e``. So no value can begin a line,

@@ -87,7 +87,10 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
 
 
 def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    """Return the newest commit along the first parents that is not later than ``at``, or raise."""
+    """Return the newest commit along the first parents that is not later than ``at``.
+
+    Raises StateRepoError if there is none.
+    """
     latest = int(at.timestamp())
     for commit in commit_log.first_parents(repo, tip):
         if commit.commit_time <= latest:

@@ -65,7 +65,7 @@ class LastValidConfig:
 
 
 def config_at(tree: Tree) -> Config:
-    """Return the configuration of one tree; raise every fault of every file."""
+    """Return the configuration of a tree; raise InvalidInput with the faults of all files."""
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
@@ -73,17 +73,17 @@ def config_at(tree: Tree) -> Config:
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:
-    """Return path → text of the markers of ended overrides."""
+    """Return path → text of the files that mark overrides as ended."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return override → end time, for each ended override."""
+    """Return name → end time of each ended override."""
     return ended_override_file.read(end_markers_at(tree))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise StateRepoError if a generator of another version writes this repo.
+    """Raise StateRepoError if generators of another render version write this repo.
 
     Generators of two render versions would undo each other's changes.
     """
@@ -146,10 +146,10 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return the broken files, and all files that must apply together with them.
+    """Return the broken files, and all files that apply only together with them.
 
-    A file must apply together with the other files of a commit that changed it, and of its
-    application definition. This is repeated for each file that is found.
+    A file applies only together with all files of each commit that changed the file, and with all
+    files of its application definition. The search goes on with each file that is found.
     """
     together = set(broken)
     merges = [

@@ -37,7 +37,7 @@ class ClaimFiles:
 
 
 def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
-    """Return the claims of files, given as (path, text); skip files that are not claim files."""
+    """Return the claims in files, given as (path, text); other files than claims are skipped."""
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
         if claim_file.kind_of(path) is None:
@@ -50,7 +50,10 @@ def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None if there is no file; raise if the file is not valid."""
+    """Return the claim at a path, or None if there is no file.
+
+    Raises InvalidInput if the file is not valid.
+    """
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 
@@ -64,7 +67,7 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
 
 
 def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
-    """Return the key of the claim that the ledger has for a path, or None.
+    """Return the key of the ledger's claim whose file has this path, or None.
 
     This searches the whole ledger.
     """
@@ -109,13 +112,13 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
 ) -> list[ClaimChange]:
-    """Return people's changes of claims, each from the claim that the generator last wrote.
+    """Return the changes of claims by people, compared with what the generator last wrote.
 
     Args:
         repo: the repository.
         last_valid_commit: the newest commit with only valid files; older changes are left out.
         to: the newest commit to consider.
-        known: the claims that were in effect before; a claim that equals one of them is left out.
+        known: the claims that were in effect before; a claim that equals one of these is left out.
     """
     paths = {
         path
@@ -133,7 +136,7 @@ def claims_by_people(
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     """Return the request to roll back to the ledger of the commit ``to``.
 
-    ``more`` has further fields of the request. Raises InvalidInput with every fault of the
+    ``more`` are the other fields of the request. Raises InvalidInput with every fault of the
     commit's claim files.
     """
     commit = trees.commit_of(repo, to)
@@ -156,7 +159,7 @@ def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
 
 
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
-    """Yield the claim files that differ between two trees, in order."""
+    """Yield the paths of the claim files that differ between two trees, sorted."""
     changed = trees.differences(before, after, (claim_file.LEDGER_ROOT,))
     return (path for path, _ in changed if claim_file.kind_of(path) is not None)
 

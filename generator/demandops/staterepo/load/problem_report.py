@@ -26,7 +26,7 @@ _WRITTEN = ("file", "field", "message", "since", "author")
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault, and id and author of the commit that caused it."""
+    """A fault, with the id and the author of the commit that caused it."""
 
     file: str
     field: str

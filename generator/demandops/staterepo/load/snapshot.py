@@ -46,7 +46,7 @@ class Snapshot:
     ``problems``: the faults of invalid files; their last valid versions are in effect.
     ``last_valid_commit``: the newest commit without problems.
     ``quarantined_files``: ledger files whose content at this commit is not in effect.
-    ``other_config_source``: the source of the configuration in effect, if not this commit.
+    ``other_config_source``: where the configuration in effect is from, if not from this commit.
     """
 
     commit: Oid
@@ -62,17 +62,17 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a commit that this process made; ``state`` is its state."""
+        """Return the snapshot of a commit on top of this one; ``state`` is its state."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A later snapshot, and what changed since the earlier one.
+    """A later snapshot, and the changes since an earlier one.
 
-    ``subjects`` are those whose claims changed. ``config_changed`` is true if all releases must be
-    rendered again.
+    ``subjects`` are the subjects whose claims changed. ``config_changed`` is true if all releases
+    must be rendered again.
     """
 
     snapshot: Snapshot
@@ -83,7 +83,7 @@ class Advance:
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the snapshot of a commit, with all its files read.
+    """Read all files of a commit and return its snapshot.
 
     ``progress`` is called with (files read, all files) of the ledger.
 
@@ -122,7 +122,7 @@ def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
 def advance(
     repo: Repository, before: Snapshot, to: Oid, recorded: ConfigSource | None = None
 ) -> Advance:
-    """Return the advance from the snapshot ``before`` to the commit ``to``.
+    """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
 
     Only files that differ are read. Invalid changes are not applied; the new snapshot's problems
     list them.
@@ -131,7 +131,7 @@ def advance(
         repo: the repository.
         before: the earlier snapshot.
         to: the later commit.
-        recorded: the source of the configuration in effect at ``to``, if it is known.
+        recorded: where the configuration in effect at ``to`` is from, if this is known.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
     state, known = before.state, LastValidConfig(None, before.config_source, ())
@@ -192,9 +192,9 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
 
 
 def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
-    """Yield (instance, new steps) of each service instance whose kept replicas differ.
+    """Yield (instance, what it keeps now) for each service instance whose kept replicas changed.
 
-    The steps are empty if the instance keeps no replicas any more.
+    The second item is empty if the instance no longer keeps replicas.
     """
     for path, _ in trees.differences(old, new, (kept_replicas.REPLICAS_ROOT,)):
         texts = [trees.read_text(tree, path) for tree in (old, new)]
@@ -204,7 +204,7 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether every release must be rendered to find the generated files that must change.
+    """Return whether all releases must be rendered, because generated files may be outdated.
 
     If a generator made the newest commit, generated files match the ledger, so the result is false.
     Otherwise people may have edited the files, or undone what another generator committed since
@@ -224,7 +224,7 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
 
 
 _judged: dict[object, LastValidConfig] = {}
-"""The newest results of :func:`_last_valid_config`, by its input.
+"""Arguments → result of the newest calls of :func:`_last_valid_config`.
 
 So an invalid file is judged only once, and not again for each demand.
 """
@@ -257,10 +257,10 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration of files, given as path → text.
+    """Return the configuration in ``files`` (path → text).
 
-    If it differs from that of ``state``, also render sample demands with it. Raises InvalidInput
-    if the files are not valid, or the samples cannot be rendered.
+    If it differs from the configuration of ``state``, also render sample demands with it. Raises
+    InvalidInput if the files are not valid, or the samples cannot be rendered.
     """
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
@@ -271,10 +271,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Remembers, between attempts to publish, what was read after the published snapshot.
+    """Remembers the last advance, so that the next attempt to publish reads only newer commits.
 
-    So each attempt reads only the commits that are new since the last attempt. If each attempt read
-    all commits again, faster writers could always publish first.
+    If each attempt read all commits since the published snapshot, faster writers could always
+    publish first.
     """
 
     def __init__(self) -> None:
@@ -282,7 +282,7 @@ class ReadAhead:
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the advance from ``before`` to ``tip``.
+        """Return the snapshot of ``tip``, and the changes since the snapshot ``before``.
 
         Raises StateRepoError if ``tip`` has another render version.
         """

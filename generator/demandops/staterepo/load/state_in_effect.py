@@ -39,7 +39,7 @@ from demandops.subject import Subject
 _NONE = "none"
 _HELD_BACK = "Held-Back"
 _TO_CHECK = Fault("invalid", "", "must be checked again")
-"""A placeholder for a problem that is not known yet; the next advance finds the real problem."""
+"""A placeholder for a problem that is not known until the next commits are read."""
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
@@ -59,7 +59,7 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Return the state from which a generator starts: :func:`start_at` of the newest commit.
+    """Return the state from which a generator starts: the newest state that a commit records.
 
     The caller then applies later changes by people with
     :func:`demandops.staterepo.load.snapshot.advance`.
@@ -72,7 +72,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
 def state_at(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at any commit: the recorded state with people's later changes.
+    """Return the state in effect at a commit: the last recorded state with later changes by people.
 
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
@@ -81,7 +81,7 @@ def state_at(
 
 
 def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
-    """Return the state in effect at ``to``: the earlier state ``start`` with people's changes."""
+    """Return the state in effect at ``to``: the earlier state ``start`` with changes by people."""
     if start.commit == to:
         return start
     commit, advance = trees.commit_of(repo, to), snapshots.advance(repo, start, to)
@@ -149,7 +149,10 @@ def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
 def recorded_state(
     repo: Repository, record: LogEntry, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at a commit of the generator; raise if the record is not valid."""
+    """Return the state in effect that a commit of the generator records.
+
+    Raises InvalidInput or StateRepoError if the record is not valid.
+    """
     commit = trees.commit_of(repo, record.commit)
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)
@@ -183,7 +186,7 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """People's changes, and the faults of subjects with the new and with the old configuration.
+    """Changes by people, and their faults with the new and with the old configuration.
 
     If a subject can be planned with neither configuration, its claims are at fault. If it can be
     planned with the old configuration but not with the new one, the new configuration is at fault.
@@ -201,14 +204,17 @@ class Judgement:
     """The new ledger with the configuration that was in effect before."""
 
     def with_new_config(self) -> Advance:
-        """Return the advance to the state in effect if the new configuration is accepted."""
+        """Return the state in effect with the new configuration, and the accepted changes."""
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
-        return self._without(self.advance, _together(faults, self.refused))
+        return self._without(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the advance to the state in effect if the new configuration has ``faults``."""
+        """Return the state in effect with the old configuration, and the accepted changes.
+
+        ``faults`` are why the new configuration is refused.
+        """
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(
@@ -221,7 +227,7 @@ class Judgement:
         return self._without(replace(accepted, snapshot=snapshot), self.with_old)
 
     def _without(self, accepted: Advance, faults: Faults) -> Advance:
-        """Return ``accepted``, with the last valid claims in effect for subjects in ``faults``."""
+        """Return ``accepted``, but with the last valid claims on the subjects in ``faults``."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)
@@ -257,7 +263,7 @@ def judge(
 
     Args:
         repo: the repository.
-        advance: the advance to the state with all valid changes.
+        advance: the snapshot with all valid changes, and the subjects that they change.
         before: the snapshot before people's changes.
         tree: the tree with the current generated files.
         held_back: the claim files that a generator's commit records as not in effect. If it is
@@ -294,11 +300,11 @@ def judge(
     refused = refused_in(state) if held_back is None else _recorded(advance, held_back)
     if state.config == old.config:
         return Judgement(repo, before, advance, with_new, with_new, refused, old)
-    with_old = _together(faults_in(old), refused_in(old))
+    with_old = _merged(faults_in(old), refused_in(old))
     return Judgement(repo, before, advance, with_new, with_old, refused, old)
 
 
-def _together(one: Faults, other: Faults) -> Faults:
+def _merged(one: Faults, other: Faults) -> Faults:
     return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
 
 
@@ -315,7 +321,7 @@ def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
 def _located_in_claim_files(
     faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
 ) -> list[Fault]:
-    """Return faults of a subject, located in the file of a claim that changed."""
+    """Return the faults of a subject; those in no claim file get the path of a changed claim."""
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]

@@ -31,7 +31,7 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The commit that an edit started from. ``state`` is None if no commit was ever valid."""
+    """The commit that an edit started from; ``state`` is None if no commit was ever valid."""
 
     commit: str
     files: Mapping[str, str]

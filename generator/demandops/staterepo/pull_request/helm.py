@@ -1,4 +1,4 @@
-"""Runs the program ``helm`` on charts, and reads the output: kinds of objects, or faults.
+"""Runs the program ``helm`` on charts, and reads kinds of objects or faults from its output.
 
 Helm gets a home folder of its own. It has no access to a cluster or to chart repositories.
 """
@@ -49,7 +49,7 @@ class Helm:
     def find(home: Path) -> Helm | None:
         """Return the program ``helm`` that ``HELM_BIN`` names or ``PATH`` has, or None.
 
-        ``home`` is the folder for helm's files.
+        ``home`` is helm's home folder.
         """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
         return Helm(program, home) if program else None
@@ -110,17 +110,17 @@ def parsed_lint(out: str, chart: str) -> Report:
     for entry in re.split(r"\n(?=\[|\n)", out):
         match = _LINT.match(entry.strip())
         if match:
-            found[match["level"]].append(_told(entry.strip()[match.start("text") :], chart))
+            found[match["level"]].append(_fault(entry.strip()[match.start("text") :], chart))
     return Report(faults=tuple(found["ERROR"]), warnings=tuple(found["WARNING"]))
 
 
 def parsed_error(err: str, chart: str) -> Fault:
     """Return helm's error message as a fault, with the template and line that it names."""
     text = err.partition("Error: ")[2] or err
-    return _told(text.partition("\n\nUse --debug")[0].strip(), chart)
+    return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
 
 
-def _told(text: str, chart: str) -> Fault:
+def _fault(text: str, chart: str) -> Fault:
     places = [*_PLACE.finditer(text)]
     place = places[-1] if places else None
     file = place["path"] if place else chart

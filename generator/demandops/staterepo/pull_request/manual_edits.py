@@ -1,7 +1,7 @@
 """Manual edits to generated files, and overrides that would have the same effect.
 
 The check refuses manual edits, because the generator's next commit would silently undo them. An
-override in ``overrides/`` stays. A person who uses a suggested override must only write its reason.
+override has a lasting effect. In a suggested override, a person must only write the reason.
 """
 
 from __future__ import annotations
@@ -139,10 +139,7 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects of an override that replaces an edit, and the edits that it cannot make.
-
-    Each such edit is given by its place in the file.
-    """
+    """Return the override effects that replace an edit, and the fields that no override changes."""
     if after is None:
         return {"deny": True}, []
     try:
@@ -162,7 +159,7 @@ def _override_text(effects: dict[str, Any], release: Release, owner: str) -> str
 
 
 def _fits(release: Release, other: Release) -> bool:
-    """Return whether a suggested override for one release fits another release too."""
+    """Return whether the override suggested for ``release`` also fits ``other``."""
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
     same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
@@ -175,9 +172,9 @@ def _used(effects: dict[str, Any]) -> list[str]:
 
 
 def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
-    """Return an override's selector that selects a release.
+    """Return the selector of an override for a release.
 
-    For an end of a connection, ``whole`` makes it select both ends.
+    For an end of a connection, ``whole`` selects the other end too.
     """
     if isinstance(release, ServiceRelease):
         selected = {"applications": list(release.applications), "services": [release.key.service]}
@@ -222,7 +219,7 @@ def _service_effects(
             effects["hold"] = True
         elif not (patched and (place == patched[0] or place.startswith(patched[1:]))):
             not_covered.append(place)
-    if "hold" in effects:  # a hold keeps the file as it was rendered, so it excludes other effects
+    if "hold" in effects:  # a held file stays as it is, so no other effect applies
         not_covered += [name for name in _used(effects) if name != "hold"]
         effects = {"hold": True}
     return effects, not_covered
@@ -241,9 +238,10 @@ def _move_images(
     config: Config,
     moved: dict[str, dict[str, str]],
 ) -> None:
-    """Move the changes of registered images out of ``patch``, into ``moved``.
+    """Move the changes of images in the registry from ``patch`` to ``moved``.
 
-    ``patch`` is a merge patch of ``values``. ``moved`` maps the image's name to its new parts.
+    ``patch`` is a merge patch of ``values``. ``moved`` maps an image's name to the new tag, digest
+    or repository.
     """
     names: dict[str, list[str]] = {}
     for name in release.service.images:

@@ -117,7 +117,7 @@ def check(
         ]
         new = merge_preview.planned_releases(state)
         preview = merge_preview.preview(
-            new if start is None else start.releases(), new, edit.merged_into(wanted), wanted
+            new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
             folder,
@@ -161,7 +161,7 @@ def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
 
 
 def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
-    """Yield a warning for each topic that does not arrive any more because of the merge."""
+    """Yield a warning for each topic that an application will not get any more after the merge."""
     old = start.state if start else None
     known = {(one.application, one.reason) for one in missing_inputs(old)} if old else set()
     for one in missing_inputs(state):
@@ -201,11 +201,11 @@ class _Edit:
             if _generated(path) and not trees.is_readme(path)
         }
 
-    def merged_into(self, wanted: Mapping[str, str]) -> dict[str, str]:
+    def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
         """Return path → text of the generated files before the merge.
 
-        These are the files before the edit. But if the merge target already has a file as
-        ``wanted`` has it, that version counts as the file before the merge.
+        These are the files before the edit, except where the merge target already has the text
+        that ``wanted`` has. Then this text counts as the text before the merge.
         """
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
@@ -251,7 +251,7 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield the faults for which the generator would refuse claims of the edit.
+        """Yield the faults for which the generator would refuse claims that the edit writes.
 
         Only claims that the edit adds or changes are checked.
         """
@@ -264,7 +264,7 @@ class _Edit:
             )
 
     def rendered(self, state: State) -> dict[str, str]:
-        """Return path → text of every generated file, or raise the faults of every release."""
+        """Return path → text of every generated file; raise InvalidInput with all faults."""
         try:
             return rendered_files(state, self.generated)
         except InvalidInput as error:
@@ -273,7 +273,7 @@ class _Edit:
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
         """Yield a warning for each bootstrap file that a person has to apply to its cluster."""
-        before = self.merged_into(wanted)
+        before = self.before_merge(wanted)
         for path, text in sorted(wanted.items()):
             if path.startswith(f"{BOOTSTRAP_ROOT}/") and before.get(path) != text:
                 cluster = path.removeprefix(f"{BOOTSTRAP_ROOT}/").removesuffix(".yaml")

@@ -1,8 +1,8 @@
-"""Has helm lint and render the charts of a checkout, with the values of the planned releases.
+"""Lints and renders the charts of a checkout with helm, with the values of the planned releases.
 
-Each chart is also rendered for an example demand of each application. The kinds of rendered objects
-are compared with those that the access domain allows. If the edit does not change a chart, the
-chart is rendered only for the examples, and for the releases whose values the edit changes.
+Each chart is also rendered for an example demand of each application. The kinds of the rendered
+objects are compared with those that the access domain allows. If an edit does not change a chart,
+the chart is rendered only for the examples, and for the releases whose values the edit changes.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def _concerned(
 
 
 class _Run:
-    """One pass over the charts, in a scratch folder that has a copy of ``appdefs/``."""
+    """Collects the results of helm; helm runs in a scratch folder with a copy of ``appdefs/``."""
 
     def __init__(self, helm: Helm, scratch: Path, state: State) -> None:
         self._helm, self._scratch, self._state = helm, scratch, state
@@ -110,7 +110,7 @@ class _Run:
         self._warnings: dict[Fault, None] = {}
 
     def result(self) -> RenderedCharts:
-        """Return the result so far."""
+        """Return the results that are collected so far."""
         return RenderedCharts(
             tuple(sorted(self._rendered)),
             self._counts[False],
@@ -121,7 +121,7 @@ class _Run:
         )
 
     def render(self, release: ServiceRelease, *, example: bool = False) -> None:
-        """Render the chart of a release, or of an example; the chart is linted the first time."""
+        """Render the chart of a release or an example; lint the chart before its first release."""
         name, folder = release.service.chart, release.chart.folder
         if folder is None:
             self._not_rendered[name] = "it is in a registry"

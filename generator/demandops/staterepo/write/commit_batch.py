@@ -58,14 +58,14 @@ _PAUSE_S = 0.02
 
 
 _Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
-"""The effect of people's changes: the snapshot, the files, and keys of claims.
+"""The effect of people's changes: snapshot, changed files, and keys of changed claims.
 
 The claims are those that overrides may have changed.
 """
 
 
 class CommitBatch:
-    """Commits on top of one published tip, in the order of the demands."""
+    """Commits on top of one published tip; :meth:`publish` publishes them together."""
 
     def __init__(self, repository: StateRepository, start: Snapshot) -> None:
         self._repository = repository
@@ -86,7 +86,7 @@ class CommitBatch:
         return self.head.commit == self.start.commit
 
     def read(self, path: str) -> str | None:
-        """Return a file's text at the newest commit of the batch, or None."""
+        """Return a file's text at the batch's newest commit, or None if the file is missing."""
         return trees.read_text(self._tree, path)
 
     def commit(
@@ -124,8 +124,8 @@ class CommitBatch:
         self.head = self.head.with_commit(made, state)
         return str(made)
 
-    def note_settled(self, operation: str, outcome: commit_log.Settled) -> None:
-        """Note a demand that changed nothing; the message of the next commit will record it.
+    def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
+        """Record the outcome of a demand that changed nothing, in the message of the next commit.
 
         The process may die before it answers the demand. After a restart, the generator must not
         evaluate the demand again, because a later release could change the outcome.
@@ -133,7 +133,7 @@ class CommitBatch:
         self._settled.append((commit_log.settled_trailer(outcome), operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
-        """Apply people's changes: render them, and commit the files that differ, if any.
+        """Render people's changes, and commit the generated files that differ, if any.
 
         A claim or file may be impossible to plan or render, for example because its node left the
         inventory. It then stays unchanged, and the problems of ``head`` list it.
@@ -183,7 +183,7 @@ class CommitBatch:
         return self._rendered_subjects(accepted, before, now)
 
     def _rendered_whole(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return the effect of a changed configuration, with everything rendered."""
+        """Render everything with the changed configuration, and return the effect."""
         marked = last_valid_config.end_markers_at(self._tree)
         state = accepted.snapshot.state
         applied = update_ledger(before.state, state, accepted.subjects, marked, now)
@@ -209,7 +209,7 @@ class CommitBatch:
         keys: Iterable[ClaimKey],
         now: datetime,
     ) -> _Followed:
-        """Return the effect of people's changes, with the leases of approved claims started.
+        """Return the effect of people's changes; start the leases of the claims they approved.
 
         Such a lease starts only after the approval. Otherwise it could end before the approval.
         """
@@ -251,7 +251,9 @@ class CommitBatch:
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
     def scale_down(self, instance: Instance, now: datetime) -> str:
-        """Commit that a service no longer keeps replicas; return the commit's first line.
+        """Commit the removal of replicas that a service no longer keeps.
+
+        Return the first line of the commit's message.
 
         Raises Refused or InvalidInput if the service cannot be planned or rendered.
         """
@@ -262,7 +264,7 @@ class CommitBatch:
         return text.partition("\n")[0]
 
     def drain(self, node: str, operation: str, now: datetime) -> Decision:
-        """Move placed applications off a drained node, in one commit; return the decision.
+        """Commit the move of placed applications off a drained node, and return the decision.
 
         The commit's author is the person who last changed the node's file.
         """

@@ -98,9 +98,9 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise Unsound if an earlier write left the file in an unknown state; else do nothing.
+        """Raise Unsound if an earlier write left the file in an unknown state.
 
-        Every later write then raises the same error.
+        Every later write raises the same error.
         """
         if self._unsound is not None:
             raise self._unsound
@@ -115,7 +115,7 @@ class Journal:
             with self._explained():
                 self._write([entry.record() for entry in entries], durably=True)
             self.pending.update((entry.operation, entry) for entry in entries)
-            self._bound()
+            self._rewrite_if_large()
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
@@ -134,7 +134,7 @@ class Journal:
         if done and not durably:
             with suppress(OSError):
                 self._write(records, durably=False)
-        self._bound()
+        self._rewrite_if_large()
 
     def close(self) -> None:
         """Close the journal; pending demands stay for the next process."""
@@ -160,14 +160,14 @@ class Journal:
                 self._file.truncate(self._size)
             except OSError:  # a restart could read demands that this process refuses
                 self._unsound = Unsound(
-                    f"the journal {self._path} cannot be written or cut back: {error.strerror}; "
+                    f"the journal {self._path} cannot be written or truncated: {error.strerror}; "
                     "check its disk, then start again"
                 )
                 self.require_sound()
             raise
         self._is_broken, self._chain, self._size = False, chain, self._size + len(text)
 
-    def _bound(self) -> None:
+    def _rewrite_if_large(self) -> None:
         if self._size > self._limit:
             with suppress(OSError):  # the next write tries again
                 self._rewrite()
@@ -195,7 +195,7 @@ class Journal:
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
     def _require_known(self, error: OSError) -> None:
-        """Raise Unsound if ``error`` leaves unknown what is on the disk; else do nothing."""
+        """Raise Unsound if the content of the disk is unknown after ``error``."""
         told = disk_error(error, f"the journal {self._path}")
         if isinstance(told, Unsound):
             self._unsound = told
@@ -285,7 +285,7 @@ def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> 
     if chain is not None:
         found = _SEALED.fullmatch(line)
         if found is None or _digest(found[1] + b"}", chain) != found[2].decode():
-            raise ValueError("another digest")
+            raise ValueError("the line has another digest")
         line, chain = found[1] + b"}", found[2].decode()
     _replay(line, pending)
     return chain
@@ -302,10 +302,10 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         entry = JournalEntry(**record, proposal=proposal)
         received = datetime.fromisoformat(entry.received)
         if received.tzinfo is None or not 1970 <= received.year < UNSTARTED.year:
-            raise ValueError("a time without a zone, or of no generator")
+            raise ValueError("the time has no zone, or no generator can have written it")
         pending[entry.operation] = entry
     except (TypeError, LookupError, AttributeError, RecursionError) as error:
-        raise ValueError("not an entry") from error
+        raise ValueError("the line is not an entry") from error
 
 
 def _write_all(file: int, text: bytes) -> None:

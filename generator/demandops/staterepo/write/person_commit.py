@@ -33,7 +33,7 @@ Files = Mapping[str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Author:
-    """The person who commits, the time, and summary and reason for the message."""
+    """The person who commits, the time, and the message's summary and reason."""
 
     person: Person
     now: datetime
@@ -62,8 +62,8 @@ def commit_to_main(
 
     Args:
         repository: the state repo.
-        make: returns the files to commit. It gets a reader of the files on main, and is called
-            again if main has moved.
+        make: returns the files to commit. It gets a function that reads the files on main, and is
+            called again if main has moved.
         author: the person, the time and the message.
 
     Raises:
@@ -136,7 +136,8 @@ def _publish(
         repository.new.forget()
         REAL.sleep(_PAUSE_S * attempt)
     raise StateRepoError(
-        f"{repository.address} moved {_ATTEMPTS} times, so nothing was changed; try again"
+        f"{repository.address} got new commits during each of {_ATTEMPTS} attempts, so nothing was "
+        "changed; try again"
     )
 
 
@@ -154,7 +155,7 @@ def _commit(
 
 
 def _faults(tree: Tree) -> set[Fault]:
-    """Return the faults of a configuration; a commit must not add new faults to main."""
+    """Return the faults of a tree's configuration; a commit must not add faults to main."""
     try:
         last_valid_config.config_at(tree)
     except InvalidInput as error:

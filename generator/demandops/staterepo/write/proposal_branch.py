@@ -1,7 +1,7 @@
 """Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
 
-The generator rebuilds a branch on a newer main and deletes it in the end, but only if the branch
-is at the commit that the generator put there. This module knows nothing of forges except GitLab's
+The generator rebuilds a branch on each newer main, and deletes the branch in the end. It does
+neither if somebody else has moved the branch. This module knows nothing of forges except GitLab's
 push options.
 """
 
@@ -40,7 +40,7 @@ class BranchMoved(StateRepoError):
 
 
 def branch_name(name: str, operation: str) -> str:
-    """Return the branch for a demand: readable, and unique to the operation."""
+    """Return the name of the branch for a demand; it is readable, and unique to the operation."""
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
     digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
     return f"{PREFIX}{slug}-{digest}" if slug else f"{PREFIX}{digest}"
@@ -115,7 +115,7 @@ class ProposalBranches:
         """Move or delete a branch; return the link that the server printed, or an empty text."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
-            self._set_here(reference, commit, expected)
+            self._set_reference(reference, commit, expected)
             return ""
         try:
             spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
@@ -130,7 +130,7 @@ class ProposalBranches:
                 raise BranchMoved(branch) from None
             raise self._remote.push_error(error) from None
 
-    def _set_here(self, reference: str, commit: Oid | None, expected: str) -> None:
+    def _set_reference(self, reference: str, commit: Oid | None, expected: str) -> None:
         references = self._repository.objects.references
         now = str(references[reference].target) if reference in references else ""
         if commit is None and not now:
@@ -145,7 +145,7 @@ class ProposalBranches:
             references.create(reference, commit)
 
     def message(self, commit: str) -> str:
-        """Return a commit's message; empty if the commit is not here."""
+        """Return a commit's message; empty if this repository lacks the commit."""
         try:
             return commit_of(self._repository.objects, commit).message
         except StateRepoError:
@@ -154,7 +154,7 @@ class ProposalBranches:
     def is_up_to_date(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether ``commit`` merges into ``tip`` cleanly and changes just ``files``.
+        """Return whether ``commit`` merges into ``tip`` cleanly, and changes only ``files``.
 
         Args:
             tip: the current commit of main.

@@ -1,4 +1,4 @@
-"""Slots: the folders for the journal and the clone of each process that serves one state repo."""
+"""Slots: each process that serves a state repo has one, a folder for its journal and clone."""
 
 from __future__ import annotations
 
