@@ -73,7 +73,7 @@ def release(repo: MemoryRepo) -> dict[str, Any]:
 
 
 def fact(repo: MemoryRepo) -> str:
-    """Return what a commit message reports of the recorder's replicas."""
+    """Return what the commit message says about the recorder's replicas."""
     (found,) = (plan for plan in repo.state.plans.values() if plan.name.startswith("rec-"))
     (told,) = (line for line in found.facts() if line.startswith("replicas "))
     return told.removeprefix("replicas ")
@@ -183,13 +183,14 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
 
 
 class TestRequesters:
-    """A service whose definition or override depends on requesters is planned when they change."""
+    """A change of requesters replans only services whose definition or override depends on them."""
 
     @staticmethod
     def changed(repo: MemoryRepo, requesters: int) -> tuple[list[str], set[str]]:
-        """Demand again with so many requesters.
+        """Demand again with this number of requesters.
 
-        Return the generated files that change, and the names of the services that are planned.
+        Return the generated files that change, and the names of the services that are planned
+        again.
         """
         before = repo.state
         decision = repo.send(demand(topics=3, requesters=requesters))
@@ -291,7 +292,7 @@ class TestAutoscaler:
 
 @pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
 def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: bool) -> None:
-    """The report warns of the driver, which publishes, and not of the recorder, which does not."""
+    """A second replica doubles what the driver publishes; the recorder publishes nothing."""
     driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
     doubled = override({"services": ["*"]}, replicas=2)
     repo = MemoryRepo({**ADDITIONS, DRIVER: driver, "overrides/two.yaml": doubled})
