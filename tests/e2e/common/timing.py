@@ -35,14 +35,13 @@ class Times:
 
 
 class Table:
-    """The times of several demands, by title."""
+    """A table of the times of several demands, each with a title."""
 
     def __init__(self, heading: str) -> None:
         self._heading = heading
         self._rows: list[tuple[str, Times]] = []
 
     def add(self, title: str, times: Times) -> None:
-        """Add the times of a demand."""
         self._rows.append((title, times))
 
     def show(self, say: Callable[[str], None]) -> None:

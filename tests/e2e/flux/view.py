@@ -37,7 +37,7 @@ class Domain(Namespace):
     def fetched_files(self) -> list[str]:
         """Return the paths that the GitRepository has fetched.
 
-        Downloads the artifact, so source-controller must be reachable from this machine.
+        This downloads the artifact, so source-controller must be reachable from this machine.
         """
         url = self._status("GitRepository", SOURCE)["artifact"]["url"]
         with (

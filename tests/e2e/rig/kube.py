@@ -66,7 +66,6 @@ class Kube:
         self._dynamic: Any = None
 
     def close(self) -> None:
-        """Close the connections."""
         self.api.close()
 
     def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
@@ -94,7 +93,6 @@ class Kube:
         return ""
 
     def get(self, kind: str, name: str, namespace: str = "", version: str = "") -> Manifest | None:
-        """Return an object, or None if it does not exist."""
         try:
             found = self._resource(kind, version).get(name=name, namespace=namespace or None)
         except NotFoundError:
@@ -120,7 +118,6 @@ class Kube:
     def patch(
         self, kind: str, name: str, body: Manifest, namespace: str = "", version: str = ""
     ) -> None:
-        """Merge-patch an object."""
         self._resource(kind, version).patch(
             name=name,
             namespace=namespace or None,
