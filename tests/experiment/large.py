@@ -32,7 +32,7 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""After about how many commits the whole bookkeeping is compared."""
+"""About how many commits have their whole bookkeeping compared."""
 
 
 class PodWatch(ProcessRunner):
@@ -167,7 +167,7 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demands, as the commits' trailers name them; only some get their `books`."""
+        """Yield the demands that the commits' trailers name; only some get `books`."""
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
         for commit in commits:
