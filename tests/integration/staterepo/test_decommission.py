@@ -15,7 +15,7 @@ from tests.kit.rig import Person, goal, leave
 
 
 def of(generator: Generator, subject: str) -> list[str]:
-    """Return the requesters of each claim on a subject, as one text for each claim."""
+    """Return the requesters of each claim on a subject: one text for each claim."""
     claims = [c for c in generator.snapshot.state.ledger if c.subject.id == subject]
     return sorted(" ".join(claim.requesters) for claim in claims)
 
@@ -23,7 +23,7 @@ def of(generator: Generator, subject: str) -> list[str]:
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     url: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
-    """A generator runs meanwhile, and its polls find both commits."""
+    """A generator runs meanwhile; its polls find both commits."""
     person = Person(bare, tmp_path / "person")
     with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))
@@ -53,7 +53,8 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
         person.fetch()
         assert demandops("check", tmp_path / "person")[0] == 0
         rig.wait_until(
-            lambda: "vehicle01" not in generator.snapshot.state.config.nodes, "it is taken in"
+            lambda: "vehicle01" not in generator.snapshot.state.config.nodes,
+            "the generator has followed the inventory",
         )
         assert generator.snapshot.problems == ()
         assert rig.git(bare, "ls-tree", "main", ".demandops") == ""
@@ -187,7 +188,7 @@ def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Run)
 def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Run
 ) -> None:
-    """Like any demand, a decommission waits in the journal, and the next start carries it out."""
+    """A decommission waits in the journal like any demand, so the next start carries it out."""
     from demandops.demand.demand_request import Decommission
 
     generator = Generator(url)
@@ -200,7 +201,7 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     assert rig.operations(bare)[-1] == "op-leave"
     assert rig.commits(bare)[-1].one("Node") == "vehicle01"
     author = rig.git(bare, "log", "-1", "--format=%an", "main")
-    assert author == "DemandOps generator", "nobody is named who had it done"
+    assert author == "DemandOps generator", "without a person, the generator must be the author"
     rig.assert_sound(bare)
 
 

@@ -1,4 +1,4 @@
-"""After a person drains a node, one commit moves what was placed there, and gives the reason."""
+"""After a person drains a node, one commit moves its placed applications and gives the reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Leftovers of killed processes and failed syncs in state repos, and repos that are refused."""
+"""Leftovers of killed processes and failed syncs in a state repo, and repos that are refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.kit.repo import git, tip
 
 
 def _leave(bare: Path) -> list[Path]:
-    """Make the leftovers of a process that was killed while it wrote a pack; return their paths."""
+    """Make the files that a process leaves when it is killed during a pack; return their paths."""
     folder = bare / "demandops-pack-killed"
     folder.mkdir()
     (folder / "pack_git2_1").write_text("half of a pack")
