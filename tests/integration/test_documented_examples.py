@@ -1,4 +1,4 @@
-"""Run what the documentation shows, so that it stays true."""
+"""The examples of the documentation do what the documentation says."""
 
 from __future__ import annotations
 

@@ -370,7 +370,7 @@ class TestStatus:
         suspended = ("--connection", "vehicle00/edge", "-m", "in the workshop")
         assert demandops("suspend", *suspended, *where).code == 0
         (item,) = demandops("get", "overrides", *where, "-o", "json").json()["items"]
-        assert item["state"] == "not rendered yet", "its files are those of stopped clients"
+        assert item["state"] == "not rendered yet", "the files must be those of stopped clients"
         assert demandops("request", EXPERIMENT[2], *where).code == 0
         (item,) = demandops("get", "overrides", *where, "-o", "json").json()["items"]
         assert item["state"] == "in force"
@@ -390,7 +390,7 @@ class TestStatus:
     def test_a_cluster_with_an_old_bootstrap_file_is_named(
         self, demandops: Run, fleet: GitRepo, tmp_path: Path
     ) -> None:
-        """Without the annotation of its Kustomization, a bootstrap file counts as old."""
+        """A bootstrap file counts as old if its Kustomization lacks the annotation."""
         bootstrap = fleet.files()["bootstrap/c-its.yaml"]
         applied = next(
             one for one in yaml.safe_load_all(bootstrap) if one["kind"] == "Kustomization"

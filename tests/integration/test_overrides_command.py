@@ -1,4 +1,4 @@
-"""The output of ``demandops get overrides``, check, bookkeeping and schema about overrides."""
+"""The output of ``get overrides``, ``check``, ``bookkeeping`` and ``schema`` about overrides."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def text(select: dict[str, list[str]], **fields: Any) -> str:
 
 @pytest.fixture
 def overridden(state: GitRepo, request_json: Callable[..., Ran]) -> GitRepo:
-    """A state repo with vehicle00's demand and an override of each kind in effect."""
+    """A state repo with vehicle00's demand, and an override of each kind in effect."""
     request_json(perception())
     many = {
         "values": {"replicas": 2, "nodeSelector": None},

@@ -1,4 +1,4 @@
-"""Commands by which a person makes overrides, suspensions and approvals in their own name."""
+"""Commands with which a person makes overrides, suspends and approves demands in their own name."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.usefixtures("git_environment")
 
 @pytest.fixture
 def joined(request_json: Callable[..., Ran], state: GitRepo) -> GitRepo:
-    """A state repo with one demand of vehicle00."""
+    """A state repo with one demand, by vehicle00."""
     assert request_json(perception()).code == 0
     return state
 
 
 @pytest.fixture(params=["folder", "url"])
 def where(request: pytest.FixtureRequest, joined: GitRepo) -> tuple[str, str]:
-    """The options that name the state repo: once as a folder, once as a URL."""
+    """The options that name the state repo; each test runs with its folder and with its URL."""
     address = str(joined.path) if request.param == "folder" else joined.path.as_uri()
     return "--state-repo", address
 

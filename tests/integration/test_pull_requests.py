@@ -47,7 +47,7 @@ def book(bare: Path, step: str) -> None:
 
 @pytest.fixture
 def branch(bare: Path, tmp_path: Path) -> Path:
-    """A clone in which a new branch `edit` is checked out."""
+    """A clone of the state repo, with a new branch `edit` checked out."""
     folder = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(bare), str(folder))
     git(folder, "checkout", "--quiet", "-b", "edit")
@@ -500,7 +500,7 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
 
 
 def without_code(text: str) -> str:
-    """Return a Markdown text without its code spans and fences, by CommonMark's rule."""
+    """Return a Markdown text without its code spans and fences, by CommonMark's rules."""
     kept, rest = "", text
     while "`" in rest:
         before, _, rest = rest.partition("`")

@@ -1,4 +1,4 @@
-"""Messages go from one end of a connection to the other, by a real broker with TLS and password.
+"""A real broker with TLS and a password carries messages between both ends of a connection.
 
 The clients use only the rendered manifests: the tests run the init containers, and the real rcl
 reads the parameters. paho stands in for mqtt_client.

@@ -1,4 +1,4 @@
-"""What the page's views show of a real state repo."""
+"""The page's views of a real state repo."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ IMAGE = "docker.io/rwthika/robotkube-object-detection:2025-04"
 
 @pytest.fixture
 def shown(still: Shown) -> Shown:
-    """These tests change nothing, so they share one site."""
+    """The site that tests share, because these tests change nothing."""
     return still
 
 
@@ -168,7 +168,7 @@ def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: F
     assert squares == len(state.config.nodes)
     few = fleet_map.picture(now, Filter("node=far7"), "")
     assert [node.id for node in few.nodes] == ["far7"] and few.only_lit
-    # too many nodes to draw alone are highlighted in the whole picture
+    # too many nodes to draw alone: they are highlighted in the picture of the whole fleet
     many = fleet_map.picture(now, Filter("node:far"), "")
     assert many.is_dimmed and {node.id for node in many.nodes} == {
         f"far{number}" for number in range(1_000)
