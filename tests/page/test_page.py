@@ -1,4 +1,4 @@
-"""The page in a browser: what a person sees, by mouse, by keyboard, and by a screen reader."""
+"""The page in a real browser, for a mouse, a keyboard, a phone and a screen reader."""
 
 from __future__ import annotations
 
