@@ -1,4 +1,4 @@
-"""`demandops parameter-sync`: a running node follows a ConfigMap, by a watch."""
+"""With `demandops parameter-sync` a running node follows a ConfigMap, which is watched."""
 
 from __future__ import annotations
 
