@@ -1,4 +1,4 @@
-"""The state of releases is read from Argo CD's objects, in the form in which the API gives them."""
+"""The state of releases follows from Argo CD's objects, as the API gives them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def application(
     health: str = "Healthy",
     resources: tuple[dict[str, str], ...] = (),
 ) -> dict[str, Any]:
-    """Return an Application; by default it was compared with its current source `wanted`."""
+    """Return an Application; by default Argo CD has compared its current source `wanted`."""
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}
     if sync:
@@ -131,7 +131,7 @@ BAD = condition("Progressing", "False", "timed out")
         (None, None, "reconciled", "does not exist yet", False),
         (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
-        # its health is from before the change
+        # its health dates from before the change
         (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
          "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
@@ -199,7 +199,7 @@ def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
 def test_a_chart_that_changed_in_its_folder_is_waited_for(
     at: str, changing: list[tuple[str, str]], state: str
 ) -> None:
-    """The Application's source stays the same; only its synced commit shows the new chart."""
+    """The Application's source stays the same; only its last synced commit has the new chart."""
     objects = {
         OVER: over(sync="Synced", at="b"),
         CHILD: application(NEW, sync="Synced", at=at),
@@ -265,7 +265,7 @@ def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
 
 
 def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
-    """An operator may deny the generator access to the other objects."""
+    """The generator may lack the right to read the other objects there."""
     assert ARGOCD.objects_to_watch(PLACE)[0] == ObjectSelector(
         "Application", "argocd", "demandops-perception"
     )

@@ -1,4 +1,4 @@
-"""Signed calls of webhooks over real HTTP; openssl verifies the signatures."""
+"""Real HTTP calls to webhooks are signed; openssl verifies the signatures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The state of releases is read from Flux's objects, in the form in which the API gives them."""
+"""The state of releases follows from Flux's objects, as the API gives them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The clusters file, and how a trigger calls the API or a webhook of a cluster."""
+"""The clusters file, and the calls of a trigger to a cluster's API or webhook."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 def trigger(
     case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
 ) -> None:
-    """Trigger the cluster of a golden case once; ``changed`` are the paths that have changed."""
+    """Trigger the cluster of a golden case once; ``changed`` lists the paths that have changed."""
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)
@@ -83,7 +83,7 @@ def receiver() -> Iterator[tuple[str, list[str]]]:
 
 @pytest.fixture
 def api(tmp_path: Path) -> Iterator[tuple[Path, list[tuple[str, bytes]]]]:
-    """A kubeconfig of a server that accepts every patch, and the list of the patches."""
+    """A kubeconfig for a server that accepts every patch, and the list of its patches."""
     heard: list[tuple[str, bytes]] = []
 
     def answer(call: Call) -> Answer:

@@ -1,4 +1,4 @@
-"""A rollout is followed on a cluster that cannot be reached, or to which there is no access."""
+"""Rollouts on a cluster that cannot be reached, or to which the generator has no access."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Role, the AppProject and `check` permit the same kinds for an access domain's charts."""
+"""The Role, the AppProject and `check` permit the same kinds of objects in an access domain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A collection may be one file or many: its entries and their faults are the same.
+"""A collection may be in one file or in many: its entries and their faults are the same.
 
 The examples come from docs/inventory.md.
 """
@@ -44,7 +44,7 @@ def faults(changed: Mapping[str, str | None]) -> str:
 
 
 def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
-    """Move entries of each collection at random to two files in the collection's folder."""
+    """Move entries of each collection at random to other files in the collection's folder."""
     result = dict(files)
     for path in {*COLLECTIONS} & {*files}:
         data, parts = plain_yaml.load(result.pop(path)), dict[str, dict[str, Any]]()

@@ -1,4 +1,4 @@
-"""A node in several access domains, each with a policy, a namespace and a ROS domain of its own."""
+"""A node in several access domains has a policy, a namespace and a ROS domain in each."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_all_of_a_service_follows_the_domain() -> None:
         made = fusion(f"d{number}", "city1")
         made["applications"][0]["id"] = f"edge/d{number}"
         taken = repo.take(made)
-    assert "servicesPerNode" in str(taken), "the quota of the city"
+    assert "servicesPerNode" in str(taken), "the city's quota must refuse it"
     assert repo.send(fusion("of-the-fleet", "vehicle00")).outcome == "booked"
     rule = [d for d in yaml.safe_load_all(repo.files["bootstrap/c-its.yaml"]) if d]
     (policy,) = (

@@ -14,7 +14,7 @@ LISTS = {"ros2mqtt": "ros_topics", "mqtt2ros": "mqtt_topics"}
 
 
 def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
-    """Return the parameters of each client by its client id."""
+    """Return the parameters of each client by the client's id."""
     found = {}
     for name, config in books.objects("ConfigMap").items():
         whole = yaml.safe_load(config["data"]["params.yaml"])
@@ -27,7 +27,7 @@ def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
 def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
     """Follow each topic through both clients of its connection.
 
-    Return by connection the ROS topic at the target by the ROS topic at the source and the
+    Return, for each connection, the ROS topic at the target by the ROS topic at the source and the
     MQTT topic.
     """
     deployments = books.objects("Deployment")

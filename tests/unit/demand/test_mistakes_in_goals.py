@@ -1,4 +1,4 @@
-"""One mistake at any place of a valid goal gives a fault at that place, and changes nothing."""
+"""A mistake at any place of a valid goal gives a fault at that place, and changes nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ELSEWHERE = {
     "applications[1].place": "applications[1].node",  # then both are missing
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
-"""By the field of a mistake, another field at which the fault may be reported."""
+"""For a mistake in some fields: another field at which its fault may be reported."""
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ CONTRADICTING: dict[str, Goal] = {
     "a shutdown by another requester": goal([application(who=OTHER)], shutdown=True),
     "a shutdown with a misspelt id": goal([application("edge/fusion")], shutdown=True),
 }
-"""Goals that are refused once ``perception()`` is booked."""
+"""Goals that are refused after ``perception()`` is booked."""
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_a_shutdown_sent_again_changes_nothing_and_says_so() -> None:
 
 
 def limited(**limits: int) -> MemoryRepo:
-    """Return a state repo with these ``limits`` in demandops.yaml."""
+    """Return a state repo with these ``limits`` in its demandops.yaml."""
     settings = yaml.safe_load(skeleton()["demandops.yaml"])
     return MemoryRepo({"demandops.yaml": yaml.safe_dump(settings | {"limits": limits})})
 

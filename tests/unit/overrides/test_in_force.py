@@ -1,7 +1,8 @@
-"""Under overrides, what demands commit is what the ledger alone would render.
+"""Under overrides, demands write the files that the ledger alone would render.
 
 Random demands join and leave. After each one, the files rendered from the ledger equal the files
-that the demands have written one by one, and the claims alone tell which are suspended or kept.
+that the demands have written one by one, and the claims alone tell which demands are suspended or
+kept.
 """
 
 from __future__ import annotations
@@ -99,7 +100,9 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
             assert ((claim.subject.id, claim.demand) in told) is suspended
             if claim.demand.startswith(OVERRIDE_PREFIX):
                 assert claim.requesters == ("petra",)
-                assert ledger.claims_on(claim.subject) == (claim,), "it gives way to any other"
+                assert ledger.claims_on(claim.subject) == (claim,), (
+                    "a kept claim must be the only one"
+                )
         for entry in entries.services.values():
             assert (entry.service, entry.node) != ("object-detection", "cloud")
         assert "v2/edge" not in entries.connections
@@ -177,7 +180,7 @@ def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
 
 
 def test_a_demand_that_an_override_breaks_is_told_which() -> None:
-    """A patch may fit the demand that `check` invents, but not a real one."""
+    """A patch may fit the demand that `check` invents, but not a real demand."""
     fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
     books = MemoryRepo(files(tested=fields))
     with pytest.raises(InvalidInput) as refusal:

@@ -1,4 +1,4 @@
-"""A configuration is valid only if no result depends on the order of overrides of equal priority.
+"""The order of overrides of equal priority never matters, or else the configuration is refused.
 
 The tests compare random selectors with every possible release.
 """
@@ -110,7 +110,7 @@ def test_selectors_apart_in_what_a_release_has_one_of_do_not_meet() -> None:
         ({"connections": ["a"]}, {"connections": ["b"]}),
     ]
     together: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"applications": ["a"]}, {"applications": ["b"]}),  # a shared service may be of both
+        ({"applications": ["a"]}, {"applications": ["b"]}),  # one shared service may serve both
         ({"requesters": ["a"]}, {"requesters": ["b"]}),
         ({"nodes": ["edge"]}, {"services": [OWN]}),
     ]

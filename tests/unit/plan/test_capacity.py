@@ -25,7 +25,7 @@ from tests.scenarios.running import configuration
 
 VEHICLES = ("vehicle00", "vehicle01")
 CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
-"""The cpu capacity by node; other nodes have no limit."""
+"""The cpu capacity of some nodes; other nodes have no limit."""
 
 
 @cache
@@ -51,7 +51,7 @@ def recorders() -> State:
 
 
 def recorder(random: Random) -> dict[str, Any]:
-    """Return a random recorder application, which has one replica for every two topics."""
+    """Return a random recorder application; it has one replica for every two topics."""
     known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
     topics = random.sample(known, random.randint(1, 5))
     where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))

@@ -1,4 +1,4 @@
-"""Waits between tries grow to a bound; fewer demands go into one push while pushes fail."""
+"""Pauses between tries grow to a bound; fewer demands go into one push while pushes fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The objects of Flux or Argo CD that the generator watches to see how far a demand got."""
+"""The objects of Flux or Argo CD by which the generator sees how far a demand has got."""
 
 from __future__ import annotations
 
@@ -42,5 +42,5 @@ def test_a_demand_waits_for_no_release_that_only_others_need() -> None:
     repo.send(vehicle)
     own = {fusion: True, "od-edge-station00": True}
     assert followed(station) == own
-    assert followed(station) == own, "it repeats"
+    assert followed(station) == own, "the demand was booked before"
     assert followed(vehicle | {"shutdown": True}) == {fusion: True, "od-edge-vehicle00": False}
