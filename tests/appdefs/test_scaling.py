@@ -80,7 +80,7 @@ def fact(repo: MemoryRepo) -> str:
 
 
 def replicas_by_overrides(*replicas: int) -> dict[str, str]:
-    """Return one override's file for each number of replicas; the last one takes precedence."""
+    """Return an override file for each number of replicas; the last override takes precedence."""
     return {
         f"overrides/o{rank}.yaml": override(
             {"services": ["recorder"]}, priority=rank, replicas=number

@@ -32,7 +32,7 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""About how many commits have their whole bookkeeping compared."""
+"""The whole bookkeeping is compared after about this many commits."""
 
 
 class PodWatch(ProcessRunner):

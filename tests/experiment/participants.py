@@ -143,7 +143,7 @@ class Participants:
             self._send_clouds(where, elapsed, now)
 
     def _pass_time(self) -> float:
-        """Return the seconds of driving so far, and add those since the last call; -1 at first."""
+        """Add the driving time since the last call; return the sum in seconds, or -1 at first."""
         passed, self._last = time.monotonic() - self._last, time.monotonic()
         if self.set_off is not None:
             driven = min(passed, max(0.0, self.until - self._elapsed))

@@ -54,7 +54,7 @@ class RunningPod:
 
 
 def program_of(image: str) -> str:
-    """Return the name of an image's stand-in program, which is the image's name alone."""
+    """Return the name of an image's stand-in program: the image's name without registry and tag."""
     return image.rpartition("/")[2].partition("@")[0].partition(":")[0]
 
 

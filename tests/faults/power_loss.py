@@ -52,7 +52,7 @@ class _Data:
 
 @dataclass
 class _Change:
-    """The parts of one call or of successive writes; ``safe`` and ``lost`` index ``parts``."""
+    """A change by one call or successive writes; ``safe`` and ``lost`` are indices of parts."""
 
     name: str
     parts: list[_Name | _Data]

@@ -27,12 +27,12 @@ from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""A process that books a demand gets SIGTERM after so many seconds, or after more (``PATIENCE``).
+"""The shortest time limit, in seconds, of a process that books a demand; it then gets SIGTERM.
 
 A demand takes half a second, but it may have to wait for its disk.
 """
 PATIENCE = 20
-"""The time limit is so many times what the first demand took, if that is more than ``LIMIT_S``."""
+"""On a busy machine, the time limit is so many times what the first demand took."""
 PLENTY_S = 60.0
 """The time limit, in seconds, of commands without an injected fault."""
 END_S = 8.0
@@ -118,7 +118,7 @@ class Ran:
 
 
 class Rig:
-    """A state repo, and processes that book demands in it, by its URL if ``remote``."""
+    """A state repo, and processes that book demands in it; with ``remote`` they use its URL."""
 
     def __init__(self, folder: Path, *, remote: bool) -> None:
         self.folder, self.remote = folder / "here", remote

@@ -100,7 +100,7 @@ def arm(where: str, address: str) -> None:
 
 
 class Lanes:
-    """Clients of which each sends its next demand when the one before is answered.
+    """Clients; each sends its next demand when its last one is answered.
 
     A demand marked ``withdraw`` is withdrawn as soon as a demand of any lane is admitted.
     """

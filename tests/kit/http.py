@@ -28,7 +28,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer of a server."""
+    """An HTTP answer of a server."""
 
     status: int = 200
     body: bytes = b""

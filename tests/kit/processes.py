@@ -39,11 +39,9 @@ class Told:
     waits: dict[str, float] = field(default_factory=dict)
     """The seconds from sending a demand to its answer, by the demand's name."""
     first: float = 0.0
+    """When the first demand was sent, by the monotonic clock."""
     last: float = 0.0
-    """``first``: when the first demand was sent; ``last``: when the last event came.
-
-    Both are times of the monotonic clock.
-    """
+    """When the last event came, by the monotonic clock."""
 
 
 class Run:

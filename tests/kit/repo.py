@@ -315,7 +315,7 @@ def claims(repo: Path, needle: str = "") -> list[str]:
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the differing files of each commit that `demandops verify` rejects, by its summary.
+    """Return the differing files of the commits that `demandops verify` rejects, by summary.
 
     Only commits after ``since`` are verified, by default all after the first one.
     """

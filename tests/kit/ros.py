@@ -239,7 +239,7 @@ class Client:
         )
 
     def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
-        """Spin until a condition is true; fail the test if it is not in time."""
+        """Spin until a condition is true; fail the test after ``seconds``."""
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, "the condition did not hold in time"

@@ -176,7 +176,7 @@ class Books:
     def _broker(self, item: Item) -> str:
         """Return the broker of an item, or an empty text if the item names none.
 
-        If the inventory has only one broker, it is that one. Otherwise it is the first of the named
+        With one broker in the inventory, it is that broker. Otherwise it is the first of the named
         node, the target and the source that has a broker.
         """
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers

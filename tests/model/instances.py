@@ -37,8 +37,8 @@ Instance = tuple[str, str]
 class Instances(Places):
     """The model of places, with instances.
 
-    ``testing`` is the version in the channel of this name. ``kept`` is for instances with more
-    replicas than they need: by number of replicas, the time until which an instance keeps so many.
+    ``testing`` is the version in the channel of this name. ``kept`` has the instances with more
+    replicas than they need, with the time until which each number of replicas is kept.
     """
 
     testing: str = NEXT

@@ -1,4 +1,4 @@
-"""With `demandops parameter-sync` a running node follows a ConfigMap, which is watched."""
+"""`demandops parameter-sync` watches a ConfigMap and sets a running node's parameters to it."""
 
 from __future__ import annotations
 

@@ -279,8 +279,7 @@ class Oracle:
     def _guard(self, check: Callable[[], object]) -> None:
         """Run a check; keep its failure for the next :meth:`check`.
 
-        Generators and futures would catch most errors, so the failure must not depend on being
-        raised.
+        Generators and futures catch most errors, so a failure that is only raised would be lost.
         """
         try:
             check()

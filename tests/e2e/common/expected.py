@@ -94,5 +94,5 @@ def _deployed(node: str, name: str) -> tuple[str, str]:
 
 
 def unscheduled(lines: frozenset[str]) -> frozenset[str]:
-    """Return the lines with each pod of the edge not scheduled and not ready."""
+    """Return these lines as they are while no pod of the edge is scheduled."""
     return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)

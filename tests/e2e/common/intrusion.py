@@ -59,7 +59,7 @@ FORBIDDEN = {
     "any node": (pod(nodeSelector={}), _ELSEWHERE),
     "a node of nobody": (pod(nodeSelector={"kubernetes.io/os": "linux"}), _ELSEWHERE),
 }
-"""Pod specs that the skeleton's access domain must refuse, each with the reason that is told."""
+"""Pod specs that the skeleton's access domain must refuse, each with the refusal's reason."""
 
 
 def makers(spec: Manifest) -> Iterator[Manifest]:

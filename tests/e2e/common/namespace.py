@@ -148,8 +148,7 @@ class Namespace:
     def restore(self, *releases: str) -> None:
         """Make the controller restore these releases, or the domain's folder if none is named.
 
-        Without a controller's own method, this does nothing: that controller restores them by
-        itself.
+        By default this does nothing, for a controller that restores them by itself.
         """
 
     # --- waiting ----------------------------------------------------------------------------
@@ -159,7 +158,7 @@ class Namespace:
         return self._wait_same(self.lines, wanted, timeout)
 
     def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
-        """Wait until `inventory` returns exactly this."""
+        """Wait until `inventory` returns exactly the wanted objects."""
         self._wait_same(self.inventory, wanted, timeout)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:

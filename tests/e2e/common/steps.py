@@ -155,7 +155,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Set replicas as an autoscaler does, and an image; wait until the image is restored."""
+        """Set replicas as an autoscaler does, change the image, and wait until it is restored."""
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)

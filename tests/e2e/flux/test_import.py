@@ -102,7 +102,7 @@ def test_the_resources_of_the_reference_are_read_from_a_cluster(
 
 
 class Shell:
-    """Runs the page's commands in a folder from which the cluster can fetch repositories."""
+    """Runs the commands of docs/migration.md in a folder that the rig's Git server serves."""
 
     def __init__(self, rig: Rig, folder: Path, volumes: Path) -> None:
         self.folder = rig.repository("any.git").parent

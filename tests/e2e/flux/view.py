@@ -1,6 +1,6 @@
 """An access domain on a cluster that Flux reconciles: its source, its Kustomization, its releases.
 
-It reads the API and triggers Flux; it changes no object that Flux or a release owns.
+This module reads the API and triggers Flux; it changes no object that Flux or a release owns.
 """
 
 from __future__ import annotations

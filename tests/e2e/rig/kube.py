@@ -52,7 +52,7 @@ _VERSIONS = {
 class Kube:
     """A cluster's API.
 
-    A kind has the API version in `_VERSIONS`, or else `v1`, unless `version` is given.
+    The API version of a kind is `version` if given, else the one in `_VERSIONS`, else `v1`.
     """
 
     def __init__(

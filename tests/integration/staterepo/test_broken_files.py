@@ -1,8 +1,7 @@
 """While a file of people is not valid, the other files that people merge take effect.
 
-A broken file is held back together with the other files of its commit, and without the files of
-other commits. After a restart the same files are in effect, and every commit verifies by its
-trailers.
+A broken file holds back the other files of its commit, but no file of another commit. After a
+restart the same files are in effect, and every commit verifies by its trailers.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def test_an_io_error_ends_the_process_and_the_next_start_goes_by_the_journal(bar
 
 
 class _Broken:
-    """A repository whose references an error of the disk makes unreadable."""
+    """A repository whose references cannot be read, because of an error of the disk."""
 
     def __init__(self, repo: pygit2.Repository, error: OSError) -> None:
         self._repo, self._error = repo, error

@@ -1,4 +1,4 @@
-"""With overrides, `verify` finds the same by differences between commits as with `--whole`."""
+"""Under overrides, `verify` goes from commit to commit and gives the verdicts of `--whole`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def verdicts(bare: Path) -> dict[str, Verdict]:
 
 
 def forged(bare: Path, person: Person, generator: Generator, change: Callable[[], str]) -> Verdict:
-    """Make a commit of a person between demands; return the verdict on it."""
+    """Make a commit that is not the generator's, between demands; return the verdict on it."""
     rig.book(generator, rig.goal(2))
     made = change()
     found = verdicts(bare)[made]

@@ -46,7 +46,7 @@ def application(
     health: str = "Healthy",
     resources: tuple[dict[str, str], ...] = (),
 ) -> dict[str, Any]:
-    """Return an Application; by default Argo CD has compared its current source `wanted`."""
+    """Return an Application; by default it was compared with its current source `wanted`."""
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}
     if sync:

@@ -26,7 +26,10 @@ from tests.kit.turns import Turns
 
 PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
 TAKES_OVER_S = 15 + 2
-"""A Lease that its leader does not renew ends after 15 s; the standbys poll the Lease every 2 s."""
+"""How many seconds after its leader's last renewal a Lease has another leader at the latest.
+
+The Lease ends after 15 s, and the standbys poll it every 2 s.
+"""
 
 
 @dataclass

@@ -216,7 +216,7 @@ class TestValues:
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
-        """A value is rendered as JSON, in quotes; after other text, these belong to the value."""
+        """A value is written as JSON, in quotes, which become a part of it after other text."""
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(

@@ -227,7 +227,7 @@ BRIDGED: dict[str, Any] = {"bridged": {"edge": ["/a"]}}
 
 
 class TestBridgedAlready:
-    """Clients carry no topic that the inventory lists as bridged; no client has no topic."""
+    """Clients carry no topic that the inventory lists as bridged; each client has a topic."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_no_client_without_a_topic(self, kind: str) -> None:

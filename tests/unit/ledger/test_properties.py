@@ -85,7 +85,7 @@ class Walk:
 
 
 def assert_changes(taken: Decision, expected: Result) -> None:
-    """Check that exactly the touched claims are written, and that all holds not found are named."""
+    """Check that exactly the touched claims are written, and that each hold not found is named."""
     changed = {key_in(change.key) for change in taken.changes.claims}
     assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_file.path_of(change.key) for change in taken.changes.claims}

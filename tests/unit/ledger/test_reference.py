@@ -79,7 +79,7 @@ def running(repo: MemoryRepo) -> Books:
 
 
 class Recorded:
-    """The recorded books, or the recorded topics that run: in the reference, and in DemandOps.
+    """A recorded table (the books, or what runs) after each step: in the reference, and here.
 
     A recorded step has only the changes.
     """

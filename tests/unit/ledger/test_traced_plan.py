@@ -1,4 +1,4 @@
-"""A traced plan that gets the changes equals a new plan, whatever is booked in whatever order."""
+"""A traced plan follows the changes of the ledger and always equals a plan that is made anew."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def afresh(world: World) -> dict[ReleaseKey, Release]:
 
 
 class Following:
-    """The releases as somebody knows them who gets only the changes of a traced plan."""
+    """The releases as somebody knows them who gets only the changes from a traced plan."""
 
     def __init__(self, config: Config) -> None:
         self._plan = TracedPlan(config)

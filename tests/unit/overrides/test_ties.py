@@ -1,4 +1,4 @@
-"""The order of overrides of equal priority never matters, or else the configuration is refused.
+"""A configuration is valid only if no result depends on the order of overrides of equal priority.
 
 The tests compare random selectors with every possible release.
 """

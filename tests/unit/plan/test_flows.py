@@ -205,7 +205,7 @@ class Demands:
         return head | {"applications": self.held[demand]}
 
     def others(self, goal: dict[str, Any]) -> set[str]:
-        """Return the ids of the applications that demands other than the goal's hold."""
+        """Return the ids of all applications that are held by other demands."""
         others = (apps for demand, apps in self.held.items() if demand != goal["demand"])
         return {app["id"] for apps in others for app in apps}
 

@@ -49,7 +49,7 @@ def test_a_service_has_the_most_that_it_needed_in_the_time(
 ) -> None:
     repo, now = empty().copy(), NOW
     needs: list[tuple[datetime, int]] = []
-    """The number of replicas that the service needed since each time, as long as it runs."""
+    """Since when the service has needed how many replicas, as long as it runs."""
     for seconds, topics in [(0, 1), *steps]:
         now += timedelta(seconds=seconds)
         repo.scale_down(now)

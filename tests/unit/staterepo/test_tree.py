@@ -1,4 +1,4 @@
-"""`trees.write` and `trees.differences` do what a dict as a model of a file tree does."""
+"""`trees.write` and `trees.differences` agree with a model of a file tree: a dict by path."""
 
 from __future__ import annotations
 
