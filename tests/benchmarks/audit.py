@@ -31,7 +31,7 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
     """Make a state repo with a fleet and ``commits`` further demands; return its path."""
     laid = fleet.lay_down(folder / "state-repo.git", releases)
     generator = Generator(str(laid.path), data=folder / "data")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # off while the repo is made
     try:
         for first in range(0, commits, BATCH):
             tickets = []

@@ -153,7 +153,7 @@ def _lay_down(
     files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, ledger, state.engine))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # off only while the repo is made
     tree = write_tree(repo, None, files)
     who = commit_message.generator_signature(now)
     text = "A fleet\n\nOperation: init\nRender-Version: 2\n"

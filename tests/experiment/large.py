@@ -159,7 +159,7 @@ class LargeExperiment(Experiment):
         )
 
     def _exists(self, path: str) -> bool:
-        self._world.tip()  # pulls
+        self._world.tip()  # pulls the clone
         return (self._world.person.folder / path).exists()
 
     def _lines(self) -> frozenset[str]:

@@ -119,7 +119,7 @@ class Participants:
             self._by_name = dict.fromkeys(names, Participant("crowd", plan.domains["cloud"]))
         else:
             self._by_name = {name: Participant(name, plan.domains[name]) for name in names}
-        self._sent = Path(plan.record).open("w", buffering=1)  # noqa: SIM115 - as long as this
+        self._sent = Path(plan.record).open("w", buffering=1)  # noqa: SIM115 - open as long as this object
         self.set_off: float | None = None
         self.until, self.held = 0.0, 0.0
         self._elapsed, self._last = -1.0, 0.0

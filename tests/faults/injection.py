@@ -264,7 +264,7 @@ def _run(rig: Rig, job: Job, site: Site) -> Result:
     own = site.is_threads and (not job.remote or "outbox" in site.file)  # the remote keeps a push
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
     problems = list(after_fault(ran, tuple(told), unsound=unsound))
-    if site.role == "git receive-pack":  # an operator removes its locks; the generator waits
+    if site.role == "git receive-pack":  # its locks stay until an operator removes them
         rig.unlock_server()
     problems += after_restart(rig, ran)
     return Result(part, where, job.fault, tuple(problems))

@@ -304,7 +304,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
         def begin(name: str) -> None:
             with one_begins:
                 if select.select([waits], [], [], 0)[0]:
-                    os.read(waits, 1)  # for the thread before, whose own read strace would count
+                    os.read(waits, 1)  # of the thread before; strace would count its own read
                 os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
                 select.select([waits], [], [])
             with suppress(OSError):

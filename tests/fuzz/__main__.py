@@ -71,7 +71,7 @@ class Run:
             os._exit(status)  # without the exit handlers that the parent has registered
 
     def _look(self) -> None:
-        tempfile.tempdir = str(self.folder)  # which the next run removes
+        tempfile.tempdir = str(self.folder)  # the next run removes it
         signal.signal(signal.SIGVTALRM, _stop)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, used + MOST_MEMORY))

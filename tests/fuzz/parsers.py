@@ -529,7 +529,7 @@ _PUSH = b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nX-Gitlab-Token:
 def webhook_address(data: bytes) -> None:
     text = _text(data)
     if any(char.isalpha() for char in text):
-        return  # no name is looked up
+        return  # a name would be looked up
     PushWebhook(text, b"", lambda: None).close()
 
 

@@ -112,7 +112,7 @@ class Fleet:
                 return False
             found = true()
             took = time.monotonic() - began
-            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles go on between
+            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles publish between
             return found
 
         wait_until(spun, what, 60)

@@ -18,7 +18,7 @@ from demandops.http_call import HttpAnswer, NoAnswer
 
 from tests.kit.http import Answer, serving
 
-SECRET = "s3cret"  # noqa: S105 - it opens nothing
+SECRET = "s3cret"  # noqa: S105 - no real secret
 
 
 @pytest.fixture(autouse=True)

@@ -22,7 +22,7 @@ from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import Person, branches
 from tests.kit.rig import goal
 
-TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 
 
 @dataclass

@@ -116,7 +116,7 @@ def test_what_is_not_taken_is_told_and_no_redirection_followed(
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
     trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
-    assert len(hook.calls) in (1, 2)  # the second, as it is closed
+    assert len(hook.calls) in (1, 2)  # the close may cause a second one
     assert SECRET not in caplog.text and "/hook" not in caplog.text
 
 

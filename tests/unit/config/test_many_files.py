@@ -52,7 +52,7 @@ def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
         head = {name: data.pop(name) for name in heads if name in data}
         for name, entries in data.items():
             for key in entries if isinstance(entries, dict) else range(len(entries)):
-                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type stays whole
+                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type stays in one file
                     place = path.replace(".yaml", random.choice([".yaml", "/a.yaml", "/b.yaml"]))
                 part = parts.setdefault(place, dict(head))
                 if isinstance(entries, dict):

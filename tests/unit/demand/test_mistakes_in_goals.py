@@ -19,7 +19,7 @@ ELSEWHERE = {
     "connections[0].source_topics": "connections[0].target_topics",  # lengths then differ
     "shutdown": "apps[0].header.id",  # the shutdown finds no claim
     "connections[0].type": "connections[0].",  # another type has other rules
-    "applications[0].parameters.rate": "parameters.rate",  # found in the merge
+    "applications[0].parameters.rate": "parameters.rate",  # the merge finds it
     "applications[1].place": "applications[1].node",  # then both are missing
     "applications[1].parameters_json.": "applications[1].parameters.",
 }

@@ -15,7 +15,7 @@ from typing import Any
 from tests.kit import plain_yaml
 from tests.kit.http import Answer, Call, serving
 
-TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 _EXCHANGES = Path(__file__).with_name("exchanges")
 _IGNORED = {"host", "connection", "accept-encoding", "user-agent", "content-length"}
 
