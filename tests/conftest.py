@@ -143,7 +143,6 @@ def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str
 
 @pytest.fixture
 def bare(new_repo: Callable[[str], Path]) -> Path:
-    """A bare state repo."""
     return new_repo("state.git")
 
 

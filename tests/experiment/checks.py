@@ -27,12 +27,10 @@ class Check:
 
     @property
     def holds(self) -> bool:
-        """Whether the check passes."""
         return not self.fault
 
 
 def checks(outcome: Outcome) -> list[Check]:
-    """Return all checks of a run."""
     return [
         Check("the detector formed the demands that a plain script over the poses gives",
               differ([str(one) for one in outcome.events], [str(one) for one in outcome.formed])),

@@ -40,5 +40,4 @@ def to_message(points: list[Point]) -> PointCloud2:
 
 
 def from_message(message: PointCloud2) -> Iterator[Point]:
-    """Yield the points in a message."""
     yield from _POINT.iter_unpack(bytes(message.data))

@@ -47,7 +47,6 @@ class Observer:
         self._thread = ExecutorThread(self.node)
 
     def close(self) -> None:
-        """Leave the ROS graph."""
         self._thread.close()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)

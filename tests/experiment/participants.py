@@ -94,7 +94,6 @@ class Participant:
         self.messages: Counter[str] = Counter()
 
     def send(self, topic: str, message: Any, now: float) -> None:
-        """Publish a message with the stamp `now`, and count it."""
         message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(type(message), topic, 10)
@@ -104,7 +103,6 @@ class Participant:
         self.messages[topic] += 1
 
     def close(self) -> None:
-        """Leave the ROS graph."""
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 

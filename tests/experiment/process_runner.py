@@ -74,7 +74,6 @@ class ProcessRunner:
             thread.start()
 
     def close(self) -> None:
-        """End the processes of all containers."""
         self._closed.set()
         self._runner.join(30)
 

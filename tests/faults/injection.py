@@ -83,7 +83,7 @@ class Site:
 
     @property
     def of_class(self) -> tuple[str, str, str, bool]:
-        """Role, kind, class of file, and whether it creates; calls with equal values are alike."""
+        """Role, kind, class of file, and whether it makes one; calls that share these are alike."""
         return self.role, self.kind, self.file, self.creates
 
     @property

@@ -145,7 +145,6 @@ class Rig:
             (self._git / program.name).symlink_to(wrapper)
 
     def unlock_server(self) -> None:
-        """Remove the locks that git left in the state repo."""
         for lock in self.state.rglob("*.lock"):
             lock.unlink()
 
@@ -336,5 +335,4 @@ def demands(rig: Rig) -> dict[int, list[str]]:
 
 
 def includes(rig: Rig, commit: str) -> bool:
-    """Return whether main has a commit."""
     return commit in git(rig.state, "rev-list", "main").split()

@@ -91,7 +91,6 @@ def _folder() -> Path:
 
 @cache
 def _repo() -> pygit2.Repository:
-    """Return a repository with one commit."""
     repo = pygit2.init_repository(str(_folder() / "repo.git"), bare=True, initial_head="main")
     who = pygit2.Signature("x", "x@example.org", 0, 0)
     repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])

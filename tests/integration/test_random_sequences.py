@@ -38,7 +38,6 @@ class CommandLine:
         return ran.code, ran.json()
 
     def commits(self) -> list[str]:
-        """Return all commits, oldest first."""
         return git(self.repo, "rev-list", "--reverse", "main").split()
 
     def view(self, revision: str) -> dict[str, Any]:

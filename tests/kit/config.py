@@ -40,7 +40,6 @@ def brokers(*nodes: str) -> dict[str, str]:
 
 
 def override(*select: Mapping[str, Any], **fields: Any) -> str:
-    """Return the text of an override's file."""
     head = {"apiVersion": "demandops/v1", "kind": "Override"}
     why = {"reason": "a field test", "owner": "petra"}
     return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)

@@ -20,7 +20,6 @@ PATIENCE_S = 60.0
 
 @contextmanager
 def running(address: str | Path, **options: Any) -> Iterator[Generator]:
-    """Run a generator for the length of a block."""
     generator = Generator(str(address), **options)
     try:
         yield generator

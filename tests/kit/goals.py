@@ -86,7 +86,6 @@ def goal(
     id: str = "request",
     shutdown: bool = False,
 ) -> Goal:
-    """Return a goal of the reference's action."""
     return {
         "id": id,
         "apps": list(apps),
@@ -115,7 +114,6 @@ def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None)
 
 
 def leave(number: int) -> Goal:
-    """Return the shutdown of demand ``number``."""
     return numbered(number, shutdown=True)
 
 

@@ -28,7 +28,6 @@ class KubeApi:
         self._log: list[tuple[str, str, Item]] = []
 
     def put(self, plural: str, namespace: str, name: str, status: Item, **more: Any) -> None:
-        """Create or replace an object."""
         with self._changed:
             metadata = {"name": name, "namespace": namespace, "generation": 1}
             metadata |= more.pop("metadata", {})
@@ -79,7 +78,6 @@ class KubeApi:
 
 @contextmanager
 def kube_api() -> Iterator[KubeApi]:
-    """Run an API server for the length of a block."""
     api = KubeApi()
 
     class Handler(BaseHTTPRequestHandler):

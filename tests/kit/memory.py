@@ -56,14 +56,12 @@ class MemoryRepo:
         self.files = dict(self._initial)
 
     def copy(self) -> MemoryRepo:
-        """Return a second repo with the same content."""
         twin = copy.copy(self)
         twin.files = dict(self.files)
         return twin
 
     @property
     def config(self) -> Config:
-        """The configuration in effect."""
         return self.state.config
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
@@ -201,7 +199,6 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
 
 
 def outcome(taken: Decision | Refused) -> str:
-    """Return the outcome of a goal in one word."""
     return "refused" if isinstance(taken, Refused) else taken.outcome
 
 

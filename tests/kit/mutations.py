@@ -219,7 +219,6 @@ class Form:
         return [part for part in parts if "properties" in part]
 
     def fields_in(self, document: Any) -> set[str]:
-        """Return the fields that a document uses, as ``Node.id``."""
         return set(self._used(document, self._schema))
 
     def _used(self, value: Any, schema: Schema) -> Iterator[str]:

@@ -80,7 +80,6 @@ class Run:
         return self._told
 
     def kill(self) -> None:
-        """Send SIGKILL to the process if it runs."""
         if self.pid and not self._ended:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)

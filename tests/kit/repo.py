@@ -51,7 +51,6 @@ Only a signature shows that the generator did not make the commit.
 
 
 def init(path: Path, *, bare: bool = True) -> Path:
-    """Make a state repo, as ``demandops init`` does."""
     new_repo.init(path, NOW, bare=bare, gitops="flux")
     return path
 
@@ -94,7 +93,6 @@ class GitRepo:
 
     @property
     def tip(self) -> str:
-        """The id of the newest commit on main."""
         return tip(self.path)
 
     def __fspath__(self) -> str:
@@ -227,8 +225,6 @@ class Person:
 
 @dataclass(frozen=True)
 class Commit:
-    """A commit, as ``git log`` shows it."""
-
     id: str
     parents: tuple[str, ...]
     summary: str
@@ -277,7 +273,6 @@ def away(repo: Path) -> Iterator[None]:
 
 
 def tip(repo: Path | str) -> str:
-    """Return the id of the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
 
 
@@ -326,7 +321,6 @@ def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]
 
 
 def root(repo: Path) -> str:
-    """Return the id of the first commit."""
     *_, first = pygit2.Repository(str(repo)).walk(tip(repo))
     return str(first.id)
 

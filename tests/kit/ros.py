@@ -300,7 +300,6 @@ class Client:
         return bool(future.result().goals_canceling)
 
     def call(self, sent: dict[str, Any]) -> Sent:
-        """Send a goal and wait for its answer."""
         under_way = self.send(sent)
         self.wait(lambda: under_way.answered)
         return under_way

@@ -74,7 +74,6 @@ def absolute(topic: str) -> str:
 
 
 def requesters(item: Item) -> list[str]:
-    """Return the requesters of an application or a connection."""
     body = item.get(_BODY, {}) if "header" in item else item
     return list(body.get("requester_ids", []))
 

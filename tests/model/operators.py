@@ -46,7 +46,7 @@ class Operators:
         }
 
     def take(self, goal: Goal) -> set[str]:
-        """Count a goal; return why the operators count parts of it otherwise than the goal says.
+        """Count a goal; return why the operators' counts differ from what the goal says.
 
         A reason is the name of a row in docs/reference.md.
         """

@@ -281,7 +281,6 @@ class World:
 
     @property
     def tip(self) -> str:
-        """The id of the newest commit of main."""
         return str(self.remote.references[MAIN].target)
 
     @contextmanager

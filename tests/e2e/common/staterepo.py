@@ -155,7 +155,6 @@ class StateRepo(Generic[Domain]):
         return self.person.git("rev-parse", "HEAD")
 
     def changed_by(self, commit: str) -> list[str]:
-        """Return the paths that a commit changed."""
         self._pull()
         return self.person.git("show", "--name-only", "--format=", commit).split()
 

@@ -189,7 +189,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
 
 def _autoscaled(world: World) -> dict[str, str | None]:
-    """Return the files of an appdef with autoscalers; the fusion's chart has a fixed number too."""
+    """Return an appdef's files with autoscalers; the fusion's chart also sets a fixed number."""
     chart, registry = f"{CHART}/Chart.yaml", "registry/charts.yaml"
     deployment = "appdefs/charts/ros-service/templates/_deployment.yaml"
     named = re.sub(

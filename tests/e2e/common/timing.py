@@ -45,7 +45,6 @@ class Table:
         self._rows.append((title, times))
 
     def show(self, say: Callable[[str], None]) -> None:
-        """Print all rows, in seconds."""
         width = max(len(title) for title, _ in self._rows)
         say(f"\n{self._heading} (seconds)")
         say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in _STAGES))

@@ -117,7 +117,6 @@ class Deployed:
         self.pods = [Pod(rig.kube, name, NAMESPACE, address, folder) for name in names]
 
     def install(self) -> None:
-        """Install the chart, or upgrade it."""
         given = self.folder / "values.json"
         given.write_text(json.dumps(self.values))
         options = ["--install", f"--namespace={NAMESPACE}", f"--values={given}"]

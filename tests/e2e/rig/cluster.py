@@ -185,7 +185,6 @@ class Rig:
         return self._own().pids()
 
     def log(self, component: str) -> Path:
-        """Return a part's log file."""
         return self._own().log(component)
 
     def url(self, component: str) -> str:
@@ -309,8 +308,6 @@ class Rig:
 
 
 class _Clock:
-    """Measures the seconds of each stage of a start."""
-
     def __init__(self, timings: dict[str, float]) -> None:
         self._timings, self._last = timings, time.monotonic()
 

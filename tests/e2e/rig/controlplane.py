@@ -19,8 +19,6 @@ _SERVICES = "10.96.0.0/16"
 
 @dataclass(frozen=True)
 class ControlPlane:
-    """The ports and files of a control plane."""
-
     binaries: dict[str, Path]
     folder: Path
     pki: Pki

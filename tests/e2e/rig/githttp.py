@@ -62,7 +62,6 @@ class GitServer(ThreadingHTTPServer):
         self.git = program
 
     def environment(self) -> dict[str, str]:
-        """Return the environment of Git's processes."""
         return _environment(self.root)
 
 
@@ -128,7 +127,6 @@ class Handler(BaseHTTPRequestHandler):
             init_bare(repository, self.server.git)
 
     def run_backend(self, path: str, query: str) -> None:
-        """Answer a request with the output of `git http-backend`."""
         backend = subprocess.Popen(
             [self.server.git, "http-backend"],
             env=self.server.environment() | self._request_variables(path, query),

@@ -40,8 +40,6 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Go:
-    """An installed Go toolchain."""
-
     program: str
     version: str  # like go1.26.8
     target: str  # like linux/amd64

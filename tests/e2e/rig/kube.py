@@ -109,7 +109,6 @@ class Kube:
         return [dict(item) for item in found.to_dict()["items"]]
 
     def delete(self, kind: str, name: str, namespace: str = "", version: str = "") -> None:
-        """Delete an object, if it exists."""
         try:
             self._resource(kind, version).delete(name=name, namespace=namespace or None)
         except NotFoundError:
@@ -195,7 +194,6 @@ class Kube:
     def wait_gone(
         self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
     ) -> None:
-        """Wait until an object does not exist."""
         what = f"{kind} {namespace}/{name} to go"
         self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
 
@@ -234,7 +232,7 @@ def handled(manifest: Manifest, token: str) -> bool:
 
 
 def _condition(found: Manifest | None) -> str:
-    """Return why an object is not ready, or its newest generation is not; empty if it is."""
+    """Return why the newest generation of an object is not ready; empty if it is."""
     if found is None:
         return "does not exist"
     status = found.get("status", {})

@@ -25,8 +25,6 @@ _AUTHORITY = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig-authority")
 
 @dataclass(frozen=True)
 class Pki:
-    """The paths of the control plane's certificates and keys."""
-
     authority: Path
     server_certificate: Path
     server_key: Path

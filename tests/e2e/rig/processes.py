@@ -44,8 +44,6 @@ class Component:
 
 
 class Processes:
-    """The processes of a rig, by component name."""
-
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs
         self._environment = dict(environment)

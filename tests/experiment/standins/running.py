@@ -1,4 +1,4 @@
-"""Helpers of all stand-ins: find a message type by its name, and spin a node until a signal."""
+"""Helpers of all stand-ins: find a message type by name; spin a node until a signal comes."""
 
 from __future__ import annotations
 

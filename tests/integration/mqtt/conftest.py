@@ -213,6 +213,5 @@ class Client:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Disconnect from the broker."""
         self._client.disconnect()
         self._client.loop_stop()

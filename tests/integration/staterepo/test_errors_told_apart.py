@@ -73,9 +73,8 @@ def test_a_full_disk_keeps_demands_waiting_until_there_is_room(
         rig.book(generator, goal(1))
         stages = Stages()
         journal = generator._slot.folder / "outbox.jsonl"
-        with files_end_at(
-            journal.stat().st_size + 1500
-        ):  # room for a journal entry, not for a pack
+        # room for a journal entry, not for a pack
+        with files_end_at(journal.stat().st_size + 1500):
             ticket = generator.submit(goal(2), listener=stages)
             rig.wait_until(
                 lambda: ticket.future.done() or "away" in stages.names, "the requester is told"

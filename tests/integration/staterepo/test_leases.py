@@ -35,7 +35,6 @@ domains:
 
 
 def _with_policy(repo: Path, more: str = "") -> Path:
-    """Commit a policy as a person would do it."""
     GitRepo(repo).commit({DOMAINS: POLICY % more}, "Short leases\n")
     return repo
 

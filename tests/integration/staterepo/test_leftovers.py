@@ -17,7 +17,7 @@ from tests.kit.repo import git, tip
 
 
 def _leave(bare: Path) -> list[Path]:
-    """Make the files that a process leaves when it is killed during a pack; return their paths."""
+    """Make the leftovers of a process that was killed while it wrote a pack; return their paths."""
     folder = bare / "demandops-pack-killed"
     folder.mkdir()
     (folder / "pack_git2_1").write_text("half of a pack")

@@ -21,7 +21,7 @@ RELEASE = "of-edge-fusion"
 
 @pytest.fixture(scope="session")
 def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bare state repo whose fusion has a replica for each source, and removes replicas late."""
+    """A bare state repo whose fusion has a replica for each source and keeps it for a time."""
     folder = tmp_path_factory.mktemp("kept") / "state.git"
     bare = Path(shutil.copytree(bare_template, folder))
     text = skeleton()[APPDEF].replace("prefix: of\n", f"prefix: of\n    scaling: {SCALING}\n")

@@ -121,7 +121,6 @@ def by_hand(
 
 
 def held(bare: Path) -> set[tuple[str, ...]]:
-    """Return the requesters of each claim in effect."""
     with reader.opened(str(bare)) as repo:
         return {claim.requesters for claim in repo.snapshot().state.ledger}
 

@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[State, dict[str, Any]]] = {
 
 
 class TestAutomaticChoice:
-    """Zenoh if both nodes speak it, else MQTT if there is a broker, else ROS, else a refusal."""
+    """The type is Zenoh if both nodes speak it, else MQTT with a broker, else ROS, else none."""
 
     @pytest.mark.parametrize(
         ("before", "asked", "chosen"),

@@ -36,7 +36,6 @@ Books = dict[str, list[str]]
 
 
 def resource(kind: str, *ids: str) -> str:
-    """Return the name of a custom resource of the reference."""
     return "-".join((kind, *ids)).replace("_", "-").replace("/", "-")
 
 

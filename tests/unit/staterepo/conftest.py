@@ -41,7 +41,6 @@ def desk() -> Desk:
 
 @pytest.fixture
 def repo(tmp_path: Path) -> pygit2.Repository:
-    """An empty bare repository."""
     return pygit2.init_repository(str(tmp_path / "repo.git"), bare=True, initial_head="main")
 
 
