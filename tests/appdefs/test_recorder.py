@@ -191,7 +191,7 @@ def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
     assert ends[0] == ends[1]
 
 
-def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: MemoryRepo) -> None:
+def test_a_topic_list_that_is_no_input_of_the_recorder_is_refused(books: MemoryRepo) -> None:
     assert books.faults(goal([record(ego=[("/ego", "vehicle00")])])) == [
         f"{BODY}.ego_data_topics: recorder has no such input; known: point_cloud"
     ]

@@ -148,7 +148,7 @@ def test_more_of_anything_never_gives_fewer_and_bounds_hold(
     assert scaling.min <= few <= many <= scaling.max
 
 
-def test_the_largest_size_counts_and_what_is_none_is_refused() -> None:
+def test_the_largest_demanded_size_applies_and_an_unknown_size_is_refused() -> None:
     repo = books("{sizes: {parameter: size, replicas: {small: 1, medium: 2, large: 4}}}")
     for name, size, replicas in (("a", "medium", 2), ("b", "large", 4), ("c", ["small"], 4)):
         repo.send(demand(name, size=size))

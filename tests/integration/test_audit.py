@@ -399,7 +399,9 @@ class TestRollback:
         assert self.roll(demandops, played, "main~1", "-m", "why not").code == 0
         assert git(played, "log", "-1", "--format=%an|%ae", "main") == "Ada (A)|ada@example.org"
 
-    def test_what_was_booked_since_is_listed_and_stays(self, demandops: Run, played: Any) -> None:
+    def test_a_rollback_past_newer_claims_is_refused_and_lists_them(
+        self, demandops: Run, played: Any
+    ) -> None:
         before = played.tip
         ran = self.roll(demandops, played, "main~4", "-m", "x")
         found = ran.json()

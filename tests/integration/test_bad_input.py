@@ -246,7 +246,7 @@ class TestYamlAttacks:
         assert state.tip == before
         assert not (tmp_path / "trace").exists()
 
-    def test_whatever_stands_in_a_file_ends_in_a_message(
+    def test_any_content_of_a_file_ends_in_an_error_message(
         self, demandops: Send, state: Any, tmp_path: Path
     ) -> None:
         contents = [

@@ -143,7 +143,7 @@ def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
     assert (code, errors) == (1, f"error: {checkout} is not a Git checkout; leave out --base\n")
 
 
-def test_an_input_that_the_merge_keeps_from_arriving_is_told(
+def test_check_warns_of_an_input_that_the_branch_cuts_off(
     state: GitRepo, tmp_path: Path, demandops: Run
 ) -> None:
     assert demandops("request", EXPERIMENT[0], "--state-repo", state.path).code == 0

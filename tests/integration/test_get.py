@@ -339,7 +339,7 @@ class TestStatus:
         )
         assert ran.code == 0
 
-    def test_what_is_not_healthy_is_waited_for_and_told(
+    def test_status_wait_lists_unhealthy_releases_when_the_time_is_over(
         self, demandops: Run, fleet: GitRepo, tmp_path: Path
     ) -> None:
         where = ("--state-repo", fleet.path)

@@ -212,7 +212,7 @@ def test_what_cannot_be_read_is_refused(migration: Migration, text: str, message
     assert not migration.map.exists()
 
 
-def test_nothing_held_is_an_error(migration: Migration) -> None:
+def test_an_import_that_finds_no_demands_fails(migration: Migration) -> None:
     refused = migration.run("-", files="no such file", stdin="{}")
     assert (refused.code, refused.err) == (
         1,

@@ -76,7 +76,7 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
     assert bodies(state.files()[path]) == bodies(text)
 
 
-def test_the_deletion_suggested_stops_what_was_deleted_by_hand(
+def test_the_override_that_check_suggests_stops_a_release_deleted_by_hand(
     demandops: Run, state: Any, book: Callable[..., Any], clone: Path
 ) -> None:
     (clone / CLIENT).unlink()

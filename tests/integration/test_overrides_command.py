@@ -211,7 +211,7 @@ def test_why_tells_what_overrides_do(demandops: Run, overridden: GitRepo) -> Non
     assert all(one["suspended_by"] is None for one in shaped["claims"])
 
 
-def test_why_of_what_an_override_keeps(
+def test_why_names_the_override_that_keeps_a_claim(
     demandops: Run, overridden: GitRepo, request_json: Callable[..., Ran]
 ) -> None:
     overridden.commit({"overrides/closed.yaml": None, "overrides/off.yaml": None})

@@ -119,7 +119,9 @@ class TestOverride:
         person.merge("override/calm")
         assert demandops("get", "overrides", *where, "-o", "name").out == "calm\n"
 
-    def test_what_is_not_valid_changes_nothing(self, demandops: Run, joined: GitRepo) -> None:
+    def test_an_invalid_override_is_refused_and_nothing_committed(
+        self, demandops: Run, joined: GitRepo
+    ) -> None:
         before, where = joined.tip, ("--state-repo", joined.path)
         for options, told in (
             ((), "give the reason: -m TEXT"),
@@ -143,7 +145,7 @@ class TestOverride:
 
 
 class TestSuspend:
-    def test_what_is_suspended_rests_until_it_is_resumed(
+    def test_suspended_demands_run_again_after_a_resume(
         self, demandops: Run, joined: GitRepo, where: tuple[str, str]
     ) -> None:
         files = joined.manifests()

@@ -188,9 +188,7 @@ def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, che
     assert check()[0] == 1
 
 
-def test_what_is_deleted_added_or_the_generators_own_is_refused_with_what_to_do(
-    branch: Path, check: Run
-) -> None:
+def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, check: Run) -> None:
     (branch / DETECTION).unlink()
     (branch / CLIENT).unlink()
     (branch / EDGE / "extra.yaml").write_text("kind: Secret\n")

@@ -94,7 +94,9 @@ def test_an_rsa_key(book: Run, state: Any, tmp_path: Path) -> None:
     assert git_says(state, listed(key), tmp_path).returncode == 0
 
 
-def test_a_key_that_an_agent_holds(book: Run, state: Any, agent: None, tmp_path: Path) -> None:
+def test_the_ssh_agent_can_sign_with_a_key_that_has_no_file(
+    book: Run, state: Any, agent: None, tmp_path: Path
+) -> None:
     key = keygen(tmp_path / "key")
     subprocess.run(["ssh-add", "-q", str(key)], check=True)
     key.unlink()

@@ -57,7 +57,7 @@ def tag(state: GitRepo) -> str:
     return str(release["spec"]["values"]["image"]["tag"])
 
 
-def test_the_views_show_what_runs_and_what_is_asked_for(
+def test_the_views_show_the_running_and_the_demanded_version(
     send: Send, demandops: Run, state: GitRepo
 ) -> None:
     send("first")

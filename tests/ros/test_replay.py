@@ -138,7 +138,7 @@ def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
     assert told == [(1.0, ["vehicle01"], "start"), (3.0, ["vehicle01"], "stop")]
 
 
-def test_what_is_no_bag_or_has_no_topic_of_the_rules_is_refused(
+def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
     demandops: Run, tmp_path: Path
 ) -> None:
     ran = demandops("detect", RULES, "--replay", tmp_path)

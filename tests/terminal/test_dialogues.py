@@ -10,7 +10,7 @@ from tests.kit.http import kubeconfig
 from tests.kit.repo import GitRepo
 
 
-def test_what_is_not_given_is_asked_for(checkout: Path) -> None:
+def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
     with Dialogue("new", "application", "tracking", folder=checkout) as talk:
         talk.read_until("such as camera=sensor_msgs/msg/Image; several with spaces: ")
         talk.type("camera\n")

@@ -43,7 +43,7 @@ def test_what_works_again_may_fail_again(caplog: pytest.LogCaptureFixture) -> No
     assert caplog.messages == ["the tip cannot be read"] * 2
 
 
-def test_after_what_is_unsound_nothing_is_started_again() -> None:
+def test_a_thread_that_ends_as_unsound_is_not_restarted() -> None:
     turns, told = Turns(1), list[object]()
     turns.when_unsound = lambda: told.append(turns.unsound)
 

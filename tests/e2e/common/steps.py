@@ -102,7 +102,7 @@ def test_another_requester_changes_no_object_of_a_release(world: World) -> None:
     assert domain.releases() == releases
 
 
-def test_what_a_release_holds_is_restored(world: World) -> None:
+def test_deleted_and_changed_objects_of_a_release_are_restored(world: World) -> None:
     domain = running(world)
     detection, params = DETECTION["vehicle00"], f"{FUSION}-params"
     template, inputs = pod_template(domain, detection), domain.get("ConfigMap", params)["data"]

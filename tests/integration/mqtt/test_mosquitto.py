@@ -101,7 +101,7 @@ def test_a_message_passes_both_ways_as_the_parameters_say(connect: Callable[...,
     assert (payload, qos) == (b"ice", 2)
 
 
-def test_who_comes_late_gets_what_is_retained_and_nothing_else(
+def test_a_late_client_gets_the_retained_message_only(
     connect: Callable[..., Client],
 ) -> None:
     source = connect("source")

@@ -182,7 +182,7 @@ def test_a_proposal_outlives_the_generator(url: str, bare: Path, petra: Person) 
         rig.wait_until(lambda: branches(bare) == [other], "the branch is deleted")
 
 
-def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
+def test_decisions_made_while_no_generator_runs_take_effect_at_the_next_start(
     url: str, bare: Path, petra: Person
 ) -> None:
     with rig.running(url) as generator:

@@ -125,7 +125,7 @@ def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Person) -> N
     assert [pull["head"] for pull in hub.pulls].count(branch) == 1
 
 
-def test_what_is_taken_back_is_closed(hub: Hub, bare: Path, petra: Person) -> None:
+def test_withdrawing_a_demand_closes_its_pull_request(hub: Hub, bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)

@@ -64,7 +64,9 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     rig.assert_sound(bare)
 
 
-def test_applications_at_a_node_go_in_whosever_name(bare: Path, demandops: Run) -> None:
+def test_decommissioning_a_node_releases_its_applications_for_every_requester(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1), goal(2))
     assert demandops("decommission", "edge", "--node", "--state-repo", bare)[0] == 0
@@ -80,7 +82,9 @@ def _by_the_edges_broker(target: str) -> rig.Goal:
     return made
 
 
-def test_of_a_broker_that_was_asked_for_another_takes_the_place(bare: Path, demandops: Run) -> None:
+def test_another_broker_replaces_the_demanded_broker_of_a_decommissioned_node(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, _by_the_edges_broker("cloud"))
     code, out, err = demandops("decommission", "edge", "--state-repo", bare)
@@ -91,7 +95,9 @@ def test_of_a_broker_that_was_asked_for_another_takes_the_place(bare: Path, dema
     rig.assert_sound(bare)
 
 
-def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandops: Run) -> None:
+def test_a_decommission_that_leaves_a_connection_without_a_broker_changes_nothing(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, _by_the_edges_broker("station00"), goal(2))
     tip = rig.tip(bare)
@@ -135,7 +141,9 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(bare: Path, deman
     rig.assert_sound(bare)
 
 
-def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: Run) -> None:
+def test_decommissioning_a_node_as_a_requester_leaves_its_topics_to_others(
+    bare: Path, demandops: Run
+) -> None:
     others = goal(2)
     for subject in (others["apps"][0]["object_detection_fusion_app"], others["connections"][0]):
         subject["requester_ids"] = ["user2"]
@@ -163,7 +171,9 @@ def test_dry_run_shows_the_consequence_and_releases_nothing(bare: Path, demandop
     assert rig.tip(bare) == tip
 
 
-def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Run) -> None:
+def test_a_name_without_claims_changes_nothing_and_an_unknown_name_is_refused(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
     tip = rig.tip(bare)

@@ -279,7 +279,7 @@ def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> 
 # ---- the remote is slow, or away ----
 
 
-def test_a_look_that_hangs_holds_up_no_demand(http: str, server: Server, bare: Path) -> None:
+def test_a_fetch_that_hangs_delays_no_demand(http: str, server: Server, bare: Path) -> None:
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         hang = server.faults.hang = threading.Event()

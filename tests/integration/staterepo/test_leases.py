@@ -121,7 +121,7 @@ def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
     rig.assert_sound(bare)
 
 
-def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(
+def test_renewing_a_lease_keeps_the_claim_and_changes_no_cluster_file(
     clock: Clock, bare: Path
 ) -> None:
     with rig.running(bare, runtime=clock) as generator:
@@ -169,7 +169,7 @@ def test_an_end_that_waits_while_the_clock_is_set_back_does_not_come(
     assert re.search(r"is back after \d+ s", caplog.text)
 
 
-def test_what_another_generator_renewed_is_kept(
+def test_a_lease_that_another_generator_renewed_does_not_expire(
     clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, logger="demandops")

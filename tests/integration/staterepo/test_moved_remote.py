@@ -187,7 +187,7 @@ def test_a_node_taken_away_is_gone_for_new_demands_once_it_is_released(
 
 
 @EITHER
-def test_what_an_inventory_changed_is_carried_out_once_nothing_stands_in_its_way(
+def test_an_inventory_change_is_applied_once_a_removed_node_is_released(
     address: str, bare: Path, person: Person, running: bool
 ) -> None:
     """One push moves a broker and removes a node in use; later demands release the node."""

@@ -60,7 +60,7 @@ def test_nobody_takes_an_overrides_demand_id(generator: Generator) -> None:
         rig.book(generator, goal | {"operation": "release"})
 
 
-def test_what_is_merged_arrives_stays_and_goes(
+def test_a_merged_override_applies_until_it_is_deleted(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     limits = {"resources": {"limits": {"memory": "2Gi"}}}
@@ -185,7 +185,7 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     rig.assert_sound(bare)
 
 
-def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
+def test_a_denied_requester_is_refused_and_its_claims_suspended_until_the_override_goes(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1), rig.goal(2))
@@ -224,7 +224,7 @@ def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
     rig.assert_sound(bare)
 
 
-def test_what_is_kept_runs_on_until_somebody_asks_again_or_the_override_goes(
+def test_a_kept_application_runs_until_a_demand_takes_over_or_the_override_goes(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1))
@@ -268,7 +268,7 @@ def test_a_claim_that_a_person_deletes_is_kept_too(
     rig.assert_sound(bare)
 
 
-def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
+def test_an_expired_override_ends_in_a_commit_and_a_later_date_revives_it(
     clock: Clock, remote_generator: Generator, bare: Path, person: Person
 ) -> None:
     generator = remote_generator
@@ -328,7 +328,7 @@ def test_what_expired_while_no_generator_ran_ends_when_one_does(
     rig.assert_sound(bare)
 
 
-def test_a_tie_is_reported_and_what_was_in_force_stays(
+def test_a_tie_is_reported_and_the_earlier_override_stays_in_force(
     generator: Generator, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
     told = "overrides/sound.yaml: priority: is 0, as in overrides/broken.yaml"

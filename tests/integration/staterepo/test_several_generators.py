@@ -108,7 +108,7 @@ def test_the_same_demand_at_two_generators_at_once_is_booked_once(
     rig.assert_sound(bare)
 
 
-def test_a_branch_that_another_writer_holds_for_a_moment_is_tried_again(bare: Path) -> None:
+def test_a_push_is_repeated_while_another_writer_locks_the_branch(bare: Path) -> None:
     """For example, `git push` or a second generator has the branch's lock while it writes."""
     lock = bare / "refs" / "heads" / "main.lock"
     with rig.running(bare) as generator:

@@ -367,7 +367,7 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
 
 
 @pytest.mark.synced
-def test_what_was_taken_back_stays_so_after_a_crash(
+def test_a_withdrawn_demand_stays_withdrawn_after_a_crash(
     drivers: Drivers, address: str, bare: Path
 ) -> None:
     """The kill comes when both demands are in the journal and the second is withdrawn."""

@@ -40,7 +40,7 @@ def forged(bare: Path, person: Person, generator: Generator, change: Callable[[]
 HOLD = override({"services": ["object-fusion"]}, hold=True)
 
 
-def test_a_held_file_is_compared_with_the_one_before(
+def test_a_held_file_must_equal_the_file_of_the_commit_before(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1))

@@ -283,7 +283,7 @@ def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) 
     assert (process.returncode, out, err) == (0, "", "stopped\n")
 
 
-def test_what_is_taken_over_is_what_deriving_everything_gives(
+def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     booked: Generator, person: Person, follower: Follower, look: Look
 ) -> None:
     appdef = "appdefs/object-detection-fusion/appdef.yaml"

@@ -108,7 +108,7 @@ def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:
     assert found("node=edg") == []
 
 
-def test_links_keep_the_filter_and_the_moment(look: Look, state: GitRepo) -> None:
+def test_links_carry_the_filter_and_the_shown_commit(look: Look, state: GitRepo) -> None:
     page = look("/services", q="vehicle00", at=state.tip)
     kept = f"at={state.tip}"
     assert "q=vehicle00" in page.link("Node") and "sort=node" in page.link("Node")
@@ -135,7 +135,7 @@ def test_a_release_is_explained(look: Look, state: GitRepo) -> None:
     assert "started" in page.texts("td")
 
 
-def test_a_moment_shows_the_books_of_then(look: Look, state: GitRepo) -> None:
+def test_the_page_shows_the_claims_at_an_earlier_commit(look: Look, state: GitRepo) -> None:
     assert len(look("/demands").texts("tr")) == 3
     then = look("/demands", at=f"{state.tip}~1")
     assert len(then.texts("tr")) == 2

@@ -227,7 +227,7 @@ def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     )
 
 
-def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
+def test_a_removed_release_is_healthy_once_none_of_its_objects_is_left() -> None:
     child = application(NEW, sync="Synced", at="b")
     left = deployment("x")
     left["metadata"]["annotations"] = {
@@ -247,14 +247,14 @@ def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
     assert health.failing and health.reason.endswith("DeletionError: forbidden")
 
 
-def test_one_that_is_being_removed_is_not_what_is_wanted_anew() -> None:
+def test_an_application_under_deletion_does_not_count_as_the_wanted_one() -> None:
     child = application(NEW, sync="Synced", at="b")
     child["metadata"]["deletionTimestamp"] = AT
     health = ARGOCD.release_health(SERVICE, "b", {CHILD: child}, COMMITS)
     assert health.state == "reconciled" and "created again" in health.reason
 
 
-def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
+def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cluster() -> None:
     objects = {OVER: over(sync="Synced", at="b"), CHILD: application(NEW)}
     assert ARGOCD.applied_commit(PLACE, objects) == "b"
     assert ARGOCD.applied_commit(PLACE, {}) == ""

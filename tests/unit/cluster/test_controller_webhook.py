@@ -110,7 +110,7 @@ def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
 
 
 @pytest.mark.parametrize("status", [302, 307, 400])
-def test_what_is_not_taken_is_told_and_no_redirection_followed(
+def test_a_refused_webhook_is_logged_and_no_redirection_followed(
     hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})

@@ -115,7 +115,7 @@ def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     )
 
 
-def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
+def test_a_removed_release_is_healthy_once_none_of_its_objects_is_left() -> None:
     helm = {("HelmRelease", "ns", "od-edge"): release(READY)}
     left = {("Deployment", "ns", "x"): deployment("x", of="od-edge")}
     assert FLUX.release_health(GONE, "b", helm, COMMITS).state == "reconciled"

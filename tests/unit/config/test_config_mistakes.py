@@ -448,5 +448,5 @@ def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
         versions("1.0.0", {"1.0.0": {}, "2.0.0-rc.1": {"charts": {"object-fusion": "0.1.0"}}}),
     ],
 )
-def test_what_is_odd_but_works(changed: dict[str, str]) -> None:
+def test_an_odd_but_valid_configuration_loads(changed: dict[str, str]) -> None:
     load(configuration(changed))

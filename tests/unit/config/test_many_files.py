@@ -107,7 +107,7 @@ def test_a_name_that_is_nearly_right_is_a_fault_too(path: str) -> None:
     assert faults({path: "kind: Nodes\n"}).startswith(f"{path}: is not read; ")
 
 
-def test_what_is_no_configuration_may_stay() -> None:
+def test_files_that_are_no_configuration_are_ignored() -> None:
     odd = ("README.md", "nodes/README.md", "nodes/.draft.yaml", ".old/nodes.yaml", "plan.txt")
     load(configuration({f"inventory/{name}": "not: [yaml" for name in odd}))
     load(configuration({"policy/allowed-signers": ""}))
@@ -127,7 +127,7 @@ def test_the_folder_alone_is_enough_and_messages_name_it() -> None:
     )
 
 
-def test_a_fault_keeps_file_and_place() -> None:
+def test_a_fault_in_one_of_many_files_names_the_file_and_the_field() -> None:
     bad = FILES[VEHICLE].replace("cluster: c-its", "cluster: c-it").replace("  ego_", "  eggo_")
     assert faults(FILES | {VEHICLE: bad}) == (
         f"{VEHICLE}: nodes[0].cluster: 'c-it' is not in clusters.yaml; did you mean 'c-its'?\n"

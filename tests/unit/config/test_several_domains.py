@@ -152,7 +152,7 @@ def test_the_reference_names_it_or_gets_it_by_a_rule() -> None:
     assert repo.send(named).outcome == "booked"
 
 
-def test_what_is_booked_stays_in_its_domain() -> None:
+def test_a_booked_application_stays_in_its_domain() -> None:
     repo = MemoryRepo(SEVERAL)
     repo.send(fusion("d", "both", node="edge@city"))
     assert repo.send(fusion("d", "both")).outcome == "unchanged"

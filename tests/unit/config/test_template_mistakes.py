@@ -323,5 +323,5 @@ class TestBeforeTheFirstDemand:
         change = {path: skeleton()[path] + "x: {{ nope }}\n" for path in (TEMPLATE, other)}
         assert [found.split(":")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
 
-    def test_what_is_laid_down_passes(self) -> None:
+    def test_the_configuration_of_init_passes(self) -> None:
         try_configuration(State.of(load(configuration()), Ledger()))

@@ -89,7 +89,7 @@ def test_no_mqtt_topic_holds_a_wildcard_or_a_dollar() -> None:
             assert re.fullmatch(r"[a-z0-9-]+(/[A-Za-z0-9_]+)+", mqtt), mqtt
 
 
-def test_every_end_has_a_client_id_of_its_own_and_that_of_its_deployment() -> None:
+def test_the_client_id_of_each_end_is_unique_and_the_name_of_its_deployment() -> None:
     books = MemoryRepo()
     for id in ("c", "c-source", "c/source", "C"):
         books.send(goal([], [connection(id)], id=id))

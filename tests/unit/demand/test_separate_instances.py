@@ -199,7 +199,7 @@ def record(demand: str, version: str) -> dict[str, Any]:
     return made
 
 
-def test_a_shared_service_for_each_topic_of_an_own_one_is_a_fault() -> None:
+def test_a_shared_topic_service_must_not_use_the_output_of_a_separate_service() -> None:
     follower = """
 apiVersion: demandops/v1
 kind: ServiceDefinition

@@ -87,7 +87,7 @@ def test_an_appdef_asks_for_its_applications_and_not_for_connections() -> None:
     assert books.send(goal([], [connection()])).approval == ()
 
 
-def test_more_than_what_stands_needs_approval() -> None:
+def test_only_a_demand_that_adds_something_needs_approval() -> None:
     books = MemoryRepo(policy(approval="required"))
     assert books.send(perception()).approval == (DOMAIN,)
     assert books.send(perception()).approval == ()

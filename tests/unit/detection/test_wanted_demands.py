@@ -50,7 +50,7 @@ def test_a_demand_is_sent_renewed_after_a_third_of_its_lease_and_ended() -> None
     assert len(sent.wanted) == 1
 
 
-def test_what_is_over_before_it_was_sent_is_never_sent() -> None:
+def test_a_demand_that_ends_before_it_is_sent_is_never_sent() -> None:
     sent = Sent()
     sent.want(PUT)
     sent.want(None)
@@ -58,7 +58,7 @@ def test_what_is_over_before_it_was_sent_is_never_sent() -> None:
     assert len(sent.wanted) == 0
 
 
-def test_what_is_over_while_it_is_under_way_is_ended_after_the_answer() -> None:
+def test_a_demand_that_ends_while_its_put_is_under_way_is_ended_after_the_answer() -> None:
     sent = Sent()
     sent.want(PUT)
     under_way = sent.next(0)
@@ -120,7 +120,7 @@ def test_a_request_is_sent_again_as_often_as_its_rule_says() -> None:
     assert sent.next(60).goal == JOIN
 
 
-def test_what_is_booked_from_before_is_renewed_at_once_and_not_put() -> None:
+def test_a_demand_booked_before_the_start_is_renewed_at_once_and_not_put_again() -> None:
     sent = Sent()
     sent.wanted.hold(KEY, PUT)
     sent.want(PUT)

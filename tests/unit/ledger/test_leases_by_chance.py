@@ -80,7 +80,7 @@ def assert_recorded(world: running.World, promises: Promises) -> None:
 
 @examples(30)
 @given(chances, st.integers(1, 16))
-def test_what_was_promised_is_kept(random: Random, length: int) -> None:
+def test_every_result_agrees_with_the_model_of_lease_promises(random: Random, length: int) -> None:
     world, promises, maker = running.World(EMPTY, FILES), Promises(SLACK_S), Maker(random)
     now = 0
     for _ in range(length):

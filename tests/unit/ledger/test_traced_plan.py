@@ -45,7 +45,7 @@ class Following:
 
 @examples(20)
 @given(chances, st.integers(1, 20))
-def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
+def test_a_plan_traced_through_changes_equals_a_fresh_plan(random: Random, length: int) -> None:
     """The traced plan gets the changes one at a time, or several at once."""
     repo = MemoryRepo()
     following = Following(repo.state.config)

@@ -74,7 +74,7 @@ def test_the_versioning_files_tell_who_joined_together() -> None:
     assert warnings == []
 
 
-def test_without_them_the_counts_are_kept() -> None:
+def test_an_import_without_the_remaining_joins_keeps_the_counts() -> None:
     joins, _ = imported_goals.held(read(experiment(6), "bookkeeping"))
     assert who(joins[CONNECTION]) == [("vehicle03", "station00", "vehicle02"), ("station00",)]
 
@@ -145,7 +145,7 @@ def test_the_versioning_of_a_connection_is_not() -> None:
     )
 
 
-def test_what_was_deleted_is_forgotten_although_its_versions_are_kept() -> None:
+def test_a_deleted_application_is_not_imported_although_its_versions_remain() -> None:
     reference = experiment(8)
     files = read(reference, "")
     assert FUSION in files.versions

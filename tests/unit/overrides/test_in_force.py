@@ -135,7 +135,7 @@ def test_the_higher_priority_wins_and_patches_of_both_apply() -> None:
     assert fusion[name]["spec"]["values"]["replicas"] == 7
 
 
-def test_what_is_higher_than_a_hold_changes_what_it_holds() -> None:
+def test_an_override_of_higher_priority_than_a_hold_changes_the_held_release() -> None:
     def body(text: str) -> str:
         return "".join(line for line in text.splitlines(True) if not line.startswith("#"))
 
@@ -192,7 +192,7 @@ def test_a_demand_that_an_override_breaks_is_told_which() -> None:
     )
 
 
-def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
+def test_a_kept_claim_belongs_to_the_owner_with_the_inputs_of_the_last_claim() -> None:
     books = _one(select=[{"applications": ["edge/*"]}], keep=True)
     one = goal([application(ego=[EGO])], id="one")
     two = goal([application(who=["bob"])], id="two")
@@ -233,7 +233,7 @@ def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
         assert ("object-detection-1.0.0" in release) is kept
 
 
-def test_what_a_lease_ends_is_kept_too_and_a_put_that_drops_it_as_well() -> None:
+def test_an_override_keeps_claims_that_end_by_lease_or_by_a_reduced_put() -> None:
     demand = {
         "kind": "Demand",
         "demand": "leased",

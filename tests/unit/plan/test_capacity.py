@@ -156,7 +156,7 @@ def test_memory_is_shown_in_the_largest_unit_that_is_exact() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "-1", "1e3", "1 Gi", "0.5m", "1.2345", "many", "1GB"])
-def test_what_is_no_quantity_is_a_fault(text: str) -> None:
+def test_an_invalid_quantity_is_a_fault(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a quantity|is finer than a thousandth"):
         amount_of(text)
 

@@ -81,7 +81,7 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: Lea
     assert ended(clock, ledger) == ["a"]
 
 
-def test_a_clock_that_is_drawn_on_slowly_is_no_step(
+def test_small_adjustments_of_the_clock_count_as_no_step(
     clocks: Clock, clock: LeaseExpiry, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)

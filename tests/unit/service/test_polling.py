@@ -44,7 +44,7 @@ def test_an_interval_above_the_bound_is_kept(clock: Clock) -> None:
     assert made.seconds_until_due() == 600
 
 
-def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock) -> None:
+def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None:
     made = PollTimer(0, clock)
     assert made.seconds_until_due() is None and not made.start_if_due()
     for _ in range(3):

@@ -17,7 +17,7 @@ from tests.kit.memory import NOW, MemoryRepo
     ("case", "application"),
     [("experiment", None), ("argocd-experiment", ObjectName("argocd", "demandops-perception"))],
 )
-def test_a_place_knows_by_which_controller_it_is_kept(
+def test_a_rollout_target_names_its_argo_cd_application_or_none_for_flux(
     case: str, application: ObjectName | None
 ) -> None:
     state, files = start(case)

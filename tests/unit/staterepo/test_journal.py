@@ -48,7 +48,7 @@ def text(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_what_was_written_is_read(path: Path, text: bytes) -> None:
+def test_the_journal_reads_back_the_entries_that_are_not_done(path: Path, text: bytes) -> None:
     found = pending(text)
     assert list(found) == ["op-a", "op-c"]
     assert found["op-a"] == entry("a")
@@ -110,7 +110,7 @@ def test_no_missing_doubled_or_moved_entry_is_overlooked(path: Path, text: bytes
             assert str(error.value).startswith("outbox.jsonl: line ")
 
 
-def test_a_damage_names_its_place_and_the_remedy(path: Path, text: bytes) -> None:
+def test_a_damaged_journal_is_refused_with_the_line_and_the_remedy(path: Path, text: bytes) -> None:
     path.write_bytes(text.replace(b"wish", b"wash", 2))
     with pytest.raises(DamagedJournal) as error:
         Journal(path)

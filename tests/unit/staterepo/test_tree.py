@@ -122,7 +122,7 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
 
 @given(before=file_trees(), after=file_trees())
 @examples(50)
-def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
+def test_differences_between_trees_list_exactly_the_changed_files(
     before: Files, after: Files
 ) -> None:
     with scratch() as repo:
