@@ -84,8 +84,8 @@ class Strace:
 class GitTrace:
     """The calls of one process of git.
 
-    ``which`` is its number among the processes of its ``command``, such as ``git push``. ``folder``
-    is where it started, and ``text`` is what strace wrote.
+    ``which`` numbers the processes of one ``command``, such as ``git push``. ``folder`` is the
+    working directory of the process, and ``text`` is the output of strace.
     """
 
     command: str

@@ -1,4 +1,4 @@
-"""For each place that writes a value as text, the real reader reads the same value back."""
+"""A value that the program writes as text comes back the same from the program that reads it."""
 
 from __future__ import annotations
 

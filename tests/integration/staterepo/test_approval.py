@@ -679,10 +679,10 @@ def test_a_proposal_passes_the_check_of_pull_requests(
     assert run(["check", str(petra.folder)]) == 0, capsys.readouterr()
 
 
-def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
+def test_a_demand_withdrawn_right_before_a_crash_loses_its_branch_at_the_restart(
     http: str, server: Server, bare: Path, petra: Person
 ) -> None:
-    """The withdrawal is on the disk before the crash, so the restart deletes the branch."""
+    """The journal has the withdrawal on disk before the crash."""
     with rig.running(http) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
