@@ -32,7 +32,10 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""The whole bookkeeping is compared after about this many commits."""
+"""The number of commits, about, at which the run records the whole bookkeeping.
+
+These commits are spread evenly over the run, and the last commit is one of them.
+"""
 
 
 class PodWatch(ProcessRunner):

@@ -337,10 +337,10 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
         assert rig.book(generator, leave(1))[0].outcome == "released"
 
 
-def test_a_verdict_on_a_stale_clone_is_not_given_while_the_remote_is_away(
+def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """By the stale clone, neither demand would need a push, but the remote has changed since."""
+    """Against the stale clone, neither demand needs a push, but the remote has changed since."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)
