@@ -94,7 +94,7 @@ def synced(request: pytest.FixtureRequest) -> bool:
 
 @pytest.fixture
 def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make Petra the author and committer of each commit."""
+    """Make a person named Petra the author and committer of each commit."""
     for name, value in repo.GIT_ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
 
@@ -143,7 +143,6 @@ def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str
 
 @pytest.fixture
 def bare(new_repo: Callable[[str], Path]) -> Path:
-    """A bare state repo."""
     return new_repo("state.git")
 
 
@@ -161,7 +160,7 @@ def address(request: pytest.FixtureRequest, bare: Path) -> str:
 
 @pytest.fixture
 def url(bare: Path) -> str:
-    """The URL of the state repo `bare`, as a remote to clone, fetch from and push to."""
+    """The URL of the state repo `bare`; it serves as a remote to clone, fetch from and push to."""
     return bare.as_uri()
 
 
@@ -220,7 +219,7 @@ def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
 
 @pytest.fixture
 def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
-    """Return what starts generators as processes; the end of the test kills those that run."""
+    """Return the starter of generator processes; the end of the test kills those that still run."""
     _all_drivers.synced = synced
     yield _all_drivers
     _all_drivers.kill_runs()

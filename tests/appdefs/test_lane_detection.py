@@ -23,7 +23,7 @@ PAGE = (EXAMPLE / "README.md").read_text()
 
 
 def blocks(language: str) -> dict[str, str]:
-    """Return the code blocks of one language on the page, each by its first line."""
+    """Return the page's code blocks of one language, keyed by their first line without `# `."""
     found = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
     return {text.partition("\n")[0].lstrip("# "): text for text in found}
 
@@ -132,7 +132,9 @@ def test_object_detection_reads_the_driver_that_lane_detection_has(books: Memory
     assert of_lidars(books) == {}
 
 
-def test_the_bookkeeping_reads_claims_that_a_person_made_to_disagree(books: MemoryRepo) -> None:
+def test_the_bookkeeping_accepts_two_claims_that_a_person_made_inconsistent(
+    books: MemoryRepo,
+) -> None:
     (app,) = DEMAND["applications"]
     app = app | {"inputs": {"point_cloud": [{"topic": "/points", "source": "vehicle01"}]}}
     books.send(DEMAND | {"applications": [app]})

@@ -33,7 +33,7 @@ ADDITIONS = {
     for path, text in configuration(["recorder", "monitor"]).items()
     if path not in skeleton() or path.startswith("registry/")
 }
-"""What a platform engineer adds to a state repo: the appdefs' folders and two registry files."""
+"""The files that a platform engineer adds to a state repo: the appdefs and two registry files."""
 
 
 @pytest.fixture
@@ -191,7 +191,7 @@ def test_a_driver_does_not_depend_on_which_of_its_users_came_first() -> None:
     assert ends[0] == ends[1]
 
 
-def test_a_list_of_the_message_that_it_does_not_take_is_refused(books: MemoryRepo) -> None:
+def test_a_topic_list_that_is_no_input_of_the_recorder_is_refused(books: MemoryRepo) -> None:
     assert books.faults(goal([record(ego=[("/ego", "vehicle00")])])) == [
         f"{BODY}.ego_data_topics: recorder has no such input; known: point_cloud"
     ]
@@ -221,7 +221,7 @@ def test_all_three_kinds_run_side_by_side(books: MemoryRepo) -> None:
 
 
 class TestParameters:
-    """The appdef decides how values of several demands merge; without a rule they must be equal."""
+    """The appdef says how parameters of several demands merge; without a rule, they must agree."""
 
     @staticmethod
     def demand(who: str, appdef: str = "recorder", **parameters: object) -> dict[str, Any]:
@@ -251,7 +251,7 @@ class TestParameters:
             ("rate", [10, 20], 20),
             ("rate", [2.5, 2], 2.5),
             ("rate", [-3, -2], -2),
-            ("rate", [0.5, None], 0.5),  # a demand without a rate is none for the default
+            ("rate", [0.5, None], 0.5),  # the default of 1 does not count
             ("rate", [None, None], 1),
             ("quality", [10, 20], 10),
             ("quality", [0, 0.5], 0),
@@ -274,7 +274,7 @@ class TestParameters:
         if name != "title":  # of several titles the last one counts
             assert self.values(turned)[name] == merged
 
-    def test_values_that_nobody_said_how_to_merge_must_agree(self, books: MemoryRepo) -> None:
+    def test_values_without_a_rule_for_merging_must_agree(self, books: MemoryRepo) -> None:
         books.send(self.demand("vehicle00", format="mcap"))
         (found,) = books.faults(self.demand("vehicle01", format="bag"))
         assert found == (
@@ -288,7 +288,7 @@ class TestParameters:
     def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
         self, books: MemoryRepo, recorder: dict[str, int], monitor: int
     ) -> None:
-        """If one kind's demand gives no rate, that kind's default does not count either."""
+        """The larger rate counts; an appdef's default does not count if a demand gives no rate."""
         books.send(self.demand("a", "recorder", **recorder))
         books.send(self.demand("b", "monitor", rate=monitor))
         assert self.values(books, "drv-")["rate"] == 20

@@ -73,14 +73,14 @@ def release(repo: MemoryRepo) -> dict[str, Any]:
 
 
 def fact(repo: MemoryRepo) -> str:
-    """Return what a commit message reports of the recorder's replicas."""
+    """Return what the commit message says about the recorder's replicas."""
     (found,) = (plan for plan in repo.state.plans.values() if plan.name.startswith("rec-"))
     (told,) = (line for line in found.facts() if line.startswith("replicas "))
     return told.removeprefix("replicas ")
 
 
 def replicas_by_overrides(*replicas: int) -> dict[str, str]:
-    """Return one override's file for each number of replicas; the last one takes precedence."""
+    """Return an override file for each number of replicas; the last override takes precedence."""
     return {
         f"overrides/o{rank}.yaml": override(
             {"services": ["recorder"]}, priority=rank, replicas=number
@@ -148,7 +148,7 @@ def test_more_of_anything_never_gives_fewer_and_bounds_hold(
     assert scaling.min <= few <= many <= scaling.max
 
 
-def test_the_largest_size_counts_and_what_is_none_is_refused() -> None:
+def test_the_largest_demanded_size_applies_and_an_unknown_size_is_refused() -> None:
     repo = books("{sizes: {parameter: size, replicas: {small: 1, medium: 2, large: 4}}}")
     for name, size, replicas in (("a", "medium", 2), ("b", "large", 4), ("c", ["small"], 4)):
         repo.send(demand(name, size=size))
@@ -183,13 +183,14 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
 
 
 class TestRequesters:
-    """A service whose definition or override depends on requesters is planned when they change."""
+    """A change of requesters replans only services whose definition or override depends on them."""
 
     @staticmethod
     def changed(repo: MemoryRepo, requesters: int) -> tuple[list[str], set[str]]:
-        """Demand again with so many requesters.
+        """Demand again with this number of requesters.
 
-        Return the generated files that change, and the names of the services that are planned.
+        Return the generated files that change, and the names of the services that are planned
+        again.
         """
         before = repo.state
         decision = repo.send(demand(topics=3, requesters=requesters))
@@ -291,7 +292,7 @@ class TestAutoscaler:
 
 @pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
 def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: bool) -> None:
-    """The report warns of the driver, which publishes, and not of the recorder, which does not."""
+    """A second replica doubles what the driver publishes; the recorder publishes nothing."""
     driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
     doubled = override({"services": ["*"]}, replicas=2)
     repo = MemoryRepo({**ADDITIONS, DRIVER: driver, "overrides/two.yaml": doubled})

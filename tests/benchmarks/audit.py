@@ -1,4 +1,4 @@
-"""What an auditor's questions cost on the state repo of a fleet with thousands of commits.
+"""Measure what an auditor's questions cost on a state repo with thousands of commits.
 
 Vehicles join and leave at all edges in turn; the generator makes a commit of each join and leave.
 The benchmark prints the seconds of each question. ``--keep FOLDER`` makes the state repo in this
@@ -31,7 +31,7 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
     """Make a state repo with a fleet and ``commits`` further demands; return its path."""
     laid = fleet.lay_down(folder / "state-repo.git", releases)
     generator = Generator(str(laid.path), data=folder / "data")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # off while the repo is made
     try:
         for first in range(0, commits, BATCH):
             tickets = []
@@ -49,7 +49,7 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
 
 
 def timed(what: str, call: Callable[[], object]) -> None:
-    """Ask a question; print how long it takes, and the answer."""
+    """Call a function; print the question, the seconds that the call took, and its result."""
     start = time.perf_counter()
     found = call()
     print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")
@@ -90,7 +90,6 @@ def _verify(opened: reader.Reader, *, whole: bool) -> int:
 
 
 def main() -> int:
-    """Make the state repo unless it is there, and measure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--releases", type=int, default=RELEASES)
     parser.add_argument("--commits", type=int, default=COMMITS)

@@ -1,9 +1,9 @@
-"""What a commit costs from ``submit`` on, compared with a floor, at 100 and 10,000 releases.
+"""Measure the time of a commit from ``submit`` on, and compare it with a floor.
 
-The floor is the least that such a commit can cost: bare pygit2 writes the same blobs, trees and
-commit with the same fsync, in the same repository, right after each demand. GitPython's index
-commits the same files in a checked-out copy. The benchmark prints a table and writes
-``build/bench.json``.
+The state repo has 100 or 10,000 releases. The floor is the least time that such a commit can take:
+bare pygit2 writes the same blobs, trees and commit with the same fsync, in the same repository,
+right after each demand. For comparison, GitPython's index commits the same files in a checked-out
+copy. The benchmark prints a table and writes ``build/bench.json``.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def _changed(repo: pygit2.Repository, commit: pygit2.Commit) -> dict[str, str | 
 
 
 class Floor:
-    """The floor: bare pygit2 writes the same objects, each into a file of its own."""
+    """Writes the same objects with bare pygit2, each into a file of its own: the floor."""
 
     def __init__(self, path: Path) -> None:
         self._repo, self._other = pygit2.Repository(str(path)), pygit2.Repository(str(path))
@@ -143,7 +143,6 @@ def _index(folder: Path, bare: Path, changes: list[dict[str, str | None]]) -> li
 
 
 def main() -> int:
-    """Measure all sizes and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="releases")
     parser.add_argument("--edges-per-cluster", type=int, default=10)

@@ -1,15 +1,15 @@
-"""What a join costs with every kind of decision configured, compared with none of them.
+"""Measure a join with every kind of decision configured, and with none of them.
 
 Two state repos have the same fleet. In the second one, services request capacity of their nodes,
-scale by sources and keep replicas for a while, have versions that may run side by side, and are
-shared within a cluster with another application. Each edge is also in a further access domain with
+scale by sources, keep replicas for a while, may run in several versions side by side, and are
+shared with another application of the cluster. Each edge is also in a further access domain with
 rules, quotas and leases.
 
 Two generators in one process take turns, so that other work on the machine affects both alike. A
 vehicle joins by a goal of the reference's action, and by a demand in DemandOps' own format. In the
-second repo, this demand leaves the node to the generator. The clock stops with the receipt; CPU
-time counts until the process is idle again. The benchmark prints the ratios of the medians and
-writes ``build/configured.json``.
+second repo, this demand leaves the node to the generator. The wall-clock time ends with the
+receipt; CPU time counts until the process is idle again. The benchmark prints the ratios of the
+medians and writes ``build/configured.json``.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ domains:
 
 
 def configure(files: dict[str, str]) -> None:
-    """Add every kind of decision to a configuration."""
+    """Configure every kind of decision in the files of a configuration."""
     appdef = yaml.safe_load(files[APPDEF])
     appdef["versions"] = "separate"
     for service, scaling in (
@@ -119,7 +119,7 @@ Times = tuple[float, float]
 
 
 def _times(generator: Generator, goal: dict[str, Any]) -> Times:
-    """Book a goal; return its milliseconds by the clock, and the CPU time of all threads."""
+    """Book a goal; return its wall-clock time and the CPU time of all threads, in milliseconds."""
     clock, cpu = time.perf_counter(), time.process_time()
     generator.submit(goal).future.result()
     clock = time.perf_counter() - clock
@@ -138,7 +138,7 @@ def _when_idle() -> float:
 
 
 def reference(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return the reference's join and shutdown, which always name a node."""
+    """Return a join and a shutdown of the reference's action; both name the node in any case."""
     join = fleet.goal(fleet.edge_id(edge), fleet.spare_id(edge))
     return [join, join | {"shutdown": True}]
 
@@ -195,7 +195,6 @@ def _row(
 
 
 def main() -> int:
-    """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--releases", type=int, default=RELEASES)
     parser.add_argument("--rounds", type=int, default=ROUNDS)

@@ -1,4 +1,4 @@
-"""What the event detector costs: the engine alone, then the node with messages over ROS 2.
+"""Measure the event detector: the engine alone, then the node with messages over ROS 2.
 
 The engine gets 2,000 entities at 10 Hz, with 100 areas, a rule on pairs and a rule on a count. The
 node gets poses of more and more entities at 10 Hz until it loses messages. First each entity has a

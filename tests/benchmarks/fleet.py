@@ -50,14 +50,14 @@ def vehicle_id(edge: int, number: int) -> str:
 
 
 def spare_id(edge: int) -> str:
-    """Return the id of a vehicle at an edge that is in the inventory and demands nothing yet."""
+    """Return the id of an edge's spare vehicle: it is in the inventory and demands nothing yet."""
     return f"newcomer{edge:05d}"
 
 
 def goal(
     edge: str, vehicle: str, *, ego: Sequence[str] = (), shutdown: bool = False
 ) -> dict[str, Any]:
-    """Return a vehicle's goal for perception; ``ego`` has its topics besides the cloud."""
+    """Return a vehicle's goal for the fusion of an edge; ``ego`` lists the vehicle's ego topics."""
     ego, points = ego or [f"/{vehicle}/ego_data"], f"/{vehicle}/points"
     app = goals.application(
         f"{edge}/fusion",
@@ -113,7 +113,7 @@ def lay_down(
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
     """Make a bare state repo in which ``vehicles`` hold one application; return its path.
 
-    The inventory has ``further`` vehicles that hold nothing yet.
+    The inventory has ``further`` more vehicles, which demand nothing yet.
     """
     _lay_down(path, 1, 1, vehicles, further)
     return path
@@ -153,7 +153,7 @@ def _lay_down(
     files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, ledger, state.engine))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # set up fast, measured with it on
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # off only while the repo is made
     tree = write_tree(repo, None, files)
     who = commit_message.generator_signature(now)
     text = "A fleet\n\nOperation: init\nRender-Version: 2\n"

@@ -1,10 +1,10 @@
-"""How the cost of a demand grows with the vehicles on its application and its own topics.
+"""Measure how a demand's cost grows with its application's vehicles and with its own topics.
 
 A vehicle joins and leaves an application that 10 to 1,000 other vehicles hold. A goal lists 10,
-1,000 or 8,000 topics. Each figure is the time from ``submit`` to the receipt in a running
-generator, by the clock and of the processor. The time of the generator's start is given too. The
-sizes take turns in one process, so that other work on the machine affects all of them alike. The
-benchmark prints two tables and writes ``build/growth.json``.
+1,000 or 8,000 topics. The benchmark measures wall-clock time and CPU time from ``submit`` to the
+receipt in a running generator, and the time of the generator's start. The sizes take turns in one
+process, so that other work on the machine affects all of them alike. The benchmark prints two
+tables and writes ``build/growth.json``.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ Ego = Callable[[int, int], list[str]]
 
 
 def _costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
-    """Carry a goal out; return its seconds by the clock and of the processor."""
+    """Carry out a goal; return its wall-clock seconds and its CPU seconds."""
     start, worked = time.perf_counter(), time.process_time()
     generator.submit(goal).future.result()
     return time.perf_counter() - start, time.process_time() - worked
 
 
 def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Row]:
-    """Return a row of figures for each size: the join and the leave of one more vehicle.
+    """Return figures for each size: the join and the leave of one more vehicle.
 
-    ``sizes`` has how many vehicles hold the application of each size. ``ego`` returns the ego
-    topics of a goal from the size and the number of the goal.
+    ``sizes`` gives, for each size, the number of vehicles that hold the application. ``ego``
+    returns the ego topics of a goal, given the size and the goal's number.
     """
     generators: dict[int, Generator] = {}
     rows: dict[int, Row] = {}
@@ -73,12 +73,12 @@ def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Ro
 
 
 def vehicles_rows(folder: Path, vehicles: Sequence[int]) -> list[Row]:
-    """Return rows of figures: one more vehicle on an application that so many vehicles hold."""
+    """Return figures for one more vehicle on an application, for each number of its vehicles."""
     return _rows(folder, {size: size for size in vehicles}, ROUNDS, lambda size, number: [])
 
 
 def topics_rows(folder: Path, topics: Sequence[int]) -> list[Row]:
-    """Return rows of figures: a goal with so many topics, and its shutdown."""
+    """Return figures for a goal and its shutdown, for each number of the goal's topics."""
 
     def ego(size: int, number: int) -> list[str]:
         return [f"/t{number}/n{index}" for index in range(size)]
@@ -87,7 +87,6 @@ def topics_rows(folder: Path, topics: Sequence[int]) -> list[Row]:
 
 
 def main() -> int:
-    """Measure both and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--vehicles", type=int, nargs="+", default=VEHICLES)
     parser.add_argument("--topics", type=int, nargs="+", default=TOPICS)

@@ -1,9 +1,9 @@
-"""What the page costs with a large fleet: on the server, and in the browser's main thread.
+"""Measure the page of a large fleet: the server's time, and that of the browser's main thread.
 
 A headless Chromium opens the page of a fleet with about 10,000 releases on 3,900 nodes. For each
-view, the benchmark measures how long the server works on it, its size, and the longest time that
-the browser's main thread was busy while the view came up. Then a demand is booked, and the update
-of the open view is measured. The benchmark prints a table and writes ``build/page.json``.
+view, the benchmark measures the server's time, the size of the answer, and the longest time that
+the browser's main thread was busy while the view came up. Then the benchmark books a demand and
+measures how the open view is updated. It prints a table and writes ``build/page.json``.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _on_server(url: str) -> tuple[float, int]:
 def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -> Row:
     """Return the figures of a view.
 
-    Those of the browser are the best of several rounds, so that other work on the machine counts
+    The browser's figures are the best of several rounds, so that other work on the machine counts
     less.
     """
     server_s, size = _on_server(server.url + view)
@@ -87,7 +87,7 @@ def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -
 
 
 def measure(releases: int) -> dict[str, Row]:
-    """Return the figures of each view."""
+    """Return the figures of each view by its name."""
     rows: dict[str, Row] = {}
     with TemporaryDirectory() as folder, chromium() as browser:
         os.environ["DEMANDOPS_DATA_HOME"] = f"{folder}/home"
@@ -104,7 +104,6 @@ def measure(releases: int) -> dict[str, Row]:
 
 
 def main() -> None:
-    """Print the figures of all views, and the longest task beside the aim."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--releases", type=int, default=10_000)
     rows = measure(parser.parse_args().releases)

@@ -1,8 +1,9 @@
-"""How many demands per second `demandops request` books: 300 vehicles at 30 intersections.
+"""Measure how many demands per second `demandops request` books.
 
-One command reads all joins from a file, and each join becomes a commit. A command that books a
-single demand shows what the start costs. The two commands take turns, each on a fresh repo. The
-benchmark prints a table and writes ``build/request.json``.
+300 vehicles join at 30 intersections. One command reads all joins from a file, and each join
+becomes a commit. A second command books a single demand, which shows what the start costs. The two
+commands take turns, each on a fresh repo. The benchmark prints a table and writes
+``build/request.json``.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ ROUNDS = 5
 
 
 def _seconds(folder: Path, demands: int) -> tuple[float, float]:
-    """Book demands in a fresh repo by one command; return its seconds and its CPU seconds."""
+    """Book demands in a fresh repo by one command; return the command's seconds and CPU seconds."""
     laid = fleet.lay_down_idle(folder / "state-repo.git", INTERSECTIONS, VEHICLES)
     goals = [
         fleet.goal(fleet.edge_id(edge), fleet.vehicle_id(edge, vehicle))
@@ -56,7 +57,6 @@ def _seconds(folder: Path, demands: int) -> tuple[float, float]:
 
 
 def main() -> int:
-    """Measure both commands by turns and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
     parser.add_argument("--rounds", type=int, default=ROUNDS)
     parser.add_argument("--output", type=Path, default=Path("build/request.json"))

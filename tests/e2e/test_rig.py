@@ -45,7 +45,7 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 
 
 class Domain:
-    """An access domain of a small state repo, with namespace, account, source and Kustomization."""
+    """An access domain in a small state repo, with namespace, account, source and Kustomization."""
 
     def __init__(self, rig: Rig, folder: Path, say: Report) -> None:
         self.rig, self.kube, self.say = rig, rig.kube, say
@@ -169,7 +169,7 @@ def deployment(node_id: str, name: str = "sleeper", **annotations: str) -> str:
 
 
 def running_on(pods: list[dict[str, Any]]) -> set[str]:
-    """Return the names of the nodes with ready pods."""
+    """Return the names of the nodes on which ready pods run."""
     ready = [
         pod
         for pod in pods

@@ -40,7 +40,7 @@ esac
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Put a fake Go on PATH, with an empty cache; return the file that lists its builds."""
+    """Put a fake Go on PATH and use an empty cache; return the file that lists its builds."""
     program = tmp_path / "bin" / "go"
     program.parent.mkdir()
     program.write_text(FAKE_GO)
@@ -58,7 +58,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def quiet(_: str) -> None:
-    """Ignore a line of progress."""
+    """Take the place of a report, and print nothing."""
 
 
 def test_a_program_is_built_once_with_its_crds(runs: Path) -> None:
@@ -222,7 +222,9 @@ def test_a_large_push_and_a_partial_clone(git_port: int, tmp_path: Path) -> None
     other.git("fetch", "--quiet", "--depth=1", "--filter=blob:none", "origin", "main")
     assert other.git("rev-parse", "FETCH_HEAD").strip() == commit
     objects = other.git("rev-list", "--objects", "--missing=print", "FETCH_HEAD").split()
-    assert len([name for name in objects if name.startswith("?")]) == 2, "both were left out"
+    assert len([name for name in objects if name.startswith("?")]) == 2, (
+        "the fetch must leave out both blobs"
+    )
     other.git("checkout", "--quiet", "FETCH_HEAD")
     assert (other.folder / "big").read_text() == noise
 

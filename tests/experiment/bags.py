@@ -16,8 +16,8 @@ def bag_tracks(bag: Path, near: Near) -> tuple[Track, ...]:
     """Return the track of each vehicle in a bag.
 
     Raises:
-        InvalidInput: if the bag cannot be read, or has none of the rules' topics.
-        SystemExit: if it has a vehicle that the experiment lacks, or a vehicle that begins near
+        InvalidInput: if the bag cannot be read, or has no topic of the rules.
+        SystemExit: if the bag has a vehicle that the experiment lacks, or one that begins near
             the station.
     """
     reader = RecordedBag(bag, rule_file.read(RULES.read_text(), RULES.name))

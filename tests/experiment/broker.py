@@ -54,7 +54,6 @@ class Broker:
         self.messages[message.topic] += 1
 
     def close(self) -> None:
-        """End the client and mosquitto."""
         self._counter.disconnect()
         self._counter.loop_stop()
         self._process.terminate()

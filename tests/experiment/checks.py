@@ -1,4 +1,4 @@
-"""The checks that a run must pass. Pure functions."""
+"""The checks that a run must pass, as pure functions."""
 
 from __future__ import annotations
 
@@ -20,19 +20,17 @@ _SLACK_S = 3.0
 
 @dataclass(frozen=True)
 class Check:
-    """A check of a run: `name` says what must hold, `fault` what is wrong, or nothing."""
+    """A check of a run: `name` says what must hold, `fault` what is wrong, if anything."""
 
     name: str
     fault: str = ""
 
     @property
     def holds(self) -> bool:
-        """Whether the check passes."""
         return not self.fault
 
 
 def checks(outcome: Outcome) -> list[Check]:
-    """Return all checks of a run."""
     return [
         Check("the detector formed the demands that a plain script over the poses gives",
               differ([str(one) for one in outcome.events], [str(one) for one in outcome.formed])),
@@ -54,7 +52,7 @@ def checks(outcome: Outcome) -> list[Check]:
 
 
 def differ(expected: object, found: object) -> str:
-    """Return a text with both values if they differ, otherwise an empty text."""
+    """Return a text with both values if they differ, else an empty text."""
     return "" if expected == found else f"expected {expected}, found {found}"
 
 
@@ -75,10 +73,10 @@ def _as_in_the_paper(outcome: Outcome) -> Iterator[Check]:
 
 
 def _inputs(outcome: Outcome) -> Iterator[str]:
-    """Yield what is wrong with the topics that the fusion read, and with the number of its starts.
+    """Yield each fault in the topics that the fusion read, and in the number of its starts.
 
-    The right sets of topics must come in the order of the demands. Between two of them, the fusion
-    may read other sets for a moment.
+    The fusion must read the right sets of topics in the order of the demands. Between two of them,
+    it may read other sets for a short time.
     """
     seen = [topics for at, topics in outcome.inputs if at >= outcome.set_off]
     inside: set[str] = set()

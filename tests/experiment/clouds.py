@@ -16,7 +16,7 @@ _SPREAD_M = 0.4
 
 
 def points_of(objects: Iterable[tuple[float, float]], chance: random.Random) -> list[Point]:
-    """Return random points around the centre (x, y) of each object, which is as large as a car."""
+    """Return random points around the centre (x, y) of each object, which has a car's size."""
     return [
         (chance.gauss(x, _SPREAD_M), chance.gauss(y, _SPREAD_M), chance.uniform(0.2, 1.6))
         for x, y in objects
@@ -25,7 +25,7 @@ def points_of(objects: Iterable[tuple[float, float]], chance: random.Random) -> 
 
 
 def to_message(points: list[Point]) -> PointCloud2:
-    """Return the message of a cloud in the frame `map`, without a stamp."""
+    """Return a cloud as a message in the frame `map`, without a stamp."""
     message = PointCloud2()
     message.header.frame_id = "map"
     message.height, message.width = 1, len(points)
@@ -40,5 +40,4 @@ def to_message(points: list[Point]) -> PointCloud2:
 
 
 def from_message(message: PointCloud2) -> Iterator[Point]:
-    """Yield the points in the message of a cloud."""
     yield from _POINT.iter_unpack(bytes(message.data))

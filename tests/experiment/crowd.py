@@ -1,6 +1,6 @@
-"""The inventory, rules and checks of the larger experiment. Pure functions.
+"""The inventory, rules and checks of the larger experiment, as pure functions.
 
-There are many vehicles, and three intersections with an edge and a station each.
+The larger experiment has many vehicles, and three intersections with an edge and a station each.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NODES = (*EDGES, *STATIONS, "cloud")
 
 
 def crossings(near: Near) -> tuple[Near, ...]:
-    """Return the condition of being near for each intersection; the first is the paper's."""
+    """Return a nearness condition for each intersection; the first is that of the paper."""
     (x, y) = near.point
     return tuple(replace(near, point=(x + dx, y + dy)) for dx, dy in MIDDLES)
 
@@ -51,9 +51,9 @@ def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
 
 
 def rules(near: Near) -> str:
-    """Return the text of a rule file with a rule for each intersection.
+    """Return a rule file with a rule for each intersection.
 
-    Each is a copy of the example's last rule, which is for vehicles without a lidar.
+    Each rule is a copy of the example's last rule, which is for vehicles without a lidar.
     """
     found: dict[str, Any] = yaml.safe_load(RULES.read_text())
     text = yaml.safe_dump(found["rules"][-1])
@@ -83,9 +83,9 @@ def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> 
 
 
 def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
-    """Return the requesters of each service and connection while these vehicles are near.
+    """Return the requesters of each service and connection while the given vehicles are near.
 
-    `inside` has the number of each vehicle's intersection.
+    `inside` gives the number of each such vehicle's intersection.
     """
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
@@ -103,7 +103,7 @@ def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
 
 
 def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
-    """Return the checks of a run without containers, so without data."""
+    """Return the checks of a run in which no container runs and no data flows."""
     return [
         Check("the detector formed the demands that a plain script over the poses gives",
               differ(_by_vehicle(outcome.events), _by_vehicle(outcome.formed))),
@@ -116,9 +116,9 @@ def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
 
 
 def _by_vehicle(found: Iterable[Event] | Iterable[Formed]) -> dict[str, list[bool]]:
-    """Return the joins (true) and leaves (false) of each vehicle, in their order.
+    """Return each vehicle's joins (true) and leaves (false), in their order.
 
-    The order among different vehicles does not count.
+    The order of events of different vehicles does not count.
     """
     by_vehicle: defaultdict[str, list[bool]] = defaultdict(list)
     for one in found:

@@ -35,7 +35,7 @@ from .standins.image import image
 ROOT = Path(__file__).resolve().parents[2]
 _PATIENCE_S = 120.0
 _STAND_S = 0.5
-"""How many seconds before the cause of the next event the vehicles stop, if they must wait."""
+"""If the vehicles must wait, they stop so many seconds before the cause of the next event."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
 
 
@@ -51,7 +51,7 @@ class Experiment:
         self._stack = ExitStack()
 
     def run(self) -> Outcome:
-        """Run the experiment and return all that was observed."""
+        """Run the experiment and return all observations."""
         with self._stack:
             self._start_cluster()
             self._start_fleet()
@@ -125,7 +125,7 @@ class Experiment:
         self._detect(rules)
 
     def _detect(self, rules: Path) -> None:
-        """Start the detector in the cloud, and wait until it detects."""
+        """Start the detector in the cloud, and wait until it is ready."""
         options = ["detect", str(rules)]
         self._detector = self._start("detector", "demandops.cli.main", *options, domain="cloud")
         self._wait("the detector's start", lambda: "detecting; rules: " in self._log("detector"))
@@ -192,15 +192,14 @@ class Experiment:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
 
     def _released(self, since: str, expected: int) -> bool:
-        """Return whether all demands are committed, and only the initial deployment is left."""
+        """Return whether all demands are committed, and only the initial deployment is booked."""
         return len(self._commits(since)) >= expected and not self._books(self._world.tip())
 
     def _is_settled(self, number: int, since: str) -> bool:
         """Return whether the first `number` events have had their consequences.
 
-        Their demands are committed, and the fusion reads the right topics. If the last event is a
-        join, the vehicle's data is fused; if it is a leave, the clients of the vehicle's connection
-        have ended.
+        Their demands are committed, and the fusion reads the right topics. After a join, the
+        vehicle's data is fused. After a leave, the clients of the vehicle's connection have ended.
         """
         events = self._events()[:number]
         inside: set[str] = set()
@@ -236,7 +235,7 @@ class Experiment:
         return self._world.domain.lines()
 
     def _wait_until_as_before(self, seconds: float) -> None:
-        """Wait until the clusters have what they had before the first demand."""
+        """Wait until the clusters have exactly the objects of the time before the first demand."""
         if not self._reaches(lambda: self._lines() == self._before, seconds):
             lines = self._lines()
             stays, lacks = sorted(lines - self._before), sorted(self._before - lines)
@@ -245,7 +244,7 @@ class Experiment:
     def _books(self, commit: str) -> dict[str, list[str]]:
         """Return the requesters of each service and connection after a commit.
 
-        The initial deployment is left out.
+        The result leaves out the initial deployment.
         """
         repository = str(self._rig.repository(self._world.name))
         options = ("--state-repo", repository, "--at", commit, "--output", "json")
@@ -254,7 +253,7 @@ class Experiment:
         return {row: who for row, who in rows.items() if not row.endswith(" to cloud")}
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield a demand for each vehicle that a commit adds as a requester or removes."""
+        """Yield a demand for each vehicle that a commit adds to or removes from the requesters."""
         stages, inside = self._cloud.commits(), set()
         for commit in self._commits(since):
             books = self._books(commit)
@@ -288,7 +287,7 @@ class Experiment:
         return process
 
     def _drive_until(self, moment: float) -> None:
-        """Let the vehicles drive until a moment, in seconds of driving."""
+        """Let the vehicles drive until a time, in seconds of driving."""
         self._participants.stdin.write(f"{moment}\n")
         self._participants.stdin.flush()
 
@@ -334,7 +333,7 @@ _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 
 
 def _stand(happens: list[float], number: int) -> float:
-    """Return until when the vehicles may drive after `number` causes of events have happened.
+    """Return the time at which the vehicles must stop after `number` causes of events.
 
     This is shortly before the next cause, or infinity after the last one.
     """

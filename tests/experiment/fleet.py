@@ -63,10 +63,10 @@ def files(
 
 
 def rules(carrier: Carrier) -> str:
-    """Return the text of the example's rules, with connections of the carrier's type.
+    """Return the text of the example's rules, changed for a type of connection.
 
     Zenoh renames no topics and needs no broker. So the rules for Zenoh name no broker, and each
-    source topic is the target topic.
+    source topic has the name of its target topic.
     """
     text = RULES.read_text()
     if carrier == "mqtt":
@@ -85,11 +85,11 @@ def station_cloud(carrier: Carrier) -> str:
 
 
 CLIENTS: dict[Carrier, int] = {"mqtt": 2, "zenoh": 1}
-"""How many communication clients serve only one vehicle's connection to the edge."""
+"""How many communication clients serve one vehicle's connection to the edge and nothing else."""
 
 
 def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
-    """Return whether a service is a client that only the vehicle's connection to the edge has."""
+    """Return whether a service is a client of only this vehicle's connection to the edge."""
     if carrier == "zenoh":
         return service == f"zenoh-{vehicle}"
     return service.startswith(f"mqtt-{vehicle}-edge")
@@ -119,7 +119,7 @@ def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
 def requesters(inside: Collection[str]) -> dict[str, list[str]]:
     """Return the requesters of each service and connection while these vehicles are near.
 
-    This is the paper's table for any set of vehicles.
+    The result extends the paper's table to any set of vehicles.
     """
     if not inside:
         return {}

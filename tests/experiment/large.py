@@ -32,7 +32,10 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""After about how many commits the whole bookkeeping is compared."""
+"""The number of commits, about, at which the run records the whole bookkeeping.
+
+These commits are spread evenly over the run, and the last commit is one of them.
+"""
 
 
 class PodWatch(ProcessRunner):
@@ -159,7 +162,7 @@ class LargeExperiment(Experiment):
         )
 
     def _exists(self, path: str) -> bool:
-        self._world.tip()  # pulls
+        self._world.tip()  # pulls the clone
         return (self._world.person.folder / path).exists()
 
     def _lines(self) -> frozenset[str]:
@@ -167,7 +170,7 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demands, as the commits' trailers name them; only some get their `books`."""
+        """Yield the demands that the commits' trailers name; only some get `books`."""
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
         for commit in commits:

@@ -1,4 +1,4 @@
-"""Measures of a run: the times of each event, and what running on demand saves. Pure functions."""
+"""Pure functions over a run: the times of each event, and what running on demand saves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STAGES = ("demand", "commit", "pods", "fused")
 
 @dataclass(frozen=True)
 class Step:
-    """An event, and the times of its consequences; None if a consequence did not come.
+    """An event, and the times of its consequences; None for a consequence that did not come.
 
     If the vehicle joins: `demand` is when its demand was accepted, `commit` is when the commit was
     published, `pods` is when the last pod of its connection got its node, `first` is when the first
@@ -39,7 +39,7 @@ class Step:
 
 
 def steps(outcome: Outcome) -> list[Step]:
-    """Return the events with their consequences, except events for which no demand was formed."""
+    """Return the events with their consequences, except events that formed no demand."""
     formed: defaultdict[str, list[Formed]] = defaultdict(list)
     for one in outcome.formed:
         formed[str(one)].append(one)
@@ -63,7 +63,7 @@ def _step(outcome: Outcome, event: Event, formed: Formed) -> Step:
 
 
 def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
-    """Return the pods of the vehicle's connection in the stay that the event begins or ends."""
+    """Return the pods of the vehicle's connection in the visit that the event begins or ends."""
     carrier = outcome.settings.connections
     pods = [pod for pod in outcome.pods if fleet.is_client(pod.service, event.vehicle, carrier)]
     if event.joins:
@@ -84,7 +84,7 @@ def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | 
 
 @dataclass(frozen=True)
 class Saving:
-    """A quantity if services run on demand, and if they always run; means over the drive."""
+    """The mean of a quantity during the drive, with services on demand and always on."""
 
     name: str
     unit: str
@@ -100,8 +100,8 @@ class Saving:
 def savings(outcome: Outcome) -> list[Saving]:
     """Return what the drive took on demand, and what it would take if services were always on.
 
-    Always on means: each service that ran at all runs from the first to the last moment, and each
-    topic that was carried to the edge is carried completely, as it was published.
+    "Always on" means: each service that ran at all runs during the whole drive, and each topic that
+    was carried to the edge is carried with all its messages.
     """
     seconds = outcome.over - outcome.set_off
     services: dict[str, RunningPod] = {pod.service: pod for pod in outcome.pods}
@@ -133,7 +133,7 @@ def savings(outcome: Outcome) -> list[Saving]:
 
 
 def _payload(outcome: Outcome) -> dict[str, int]:
-    """Return the bytes that were carried to the edge, by the ROS topic at their source."""
+    """Return the bytes that were carried to the edge, by the ROS topic at the source."""
     found: defaultdict[str, int] = defaultdict(int)
     for topic, size in outcome.carried.items():
         if not topic.startswith(("mqtt_client/", "$SYS/")):
@@ -143,7 +143,7 @@ def _payload(outcome: Outcome) -> dict[str, int]:
 
 
 def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
-    """Yield the time and the number of running pods, at each change of the number."""
+    """Yield the time and the new number of running pods whenever the number changes."""
     changes = [(pod.bound, 1) for pod in outcome.pods]
     changes += [(pod.ended, -1) for pod in outcome.pods if pod.ended is not None]
     count = 0
@@ -154,7 +154,7 @@ def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
 
 @lru_cache
 def quantiles(values: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return the least, the median and the greatest."""
+    """Return the minimum, the median and the maximum."""
     ordered = sorted(values)
     middle = len(ordered) // 2
     median = ordered[middle] if len(ordered) % 2 else sum(ordered[middle - 1 : middle + 1]) / 2

@@ -30,7 +30,7 @@ _LOOK_S = 0.1
 
 
 class Observer:
-    """A node in the ROS domain of one of the fleet's nodes, spinning in a thread."""
+    """A node that spins in a thread, in the ROS domain of one of the fleet's nodes."""
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
@@ -44,18 +44,16 @@ class Observer:
         self.node.create_subscription(kind, topic, lambda _: arrived.append(time.time()), 10)
 
     def start(self) -> None:
-        """Start to spin."""
         self._thread = ExecutorThread(self.node)
 
     def close(self) -> None:
-        """Leave the ROS graph."""
         self._thread.close()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
 
 class EdgeObserver(Observer):
-    """Records what arrives on the edge, which topics the fusion reads, and what it publishes."""
+    """Records the messages at the edge, the topics that the fusion reads, and the fused objects."""
 
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
@@ -89,7 +87,7 @@ class EdgeObserver(Observer):
         self.tracks.append((time.time(), places))
 
     def _look(self) -> None:
-        """Record the topics that the fusion subscribes to, if they have changed."""
+        """Record the topics to which the fusion subscribes, if they have changed."""
         found: list[Any] = []
         if FUSION_NODE in self.node.get_node_names():
             with suppress(Exception):  # the fusion may leave meanwhile

@@ -1,4 +1,4 @@
-"""The settings of a run, and all that was observed in it."""
+"""The settings of a run, and all observations of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Settings:
-    """What to play: routes made from a seed, or the tracks of a bag."""
+    """What a run plays: routes made from a seed, or the tracks of a bag."""
 
     gitops: Gitops = "flux"
     connections: Carrier = "mqtt"
@@ -41,7 +41,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Formed:
-    """A demand of the detector: its commit, its stages' times, and the bookkeeping after it."""
+    """A demand of the detector: its commit, when it reached each stage, and the books after it."""
 
     commit: str
     vehicle: str
@@ -55,7 +55,7 @@ class Formed:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that was observed in a run. Times are seconds since 1970."""
+    """All observations of a run; times are seconds since 1970."""
 
     settings: Settings
     routes: tuple[Way, ...]
@@ -78,4 +78,4 @@ class Outcome:
     left: frozenset[str]
     before: frozenset[str]
     crossings: tuple[Near, ...] = ()
-    """All intersections of the larger experiment; empty in the paper's."""
+    """All intersections of the larger experiment; empty in the paper's experiment."""

@@ -1,12 +1,12 @@
 """The vehicles and the station as one ROS program; each is in the ROS domain of its node.
 
-    python -m tests.experiment.participants PLAN
+Call: `python -m tests.experiment.participants PLAN`.
 
 PLAN is a JSON file with the fields of `Plan`. The program publishes from its start, with all
-vehicles at rest. Each line on standard input is a moment, in seconds of driving. The vehicles drive
-until that moment, then stand until the next line; they publish all the time. The first line makes
-them set off. At its end, the program prints a line of JSON: the messages and bytes that each topic
-had since the vehicles set off, and for how many seconds they stood.
+vehicles at rest. Each line on standard input is a time, in seconds of driving. The vehicles drive
+until that time, then stand until the next line; they publish all the time. With the first line they
+set off. At its end, the program prints a line of JSON: the messages and bytes of each topic since
+the vehicles set off, and for how many seconds the vehicles stood.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ WITH_LIDAR = (VEHICLES[0],)
 
 @dataclass(frozen=True)
 class Plan:
-    """What to play.
+    """What the program plays.
 
     `routes` has each vehicle's way, `origin` the position of the intersection on the map, and
     `domains` the ROS domain of each node. The program writes all poses that it sends to the file
@@ -66,7 +66,7 @@ class Plan:
     poses_only: bool = False
 
     def write(self, file: Path) -> None:
-        """Write the plan to a file for the program."""
+        """Write the plan to a file that the program can read."""
         routes = [vars(route) for route in self.routes]
         file.write_text(json.dumps(vars(self) | {"routes": routes}))
 
@@ -94,7 +94,6 @@ class Participant:
         self.messages: Counter[str] = Counter()
 
     def send(self, topic: str, message: Any, now: float) -> None:
-        """Publish a message with the stamp `now`, and count it."""
         message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(type(message), topic, 10)
@@ -104,7 +103,6 @@ class Participant:
         self.messages[topic] += 1
 
     def close(self) -> None:
-        """Leave the ROS graph."""
         self.node.destroy_node()
         rclpy.try_shutdown(context=self._context)
 
@@ -119,14 +117,14 @@ class Participants:
             self._by_name = dict.fromkeys(names, Participant("crowd", plan.domains["cloud"]))
         else:
             self._by_name = {name: Participant(name, plan.domains[name]) for name in names}
-        self._sent = Path(plan.record).open("w", buffering=1)  # noqa: SIM115 - as long as this
+        self._sent = Path(plan.record).open("w", buffering=1)  # noqa: SIM115 - open as long as this object
         self.set_off: float | None = None
         self.until, self.held = 0.0, 0.0
         self._elapsed, self._last = -1.0, 0.0
         self._ticks = 0
 
     def tick(self) -> None:
-        """Publish what each participant sends at this moment."""
+        """Publish what each participant sends now."""
         now, elapsed = time.time(), self._pass_time()
         self._ticks += 1
         if self._plan.poses_only and self._ticks % TICKS_PER_POSE_OF_MANY:
@@ -143,7 +141,7 @@ class Participants:
             self._send_clouds(where, elapsed, now)
 
     def _pass_time(self) -> float:
-        """Return for how many seconds the vehicles have driven by now; -1 before they set off."""
+        """Add the driving time since the last call; return the sum in seconds, or -1 at first."""
         passed, self._last = time.monotonic() - self._last, time.monotonic()
         if self.set_off is not None:
             driven = min(passed, max(0.0, self.until - self._elapsed))

@@ -1,11 +1,11 @@
 """Runs the containers of a namespace's pods as processes of this machine, as a kubelet would.
 
-It watches the API server: it starts a pod that got a node, and ends a pod that is deleted. Each
-container runs its own command with its own arguments and environment. A container that ends is
-started again after a pause, which becomes longer each time. ConfigMaps become files, which change
-with the ConfigMap. The processes share this machine's file system, so a path below a mount becomes
-a path below the volume's folder. A container that mounts the token of the pod's account gets a
-kubeconfig for this account, in KUBECONFIG.
+The runner watches the API server: it starts a pod that got a node, and ends a pod that is deleted.
+Each container runs its own command with its own arguments and environment. The runner starts a
+container that ended again after a pause, which becomes longer each time. ConfigMaps become files,
+which change with the ConfigMap. The processes share this machine's file system, so a path below a
+mount becomes a path below the volume's folder. A container that mounts the token of the pod's
+account gets a kubeconfig for this account, in KUBECONFIG.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .running_pod import Container, RunningPod, path_in_pod, program_of
 
 _TICK_S = 0.1
 _NOT_YET = (LookupError, ApiException, HTTPError, OSError)
-"""Errors if an object does not exist yet, or if the API server cannot be reached."""
+"""Errors when an object does not exist yet, or when the API server cannot be reached."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105 - a folder
 
@@ -74,7 +74,6 @@ class ProcessRunner:
             thread.start()
 
     def close(self) -> None:
-        """End the processes of all containers."""
         self._closed.set()
         self._runner.join(30)
 
@@ -152,9 +151,9 @@ class ProcessRunner:
             )
 
     def _entry_point(self, image: str) -> list[str]:
-        """Return the stand-in for an image's own program, or nothing if there is none.
+        """Return the stand-in for the image's entry point, or nothing if there is none.
 
-        Without one, the container's arguments are its whole command.
+        Without a stand-in, the container's arguments are its whole command.
         """
         program = program_of(image)
         return [program] if (self._image / program).exists() else []

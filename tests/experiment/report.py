@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page that contains its plots. Pure functions."""
+"""The report of a run: one HTML page that contains its plots; pure functions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .routes import FAR_M
 _COLORS = ("#0b6e99", "#c2571a", "#4b8b3b", "#8a4fa3")
 _WIDTH, _LEFT = 900, 150
 _MOST_ROWS = 8
-"""The most vehicles that are drawn one by one; more are drawn as a crowd."""
+"""Up to this number, the plots draw each vehicle by itself; more are drawn as a crowd."""
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; }
 table { border-collapse: collapse; margin: 1em 0; } th, td { padding: .2em .9em .2em 0;
@@ -41,7 +41,6 @@ def plots(outcome: Outcome) -> dict[str, str]:
 
 
 def page(outcome: Outcome, checks: Iterable[Check]) -> str:
-    """Return the report as an HTML text."""
     settings, images = outcome.settings, plots(outcome)
     poses = f"the poses of {settings.bag}" if settings.bag else f"seed {settings.seed}"
     title = f"The experiment with {settings.gitops} and {settings.connections}, {poses}"

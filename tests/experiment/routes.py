@@ -1,7 +1,7 @@
 """The vehicles' routes through the intersection: made from a seed, or recorded.
 
-Pure functions. The intersection, where the station is, is the origin of the map. Distances are in
-metres, times in seconds since the vehicles set off.
+All functions are pure. The intersection, where the station is, is the origin of the map. Distances
+are in metres, times in seconds since the vehicles set off.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ LEAD_S = 2.0
 MIDDLES = ((0.0, 0.0), (1000.0, 0.0), (0.0, 1000.0))
 SPACING_S = 1.2
 _SILENCE_S = 0.6
-"""A vehicle is silent when its recording has no pose within this time."""
+"""A vehicle is silent at a time if its recording has no pose within so many seconds of it."""
 
 _PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
-"""The paper's order of events: `0` means that vehicle 0 joins, `-0` that it leaves."""
+"""The order of events in the paper: `0` means that vehicle 0 joins, `-0` that it leaves."""
 _SHORTEST_STAY = 3  # slots
 _JITTER = 0.2  # of a slot
 _ARMS = tuple(math.radians(degrees) for degrees in (0, 90, 180, 270))
 
 
 class Way(Protocol):
-    """Where a vehicle is at a time: a route, or a recorded track."""
+    """Where a vehicle is at each time: a route, or a recorded track."""
 
     @property
     def vehicle(self) -> str:
@@ -48,13 +48,13 @@ class Way(Protocol):
 
     @property
     def label(self) -> str:
-        """The report's text about this way."""
+        """The text about this way in the report."""
 
     def position(self, time: float) -> tuple[float, float]:
-        """Return where the vehicle is."""
+        """Return the vehicle's position at a time."""
 
     def sends(self, time: float) -> bool:
-        """Return whether the vehicle sends anything."""
+        """Return whether the vehicle sends anything at a time."""
 
 
 @dataclass(frozen=True)
@@ -81,17 +81,16 @@ class Route:
 
     @property
     def ends(self) -> float:
-        """When the vehicle leaves or vanishes."""
+        """The time at which the vehicle leaves or vanishes."""
         return min(self.leaves, self.vanishes)
 
     @property
     def label(self) -> str:
-        """The vehicle's speed, and whether it falls silent."""
+        """The vehicle's speed, and a note if it falls silent."""
         silent = ", falls silent" if math.isfinite(self.vanishes) else ""
         return f"{self.speed * 3.6:.0f} km/h{silent}"
 
     def position(self, time: float) -> tuple[float, float]:
-        """Return where the vehicle is."""
         along = (time - self.enters) * self.speed - RADIUS_M  # negative before the middle
         along = min(max(along, -FAR_M), FAR_M)
         arm = self.arm_in if along < 0 else self.arm_out
@@ -99,11 +98,10 @@ class Route:
         return x + abs(along) * math.cos(arm), y + abs(along) * math.sin(arm)
 
     def distance(self, time: float) -> float:
-        """Return how far the vehicle is from the intersection."""
+        """Return the vehicle's distance from the intersection."""
         return math.dist(self.position(time), self.middle)
 
     def sends(self, time: float) -> bool:
-        """Return whether the vehicle sends anything."""
         return time < self.vanishes
 
 
@@ -111,7 +109,8 @@ class Route:
 class Track:
     """A recorded way: points of time, x and y, with straight lines between them.
 
-    The vehicle waits at the first point until its time. It is silent in the gaps of the recording.
+    Until the time of the first point, the vehicle waits there. It is silent in the gaps of the
+    recording.
     """
 
     vehicle: str
@@ -120,17 +119,15 @@ class Track:
 
     @property
     def ends(self) -> float:
-        """When the recording ends."""
+        """The time at which the recording ends."""
         return self.points[-1][0]
 
     def position(self, time: float) -> tuple[float, float]:
-        """Return where the vehicle is."""
         (begin, x0, y0), (end, x1, y1) = self._around(time)
         part = min(max((time - begin) / (end - begin), 0.0), 1.0) if end > begin else 0.0
         return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
 
     def sends(self, time: float) -> bool:
-        """Return whether the vehicle sends anything."""
         before, after = self._around(time)
         nearest = min(abs(before[0] - time), abs(after[0] - time))
         return time < self.points[0][0] or nearest <= _SILENCE_S
@@ -183,7 +180,7 @@ def one(seed: int, gap: float) -> tuple[Route, ...]:
 def many(seed: int, count: int) -> tuple[Route, ...]:
     """Return the routes of many vehicles, each through one of the intersections in ``MIDDLES``.
 
-    One enters every ``SPACING_S`` seconds or so, at 20 to 50 km/h.
+    About every ``SPACING_S`` seconds one vehicle enters, at 20 to 50 km/h.
     """
     chance = random.Random(seed)
     found = []
@@ -199,8 +196,8 @@ def many(seed: int, count: int) -> tuple[Route, ...]:
 def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
     """Return the routes, changed so that ``vehicle`` falls silent while it is near.
 
-    It falls silent in the middle of the longest time without other events. Close to another event,
-    all vehicles may stand, and a vehicle that stands does not fall silent.
+    The vehicle falls silent in the middle of the longest time without other events. Close to
+    another event, all vehicles may stand, and a vehicle that stands does not fall silent.
     """
     (lost,) = (route for route in routes if route.vehicle == vehicle)
     moments = sorted(

@@ -1,6 +1,6 @@
-"""What the rules of `examples/experiment/` demand for given poses, by a plain script.
+"""A plain script that tells what the rules of `examples/experiment/` demand for given poses.
 
-The script shares no code with the event detector, so that the two can be compared.
+The script shares no code with the event detector, so that a test can compare the two.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ RULES = Path(__file__).resolve().parents[2] / "examples" / "experiment" / "rules
 
 @dataclass(frozen=True)
 class Near:
-    """When a vehicle is near `point`.
+    """The condition under which a vehicle is near `point`.
 
-    It becomes near at a distance of `start` metres. It stays near until it is more than `stop`
-    metres away, or silent for `timeout` seconds.
+    A vehicle becomes near at a distance of `start` metres. It stays near until it is more than
+    `stop` metres away, or silent for `timeout` seconds.
     """
 
     point: tuple[float, float]
@@ -45,7 +45,7 @@ class Near:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a vehicle reported to be, and when."""
+    """A position that a vehicle reported, and the time of the report."""
 
     at: float
     vehicle: str
@@ -55,7 +55,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Event:
-    """A vehicle joins or leaves."""
+    """An event: a vehicle joins or leaves."""
 
     at: float
     vehicle: str
@@ -86,8 +86,8 @@ def predicted(ways: Iterable[Way], near: Near, until: float) -> list[Pose]:
 def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
     """Return the times of the poses that cause events, in order.
 
-    An event is caused by the pose at its time. If a vehicle leaves because it is silent, the cause
-    is its last pose.
+    The pose at the time of an event causes it. If a vehicle leaves because it is silent, its last
+    pose is the cause.
     """
     poses = list(poses)
     sent = {(pose.at, pose.vehicle) for pose in poses}
@@ -99,7 +99,7 @@ def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
 
 
 def events_of(poses: Iterable[Pose], near: Near, until: float) -> list[Event]:
-    """Return the events before `until`, in the order of time."""
+    """Return the events before `until`, sorted by time."""
     return sorted(_events(list(poses), near, until), key=lambda event: event.at)
 
 

@@ -24,7 +24,7 @@ class Container:
 
 @dataclass
 class RunningPod:
-    """A pod that got a node at `bound`, with its containers; `ended` is when it ended."""
+    """A pod with its containers: `bound` is when it got a node, `ended` when it ended."""
 
     manifest: dict[str, Any]
     folder: Path
@@ -34,7 +34,6 @@ class RunningPod:
 
     @property
     def name(self) -> str:
-        """The pod's name."""
         return str(self.manifest["metadata"]["name"])
 
     @property
@@ -60,7 +59,7 @@ def program_of(image: str) -> str:
 
 
 def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
-    """Return the text in which each path below a mount is replaced by a path of this machine."""
+    """Replace each path below a mount in a text by a path of this machine."""
     if not mounts:
         return text
     longest_first = sorted(mounts, key=len, reverse=True)

@@ -43,7 +43,7 @@ def pod(service: str, bound: float, ended: float) -> RunningPod:
 
 
 def good() -> Outcome:
-    """Return a run of one vehicle in which everything is right."""
+    """Return a run of one vehicle that passes all checks."""
     near, all_routes = Near.read(), routes.one(0, 10.0)
     poses = drive(all_routes, OVER)
     joins, leaves = events = events_of(poses, near, OVER)

@@ -1,4 +1,4 @@
-"""The participants' program: its vehicles stop where they shall stop, and drive on from there."""
+"""The participants' program stops the vehicles where it must, and lets them drive on from there."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ def test_the_vehicles_stand_until_they_may_drive_on(tmp_path: Path, poses_only: 
             return [(p.x, p.y) for p in last] == [(100.0 + x, 200.0 + y)] * 3
 
         assert json.loads(process.stdout.readline()) == {"ready": True}
-        wait_until(lambda: record.read_text().count("\n") > 3, "they send while at rest")
+        wait_until(lambda: record.read_text().count("\n") > 3, "the vehicles send while at rest")
         drive_until(1.5)
         assert "set_off" in json.loads(process.stdout.readline())
-        wait_until(lambda: stands_at(1.5), "they stand")
+        wait_until(lambda: stands_at(1.5), "the vehicles stand")
         drive_until(2.0)
-        wait_until(lambda: stands_at(2.0), "they stand again")
+        wait_until(lambda: stands_at(2.0), "the vehicles stand again")
         process.send_signal(signal.SIGTERM)
         said = json.loads(process.stdout.readline())
         assert process.wait(30) == 0

@@ -66,7 +66,7 @@ def test_vehicles_drive_in_from_one_road_and_out_on_another() -> None:
 
 @pytest.mark.parametrize("vehicle", routes.VEHICLES)
 def test_a_vehicle_vanishes_while_nothing_else_happens(vehicle: str) -> None:
-    """No vehicle enters or leaves within a second of the moment."""
+    """No vehicle enters or leaves within a second of the time at which the vehicle vanishes."""
     for seed in range(30):
         silent = routes.vanishing(routes.four(seed, GAP_S), vehicle)
         (moment,) = (route.vanishes for route in silent if route.vehicle == vehicle)
@@ -83,8 +83,8 @@ def test_a_vehicle_that_falls_silent_leaves_after_the_time_out() -> None:
     assert math.isinf(routes.one(0, GAP_S)[0].vanishes)
 
 
-def test_a_vehicle_that_falls_silent_stands_before_it_does() -> None:
-    """The cause of its leave is its last pose, which is earlier by the rules' timeout."""
+def test_a_leave_by_timeout_is_dated_at_the_last_pose_of_the_vehicle() -> None:
+    """The last pose is the cause of the leave, which comes later by the rules' timeout."""
     silent = routes.vanishing(routes.one(0, GAP_S), "vehicle00")
     enters, vanishes = causes(drive(silent, 60), NEAR, 60)
     assert enters == pytest.approx(GAP_S, abs=0.11)

@@ -1,6 +1,6 @@
 """Inject faults into one demand and report what each did: ``make faults``.
 
-Writes ``build/faults.json`` and ends with exit code 1 if a promise was broken.
+The program writes ``build/faults.json`` and ends with exit code 1 if a promise was broken.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.faults.rig import Rig
 
 WORKERS = 2
 MEMORY = Path("/dev/shm")
-"""A file system in memory, where a sync takes no time; strace shows what is synced."""
+"""A file system in memory, where a sync takes no time; strace still shows each sync."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
 _RIGS: dict[tuple[bool, bool], Rig] = {}
 _FOLDER, _SHORT = Path(), True
@@ -36,7 +36,7 @@ _FOLDER, _SHORT = Path(), True
 
 @dataclass(frozen=True)
 class _Task:
-    """One part of the work; ``what`` has the arguments of the function that does it."""
+    """A part of the work; ``what`` has the arguments of the function that does it."""
 
     part: str
     remote: bool
@@ -67,7 +67,7 @@ def main() -> int:
 
 
 def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
-    """Yield all that there is to do, the longest tasks first."""
+    """Yield all tasks, the longest first."""
     mounts = disk.may_mount()
     if not mounts:
         print("a full disk is not tried: only root can mount a small one")

@@ -1,4 +1,4 @@
-"""A full disk, for the state repo and for the journal's folder, and damaged files."""
+"""Faults of a full disk, for the state repo and for the journal's folder, and of damaged files."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _ROOM = ("no room", os.strerror(28))
 
 
 def may_mount() -> bool:
-    """Give this process and its children mounts of their own; return whether that worked."""
+    """Give this process and its children a mount namespace; return whether that worked."""
     if ctypes.CDLL(None).unshare(_OWN_MOUNTS) != 0:
         return False
     return subprocess.run(["mount", "--make-rprivate", "/"], check=False).returncode == 0
 
 
 def full(rig: Rig, folder: Path, blocks: int) -> Result:
-    """Book a demand when a folder's disk has ``blocks`` free blocks, then restart with more room.
+    """Book a demand while a folder's disk has ``blocks`` free blocks, then restart with more room.
 
-    Return what was wrong with both runs.
+    Return the problems of both runs.
     """
     rig.restore()
     with _small_disk(folder):
@@ -64,7 +64,7 @@ def _small_disk(folder: Path) -> Iterator[None]:
 
 
 def interrupted(rig: Rig) -> None:
-    """Kill a process when its demand is journaled and not yet published; save these files."""
+    """Kill a process when its demand is in the journal and not yet published; save all files."""
     rig.restore()
     kill = ("-e", "trace=mkdir", "-e", "inject=mkdir:signal=KILL:when=1")
     ran = rig.book(DEMAND, Strace(kill, "demandops-writer"))
@@ -73,7 +73,7 @@ def interrupted(rig: Rig) -> None:
 
 
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
-    """Change a byte or cut a file of each class; yield what the next start makes of it."""
+    """Change a byte in, or cut, a file of each class; yield the problems of the next start."""
     rig.restore()
     classes: dict[str, tuple[Path, int]] = {}
     for path in sorted(rig.folder.rglob("*")):

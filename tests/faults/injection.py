@@ -1,4 +1,4 @@
-"""Errors and kills at the system calls of one demand, which strace finds."""
+"""Errors and kills at the system calls of one demand, found and injected by strace."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CANNOT_FAIL = {
     "mmap",
     "munmap",
 }
-"""Calls at which no fault is injected, because a fault of a disk does not show there."""
+"""Calls at which no fault is injected, because a disk's fault does not show in them."""
 CHANGES = {
     "creat", "fallocate", "fchmod", "fdatasync", "fsync", "ftruncate", "link", "linkat", "mkdir",
     "mkdirat", "chmod", "pwrite64", "rename", "renameat", "renameat2", "rmdir", "symlink", "sync",
@@ -45,23 +45,23 @@ _NEED_ROOM = {
 _INTERRUPTIBLE = {"flock", "fsync", "open", "openat", "pread64", "pwrite64", "read", "write"}
 KILL = "SIGKILL"
 _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
-"""The faults that the short form tries, without (false) and with (true) a remote."""
+"""The faults of the short form, without (false) and with (true) a remote."""
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often a call that was missed is counted and tried again.
+"""How often a call that the injection missed is counted and tried again.
 
-The counts vary, because either thread may write the journal.
+The counts vary, because either of two threads may write the journal.
 """
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls that a demand makes in this process, by the rig's folder."""
 _OF_SERVER = ("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch")
 """Messages of a git process, here or at the server, that do not give the reason of its failure.
 
-A server that cannot read its references offers none, so the remote "has no branch".
+A server that cannot read its references offers none, so git says that the remote "has no branch".
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
-"""Messages about files that libgit2 could not read, without a reason."""
+"""Messages about files that libgit2 could not read; they give no reason."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Site:
 
     @property
     def of_class(self) -> tuple[str, str, str, bool]:
-        """Its role, kind, class of file, and whether it creates: equal for calls to treat alike."""
+        """Role, kind, class of file, and whether it makes one; calls that share these are alike."""
         return self.role, self.kind, self.file, self.creates
 
     @property
@@ -113,7 +113,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Job:
-    """One fault at one call."""
+    """One fault at one call, with or without a remote."""
 
     remote: bool
     site: Site
@@ -122,7 +122,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """The problems that one fault caused.
+    """The problems that a fault caused.
 
     ``where`` has the thread or program, the call and the class of file.
     """
@@ -134,9 +134,10 @@ class Result:
 
 
 def sites(rig: Rig) -> list[Site]:
-    """Return the calls of one demand, which is booked twice under strace.
+    """Return the calls of one demand.
 
-    One run traces the threads, the other one traces the processes of git.
+    The demand is booked twice: strace traces the threads in one run, and git's processes in the
+    other.
     """
     options = ["-s", "64", "-e", EVERYTHING]
     rig.restore()
@@ -157,8 +158,8 @@ def sites(rig: Rig) -> list[Site]:
 def _here(rig: Rig, site: Site) -> Site:
     """Return the same call with its number in this process.
 
-    The number may differ, because this process may read more or fewer files. If the thread did not
-    make the call this time, return the call of another thread on the same class of file.
+    The number may differ, because this process may read more or fewer files. If the same thread did
+    not make the call this time, return the call of another thread on the same class of file.
     """
     known = _KNOWN[rig.folder]
     same = [each for each in known if (each.of_class, each.place) == (site.of_class, site.place)]
@@ -188,7 +189,7 @@ def _git_sites(rig: Rig, ran: Ran) -> list[Site]:
 
 
 def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
-    """Yield each traced call of git, after the number of its process (see ``Site.which``)."""
+    """Yield each traced call of git with the number of its process (see ``Site.which``)."""
     for trace in ran.git:
         text = "".join(f"1 {line}\n" for line in trace.text.splitlines())
         for call in parse(text, {1: trace.command}, rig.folder, trace.folder):
@@ -199,7 +200,8 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
     If ``short``, take only the last call of each class, and without a remote also the first call of
-    a class of syncs. A call that only reads then meets only EIO; with a remote, it meets no fault.
+    a class of syncs. In the short form, a call that only reads gets only EIO, and with a remote it
+    gets no fault.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -224,7 +226,7 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
 
 
 def run(rig: Rig, job: Job) -> Result:
-    """Inject one fault; return what became of the demand."""
+    """Inject one fault; return the problems that it caused."""
     if rig.folder not in _KNOWN:
         sites(rig)
     result = _run(rig, job, _here(rig, job.site))
@@ -262,7 +264,7 @@ def _run(rig: Rig, job: Job, site: Site) -> Result:
     own = site.is_threads and (not job.remote or "outbox" in site.file)  # the remote keeps a push
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
     problems = list(after_fault(ran, tuple(told), unsound=unsound))
-    if site.role == "git receive-pack":  # an operator removes its locks; the generator waits
+    if site.role == "git receive-pack":  # its locks stay until an operator removes them
         rig.unlock_server()
     problems += after_restart(rig, ran)
     return Result(part, where, job.fault, tuple(problems))

@@ -1,4 +1,4 @@
-"""What must hold after a fault: acknowledged demands are booked once, nothing is half done."""
+"""What must hold after a fault: an acknowledged demand is booked once, and none is half booked."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _OWN_FAULTS = ("fault of demandops", "internal error", "Traceback")
 
 
 def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[str]:
-    """Yield what is wrong with how a process met a fault.
+    """Yield each problem in how a process reacted to an injected fault.
 
     Args:
         ran: what the process did.
@@ -45,11 +45,11 @@ def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[s
 def after_restart(
     rig: Rig, ran: Ran, *, journaled: bool = False, clones: bool = True
 ) -> Iterator[str]:
-    """Book another demand in a fresh process, and yield what is wrong with the state repo.
+    """Book another demand in a fresh process, and yield each problem of the state repo.
 
     Args:
         rig: the state repo.
-        ran: what the process did that met the fault.
+        ran: the process with the injected fault.
         journaled: whether the journal has the demand, so that it must be booked.
         clones: whether git must find no fault in the clones either.
     """

@@ -1,9 +1,9 @@
 """Power loss, in the manner of ALICE: the disk as it may be when unsynced changes are gone.
 
 A model of the disk follows the system calls of a demand. A change of a file's content is safe once
-the file was synced. A change of a name is safe once its folder was synced. At each sync and at the
-end, the model writes out the disk in several states: without any unsafe change, with all of them,
-and with each single unsafe change missing.
+the file is synced. A change of a name is safe once its folder is synced. At each sync and at the
+end, the model writes the disk in several states: without any unsafe change, with all of them, and
+with each single unsafe change missing.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ _GONE = -2
 
 @dataclass(frozen=True)
 class _Name:
-    """A folder's entry is set to a file, to a folder, or removed."""
+    """A change of a folder's entry: it gets a file or a folder, or is removed."""
 
     path: str
     node: int
 
     @property
     def scope(self) -> str | int:
-        """What a sync must cover to make the change safe: the folder."""
+        """The folder, which must be synced to make the change safe."""
         return self.path.rpartition("/")[0]
 
 
 @dataclass(frozen=True)
 class _Data:
-    """Bytes of a file are written at a place, or the file is cut there."""
+    """A change of a file's content: bytes are written at an offset, or the file is cut there."""
 
     node: int
     at: int
@@ -46,13 +46,13 @@ class _Data:
 
     @property
     def scope(self) -> str | int:
-        """What a sync must cover to make the change safe: the file."""
+        """The file, which must be synced to make the change safe."""
         return self.node
 
 
 @dataclass
 class _Change:
-    """Changes by one call or by successive writes; ``safe`` and ``lost`` index ``parts``."""
+    """A change by one call or successive writes; ``safe`` and ``lost`` are indices of parts."""
 
     name: str
     parts: list[_Name | _Data]
@@ -61,12 +61,12 @@ class _Change:
 
     @property
     def is_safe(self) -> bool:
-        """Whether all parts are on the disk after a loss of power at any time."""
+        """Whether all parts survive a loss of power at any time."""
         return len(self.safe) == len(self.parts)
 
 
 class Disk:
-    """What a trace did to the files below a folder, and which changes are safe."""
+    """The changes that a trace made to the files below a folder, and which of them are safe."""
 
     def __init__(self, root: Path, *, always_safe: str = "") -> None:
         self.root = root
@@ -99,7 +99,7 @@ class Disk:
                 self._append(change)
 
     def _append(self, change: _Change) -> None:
-        """Add a change; successive unsafe writes to one file become one change."""
+        """Add a change; join it to the last one if both are unsafe writes to the same file."""
         if self.changes and change.parts and not change.safe:
             last = self.changes[-1]
             parts = [*last.parts, *change.parts]
@@ -181,7 +181,7 @@ class Disk:
             yield f"without {change.name}", [change]
 
     def write(self, missing: Iterable[_Change]) -> None:
-        """Write the folder as the disk has it without the unsafe parts of ``missing``."""
+        """Write the folder as it is on the disk without the unsafe parts of ``missing``."""
         left_out = {id(change) for change in missing}
         names = dict(self._first_names)
         data = {node: bytearray(text) for node, text in self._first_data.items()}
@@ -254,7 +254,7 @@ def failed_sync(rig: Rig, number: int) -> Result:
     disk = Disk(rig.folder)
     broken = (*_TRACE, "-e", f"inject=fsync:error=EIO:when={number}")
     first = rig.book(DEMAND, Strace(broken))
-    again = rig.must(rig.book(0, Strace(_TRACE)))  # was booked: publishes nothing
+    again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked: publishes nothing
     files = set()
     for ran in (first, again):
         for call in parse(ran.trace, ran.roles, rig.folder):

@@ -1,6 +1,7 @@
-"""One state repo at a fixed place, and processes that book demands in it, with or without strace.
+"""A state repo in a folder, and processes that book demands in it, with or without strace.
 
-Each process is a fork of this one, which has imported all modules. This saves a second for each.
+Each process is a fork of this one, which has imported all modules. This saves a second for each
+process.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""The shortest time, in seconds, after which a process that books a demand gets SIGTERM.
+"""The shortest time limit, in seconds, of a process that books a demand; it then gets SIGTERM.
 
 A demand takes half a second, but it may have to wait for its disk.
 """
 PATIENCE = 20
-"""On a busy machine, the limit is so many times what the first demand took."""
+"""On a busy machine, the time limit is so many times what the first demand took."""
 PLENTY_S = 60.0
-"""The limit, in seconds, for commands that meet no fault."""
+"""The time limit, in seconds, of commands without an injected fault."""
 END_S = 8.0
-"""How many seconds after SIGTERM a process is killed."""
+"""How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
 
 GIT = "git"
-"""The value of ``Strace.at`` that traces each process of git by itself."""
+"""The value of ``Strace.at`` with which strace traces each process of git by itself."""
 
 _GIT = """#!/bin/sh
 # Runs one of git's programs, under strace if it is the process that is asked for.
@@ -83,8 +84,8 @@ class Strace:
 class GitTrace:
     """The calls of one process of git.
 
-    ``which`` is its number among the processes of its ``command``, such as ``git push``. ``folder``
-    is where it started, and ``text`` is what strace wrote.
+    ``which`` numbers the processes of one ``command``, such as ``git push``. ``folder`` is the
+    working directory of the process, and ``text`` is the output of strace.
     """
 
     command: str
@@ -95,7 +96,7 @@ class GitTrace:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a process did: its exit code, its output, its traces, and how it hung if it did."""
+    """What a process did: its exit code, its output, its traces, and how it hung, if it did."""
 
     code: int
     out: str
@@ -117,7 +118,7 @@ class Ran:
 
 
 class Rig:
-    """A state repo, and processes that book demands in it; ``remote``: they reach it by a URL."""
+    """A state repo, and processes that book demands in it; with ``remote`` they use its URL."""
 
     def __init__(self, folder: Path, *, remote: bool) -> None:
         self.folder, self.remote = folder / "here", remote
@@ -135,7 +136,7 @@ class Rig:
         self.save()
 
     def _wrap_git(self) -> None:
-        """Make git's programs start by a script that can trace them, even if git starts them."""
+        """Replace git's programs by a script that can trace them, also when git starts them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
         wrapper.write_text(_GIT)
         wrapper.chmod(0o755)
@@ -144,7 +145,6 @@ class Rig:
             (self._git / program.name).symlink_to(wrapper)
 
     def unlock_server(self) -> None:
-        """Remove the locks that git left in the state repo."""
         for lock in self.state.rglob("*.lock"):
             lock.unlink()
 
@@ -154,17 +154,17 @@ class Rig:
         return ran
 
     def save(self) -> None:
-        """Copy all files, for :meth:`restore`."""
+        """Copy all files, so that :meth:`restore` can bring them back."""
         shutil.rmtree(self._template, ignore_errors=True)
         shutil.copytree(self.folder, self._template, symlinks=True)
 
     def restore(self) -> None:
-        """Replace all files by those of the last :meth:`save`."""
+        """Bring back all files as they were at the last :meth:`save`."""
         shutil.rmtree(self.folder)
         shutil.copytree(self._template, self.folder, symlinks=True)
 
     def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
-        """Book the demand of a number; return what the process did."""
+        """Book the demand with a number; return what the process did."""
         file = self.scratch / f"{number}.yaml"
         file.write_text(yaml.safe_dump(goal(number)))
         command = ("request", str(file), "--state-repo", self.address, "--output", "json")
@@ -214,7 +214,7 @@ class Rig:
     ) -> Ran:
         """Wait for the end of a process; return what it did.
 
-        When the thread starts that ``strace`` names, attach strace to it.
+        When the thread that ``strace`` names starts, attach strace to it.
         """
         roles: dict[int, str] = {}
         alone = 0  # the only traced thread, if any; strace then writes no thread numbers
@@ -261,7 +261,7 @@ class Rig:
 
 
 def goal(number: int) -> Goal:
-    """Return the demand of a number; each demand has a requester of its own."""
+    """Return the demand with a number; each demand has a requester of its own."""
     return numbered(number)
 
 
@@ -288,7 +288,7 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
 
 
 def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int) -> None:
-    """Run the command line in this forked process, and end the process."""
+    """Run the command line in this forked process, then end the process."""
     from demandops.cli import main
 
     code = 70
@@ -303,7 +303,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
         def begin(name: str) -> None:
             with one_begins:
                 if select.select([waits], [], [], 0)[0]:
-                    os.read(waits, 1)  # for the thread before, whose own read strace would count
+                    os.read(waits, 1)  # of the thread before; strace would count its own read
                 os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
                 select.select([waits], [], [])
             with suppress(OSError):
@@ -325,7 +325,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
 
 
 def demands(rig: Rig) -> dict[int, list[str]]:
-    """Return number → commits of each booked demand."""
+    """Return the commits of each booked demand, by the demand's number."""
     found: dict[int, list[str]] = {}
     for commit in commits(rig.state):
         name = commit.one("Request-Id")
@@ -335,5 +335,4 @@ def demands(rig: Rig) -> dict[int, list[str]]:
 
 
 def includes(rig: Rig, commit: str) -> bool:
-    """Return whether main has a commit."""
     return commit in git(rig.state, "rev-list", "main").split()

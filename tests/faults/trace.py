@@ -1,4 +1,4 @@
-"""The system calls in strace's output: who made them, on which class of file."""
+"""The system calls in strace's output: who made each one, and on which class of file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _RANDOM = (
 
 @dataclass(frozen=True)
 class Call:
-    """One system call; ``n`` counts the calls of its name in its thread or process."""
+    """One system call; ``n`` is its number among the calls of its name in its thread or process."""
 
     process: int
     role: str
@@ -45,7 +45,7 @@ class Call:
 
     @property
     def failed(self) -> bool:
-        """Whether the call returned an error, also an injected one."""
+        """Whether the call returned an error, be it real or injected."""
         return self.result.startswith(("-1", "?"))
 
     @property
@@ -107,7 +107,7 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
 def _whole_lines(
     text: str, roles: dict[int, str], folders: dict[int, str]
 ) -> Iterator[tuple[int, str]]:
-    """Yield each process and call; the two parts of an interrupted call are joined."""
+    """Yield each call with its process; join the two parts of an interrupted call."""
     begun: dict[int, str] = {}
     for raw in text.splitlines():
         match = _LINE.match(raw)
@@ -140,7 +140,7 @@ def _program(arguments: str, before: str) -> str:
 
 
 def _paths(kind: str, arguments: str, folder: str) -> list[str]:
-    """Return the paths of the files that a call refers to, by a name or by an open file's number.
+    """Return the paths of the files to which a call refers, by name or by an open file's number.
 
     A text in quotes may also be data that is read or written. Only the kind of the call shows
     whether it is a name.

@@ -1,4 +1,4 @@
-"""Fuzzing: every input from outside is accepted, or refused by an exception that is meant for it.
+"""Fuzzing: the program accepts any input from outside, or refuses it with an expected exception.
 
 ``make fuzz`` gives each target ``FUZZ_S`` seconds. Atheris drives the targets of bytes: it searches
 for inputs that reach new lines of our code. Hypothesis drives the targets of values. An input is a
@@ -31,5 +31,5 @@ class Target:
 
     @property
     def name(self) -> str:
-        """The name of the target, which comes from that of its check."""
+        """The name of the target; it is the name of its check."""
         return self.check.__name__.strip("_").replace("_", "-")

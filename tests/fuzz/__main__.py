@@ -1,4 +1,4 @@
-"""Runs the targets: ``FUZZ_S=10 python -m tests.fuzz [NAME…]``; without names all of them."""
+"""Run the targets: ``FUZZ_S=10 python -m tests.fuzz [NAME…]``; without names, run all of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.fuzz import Target
 
 try:
     import atheris
-except ImportError:  # there is no wheel for this system: Hypothesis changes the seeds
+except ImportError:  # without a wheel of Atheris for this system, Hypothesis changes the seeds
     atheris = None
 
 FOLDER = Path("build/fuzz").absolute()
@@ -39,7 +39,7 @@ _ODD = (
     *(".inf", "-.nan", "1e999", "Infinity", "null", "~", "[]", "{}", "-1", "9" * 30, "!!int", "&a"),
     *("*a", "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "..", r"\\ud800", r"\x00"),
 )
-"""Words that parsers have mistaken for something else; libFuzzer inserts them anywhere."""
+"""Words that some parser has misread; libFuzzer inserts them anywhere."""
 
 
 class TooSlow(BaseException):
@@ -47,7 +47,7 @@ class TooSlow(BaseException):
 
 
 class Run:
-    """The run of a target in a process of its own."""
+    """Runs a target in a process of its own."""
 
     def __init__(self, target: Target, seconds: float) -> None:
         self.target, self.seconds = target, seconds
@@ -71,7 +71,7 @@ class Run:
             os._exit(status)  # without the exit handlers that the parent has registered
 
     def _look(self) -> None:
-        tempfile.tempdir = str(self.folder)  # which the next run removes
+        tempfile.tempdir = str(self.folder)  # the next run removes it
         signal.signal(signal.SIGVTALRM, _stop)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, used + MOST_MEMORY))
@@ -84,7 +84,7 @@ class Run:
             self._by_hypothesis()
 
     def check(self, value: Any) -> None:
-        """Check one input; if it is a finding, keep it unless a shorter one like it is kept."""
+        """Check one input; keep a finding unless a shorter input with the same error is kept."""
         self.calls.value += 1
         error = self._error(value)
         if isinstance(error, TooSlow):  # the first call of a function may have to prepare much
@@ -151,7 +151,7 @@ class Run:
             some()
 
     def findings(self, exitcode: int | None) -> list[str]:
-        """Return the names of all findings, after the process has ended with ``exitcode``."""
+        """Return the names of all findings, given the exit code of the process that has ended."""
         found = sorted(path.name for path in self.folder.iterdir() if path.suffix == ".input")
         return found if exitcode == 0 else [*found, f"the process ended with {exitcode}; see out"]
 
@@ -165,7 +165,7 @@ def _is_ours(file: str) -> bool:
 
 
 def changed(seeds: tuple[bytes, ...]) -> st.SearchStrategy[bytes]:
-    """Return a strategy: the seeds with some bytes replaced, removed or doubled."""
+    """Return a strategy for the seeds with some bytes replaced, removed or doubled."""
 
     def change(seed: bytes, random: Random) -> bytes:
         data = bytearray(seed)

@@ -71,7 +71,7 @@ def _text(data: bytes) -> str:
 
 
 def _bytes(paths: Iterable[Path], most: int = 20) -> tuple[bytes, ...]:
-    """Return the contents of some files without repeats, at most ``most``."""
+    """Return the distinct contents of the files, at most ``most`` of them."""
     return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:most]
 
 
@@ -91,7 +91,6 @@ def _folder() -> Path:
 
 @cache
 def _repo() -> pygit2.Repository:
-    """Return a repository with one commit."""
     repo = pygit2.init_repository(str(_folder() / "repo.git"), bare=True, initial_head="main")
     who = pygit2.Signature("x", "x@example.org", 0, 0)
     repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])
@@ -116,7 +115,7 @@ def goal_as_data(data: Any) -> None:
 
 
 def _goals() -> st.SearchStrategy[Any]:
-    """Return a strategy: any data, and valid goals in which parts are replaced."""
+    """Return a strategy for any data, and for valid goals in which parts are replaced."""
     models = [rich.reference_goal(), rich.own_goal()]
     return st.one_of(ANYTHING, *(_near(model, st.one_of(ANYTHING, TEXT)) for model in models))
 
@@ -151,7 +150,7 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
 
 
 def file_of_the_reference(data: bytes) -> None:
-    """What is read from a file of the reference can be mapped, and gives goals."""
+    """A file of the reference that can be read can also be mapped, and gives goals."""
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)
     joins, _ = imported_goals.remaining_joins(files)
@@ -291,7 +290,7 @@ def contexts_file(data: bytes) -> None:
 
 
 def detector_rules(data: bytes) -> None:
-    """Rules that can be read also compile, accept observations, and want goals."""
+    """Rules that can be read can also be compiled; they accept observations and form goals."""
     try:
         file = rule_file.read(_text(data), "rules.yaml")
     except InvalidInput as error:
@@ -315,13 +314,13 @@ def detector_rules(data: bytes) -> None:
 def _seen(
     file: RuleFile, source: str, entity: str, now: float, number: int
 ) -> Iterable[Observation]:
-    """Yield the observation from a message whose fields all have the same value."""
+    """Yield the observation from a message in which every field has the same value."""
     with suppress(Unreadable):
         yield MessageReader(file, source).observation(_Message(number * 3.0), entity, now)
 
 
 class _Message(float):
-    """A number that is a message too: each of its fields is the number itself."""
+    """A number that is also a message: each of its fields is the number itself."""
 
     def __getattr__(self, name: str) -> _Message:
         return self
@@ -529,7 +528,7 @@ _PUSH = b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nX-Gitlab-Token:
 def webhook_address(data: bytes) -> None:
     text = _text(data)
     if any(char.isalpha() for char in text):
-        return  # no name is looked up
+        return  # a name would be looked up
     PushWebhook(text, b"", lambda: None).close()
 
 
@@ -568,7 +567,7 @@ _OBJECTS: dict[Any, list[Any]] = {
 
 
 def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
-    """Return a strategy for what an API may report in place of ``value``.
+    """Return a strategy for what an API may report instead of ``value``.
 
     Parts are missing or null, and texts and numbers differ.
     """

@@ -1,4 +1,4 @@
-"""Each place where a value is written as text: the real reader reads it back unchanged."""
+"""A value that the program writes as text comes back the same from the program that reads it."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def claim_in_its_file(claim: Any) -> None:
 
 
 def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
-    """Return a rich configuration and a goal in which some texts are replaced by given ones."""
+    """Return a rich configuration and a goal in which the given texts replace some texts."""
     seed, texts = given
     random, files, goal = Random(seed), rich.rich(), rich.own_goal()
     name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
@@ -193,7 +193,7 @@ def name_of_object(ids: tuple[str, str]) -> None:
 
 
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
-    """The override file has what a person gives to the command, unless that is refused."""
+    """The override file has what a person gave to the command, unless the command refuses it."""
     reason, owner, nodes, patch = words
     options = EditOptions("", None, " ".join(reason.split()) or "x", False, False, False, "text")
     given = {"owner": owner or "x", "values": patch}

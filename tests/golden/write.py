@@ -8,7 +8,6 @@ from tests.kit.golden import CASES, GOLDEN, to_store
 
 
 def main() -> None:
-    """Write the expected files of every case."""
     for case in CASES:
         expected = GOLDEN / case / "expected"
         shutil.rmtree(expected, ignore_errors=True)

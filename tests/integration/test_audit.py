@@ -1,4 +1,4 @@
-"""The program and plain git answer an auditor: what ran when, for whom, and who booked it."""
+"""The program and plain git tell an auditor what ran when, for whom, and who booked it."""
 
 from __future__ import annotations
 
@@ -318,7 +318,7 @@ class TestLogFilters:
 
 
 def test_bookkeeping_at_a_time(ask: Run, played: Any) -> None:
-    """The first commit is from January; all other commits were made during the test."""
+    """The first commit has a date in January; all other commits are made during the test."""
     first = git(played, "rev-list", "--max-parents=0", "main")
     assert ask("bookkeeping", "--at", "2026-01-31")["commit"] == first
     assert ask("bookkeeping", "--at", "1d")["commit"] == first
@@ -399,7 +399,9 @@ class TestRollback:
         assert self.roll(demandops, played, "main~1", "-m", "why not").code == 0
         assert git(played, "log", "-1", "--format=%an|%ae", "main") == "Ada (A)|ada@example.org"
 
-    def test_what_was_booked_since_is_listed_and_stays(self, demandops: Run, played: Any) -> None:
+    def test_a_rollback_past_newer_claims_is_refused_and_lists_them(
+        self, demandops: Run, played: Any
+    ) -> None:
         before = played.tip
         ran = self.roll(demandops, played, "main~4", "-m", "x")
         found = ran.json()
@@ -461,12 +463,12 @@ class TestRollback:
 
 
 class TestVerifyByDifferences:
-    """`verify` proves a range of commits by the differences between them."""
+    """`verify` checks a range of commits by the differences between them."""
 
     FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 2\n"
 
     def verdicts(self, demandops: Run, state: Any) -> dict[str, Any]:
-        """Return the rows of `verify` by commit; check that `--whole` gives the same."""
+        """Return the rows of `verify` by commit, after a check that `--whole` gives the same."""
         where = ("verify", "main~4..main", "--state-repo", state.path, "--output", "json")
         ran = demandops(*where)
         assert demandops(*where, "--whole") == ran
@@ -496,7 +498,7 @@ class TestVerifyByDifferences:
     def test_a_file_that_should_have_been_touched(
         self, demandops: Run, played: Any, request_json: Run
     ) -> None:
-        """A forged commit removes a claim, but leaves the files that the claim needed."""
+        """A forged commit removes a claim, but not the files that only this claim needed."""
         path = next(p for p, t in played.files("ledger/connections/").items() if "vehicle02/" in t)
         text = self.FORGED.replace("none", read(played.files()[path], path).demand)
         made = self.surrounded(

@@ -1,6 +1,6 @@
 """Bad input through ``demandops request``, mainly attacks in YAML.
 
-What is refused leaves no commit and nothing in the journal, and the next demand works.
+A refused input leaves no commit and nothing in the journal, and the next demand works.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
     state.commit({path: text})
     booked(request_json(perception()))
     assert any("/od-" in manifest for manifest in state.manifests())
-    assert state.files()[path] == text, "what people wrote is not touched"
+    assert state.files()[path] == text, "the generator must not change what people wrote"
     assert path in caplog.text
 
 
@@ -113,7 +113,7 @@ def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
 def test_a_mistake_anywhere_in_a_goal_changes_nothing(
     request_json: Send, state: Any, data_home: Path, valid: Any, model: Any
 ) -> None:
-    """This tries a sample; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
+    """A sample only; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
     form, before = Form(model.model_json_schema()), state.tip
     wrong = [m for m in mutations(valid()) if form.forbids(m.document)]
     for mutation in wrong[:: len(wrong) // 4]:
@@ -121,7 +121,7 @@ def test_a_mistake_anywhere_in_a_goal_changes_nothing(
         assert any(map(mutation.is_at, fields)), (mutation.place, mutation.kind, fields)
         assert state.tip == before
     booked(request_json(perception()))
-    assert list(data_home.rglob("outbox.jsonl")), "the journal, which the fixture reads"
+    assert list(data_home.rglob("outbox.jsonl")), "the fixture must find the journal"
 
 
 def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
@@ -130,7 +130,7 @@ def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
     assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
 
 
-# A file's content, and the start of the message, without the words of libyaml and pydantic.
+# A file's content, and the start of the message; the rest has words of libyaml or pydantic.
 ATTACKS: dict[str, tuple[str | bytes, str]] = {
     "empty": ("", "error: no request in {file}; write one\n"),
     "only a comment": ("# nothing\n", "error: no request in {file}; write one\n"),
@@ -246,7 +246,7 @@ class TestYamlAttacks:
         assert state.tip == before
         assert not (tmp_path / "trace").exists()
 
-    def test_whatever_stands_in_a_file_ends_in_a_message(
+    def test_any_content_of_a_file_ends_in_an_error_message(
         self, demandops: Send, state: Any, tmp_path: Path
     ) -> None:
         contents = [
@@ -307,7 +307,7 @@ class TestYamlAttacks:
     def test_brackets_without_end_crash_nothing(
         self, state: Any, tmp_path: Path, data_home: Path
     ) -> None:
-        """The commands run in another process, because a parser might overflow the stack."""
+        """The commands run in another process, because a parser might overflow its stack."""
         files = [tmp_path / "lists.yaml", tmp_path / "mappings.yaml"]
         for file, opening, closing in zip(files, ("[", "{a: "), "]}", strict=True):
             file.write_text("apps: " + opening * 40_000 + closing * 40_000)

@@ -143,7 +143,7 @@ def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(
     assert (code, errors) == (1, f"error: {checkout} is not a Git checkout; leave out --base\n")
 
 
-def test_an_input_that_the_merge_keeps_from_arriving_is_told(
+def test_check_warns_of_an_input_that_the_branch_cuts_off(
     state: GitRepo, tmp_path: Path, demandops: Run
 ) -> None:
     assert demandops("request", EXPERIMENT[0], "--state-repo", state.path).code == 0
@@ -160,7 +160,9 @@ def test_an_input_that_the_merge_keeps_from_arriving_is_told(
     git(clone, "add", "--all")
     git(clone, "commit", "--quiet", "--message=Rest")
     git(clone, "push", "--quiet")
-    assert "does not arrive" not in demandops("check", clone).err, "it did not change this"
+    assert "does not arrive" not in demandops("check", clone).err, (
+        "an input that the branch did not change must not be told"
+    )
 
 
 def test_what_the_merge_target_has_already_is_no_consequence(
@@ -224,7 +226,7 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
 
 
 def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Check) -> None:
-    """An existing report is no fault, but a person's change of it is."""
+    """A report that exists is no fault, but a person's change of it is one."""
     report = checkout / ".demandops" / "reports" / "problems.yaml"
     report.parent.mkdir(parents=True)
     report.write_text("problems: []\n")

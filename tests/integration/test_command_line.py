@@ -158,7 +158,7 @@ class TestInit:
             yaml.safe_load((folder / "registry" / "images.yaml").read_text())["images"]
         ) == ["mqtt-client"]
 
-    def test_an_empty_folder_is_used_also_the_one_that_one_stands_in(
+    def test_an_empty_working_directory_is_used(
         self, demandops: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         folder = tmp_path / "state"

@@ -1,4 +1,4 @@
-"""Run what the documentation shows, so that it stays true."""
+"""The examples of the documentation do what the documentation says."""
 
 from __future__ import annotations
 
@@ -366,7 +366,7 @@ def test_the_rules_of_the_documentation_form_demands_that_are_booked() -> None:
         assert decided(state(), goal.document).outcome == "booked"
 
 
-def test_a_schema_takes_what_is_laid_down_and_nothing_misspelt() -> None:
+def test_each_schema_accepts_the_file_of_init_and_refuses_an_unknown_field() -> None:
     runner, files = CliRunner(), skeleton.files()
     listed = dict(
         line.split(maxsplit=1) for line in runner.invoke(cli, ["schema"]).output.splitlines()

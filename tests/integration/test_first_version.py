@@ -1,4 +1,4 @@
-"""A state repo of the first version can be read as it is, and an upgrade converts it."""
+"""Commands can read a state repo of the first version, and an upgrade converts it."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def run(demandops: Run, state: GitRepo) -> Run:
 
 
 def documents(files: dict[str, str]) -> Iterator[tuple[str, Any]]:
-    """Yield each manifest with a name that an upgrade does not change."""
+    """Yield each manifest under a name that is the same before and after an upgrade."""
     for path, text in files.items():
         for place, document in enumerate(filter(None, yaml.safe_load_all(text))):
             yield f"{path} {place}", document
 
 
 def with_todays_topics(text: str) -> str:
-    """Return a manifest in which a fusion's output topics have their present names."""
+    """Return a manifest in which the output topics of a fusion have their present names."""
     return re.sub(r" /(edge|cloud)/(\w+_(?:raw_objects|global_\w+))$", r" /\1_\2", text, flags=re.M)
 
 

@@ -339,7 +339,7 @@ class TestStatus:
         )
         assert ran.code == 0
 
-    def test_what_is_not_healthy_is_waited_for_and_told(
+    def test_status_wait_lists_unhealthy_releases_when_the_time_is_over(
         self, demandops: Run, fleet: GitRepo, tmp_path: Path
     ) -> None:
         where = ("--state-repo", fleet.path)
@@ -370,7 +370,7 @@ class TestStatus:
         suspended = ("--connection", "vehicle00/edge", "-m", "in the workshop")
         assert demandops("suspend", *suspended, *where).code == 0
         (item,) = demandops("get", "overrides", *where, "-o", "json").json()["items"]
-        assert item["state"] == "not rendered yet", "its files are those of stopped clients"
+        assert item["state"] == "not rendered yet", "the files must be those of stopped clients"
         assert demandops("request", EXPERIMENT[2], *where).code == 0
         (item,) = demandops("get", "overrides", *where, "-o", "json").json()["items"]
         assert item["state"] == "in force"
@@ -390,7 +390,7 @@ class TestStatus:
     def test_a_cluster_with_an_old_bootstrap_file_is_named(
         self, demandops: Run, fleet: GitRepo, tmp_path: Path
     ) -> None:
-        """Without the annotation of its Kustomization, a bootstrap file counts as old."""
+        """A bootstrap file counts as old if the Kustomization lacks the file's annotation."""
         bootstrap = fleet.files()["bootstrap/c-its.yaml"]
         applied = next(
             one for one in yaml.safe_load_all(bootstrap) if one["kind"] == "Kustomization"

@@ -15,7 +15,7 @@ from tests.kit.reference import Reference
 from tests.kit.repo import GitRepo, books, claims, init, read, tip
 
 REQUEST = "station00/collective-perception-intersection"
-"""The request id in all of the experiment's goals."""
+"""The request id of all goals in the experiment."""
 STATION = "mqtt-connection-station00-edge"
 
 
@@ -31,13 +31,13 @@ class Migration:
         self.files = {path.stem: path for path in self.reference.write(folder / "reference")}
 
     def run(self, *args: str | Path, files: str = "", stdin: str = "") -> Ran:
-        """Run `import` with the reference's files whose names contain the text ``files``."""
+        """Run `import` with those files of the reference whose names contain ``files``."""
         chosen = [path for name, path in self.files.items() if files in name]
         how = ["--state-repo", self.repo, "--map", self.map]
         return self._demandops("import", *chosen, *how, *args, stdin=stdin)
 
     def propose(self, old: str = "", new: str = "") -> None:
-        """Let `import` propose a map; put the experiment's id and `new` into the map."""
+        """Let `import` propose a map; put the experiment's id into it, and `new` for `old`."""
         assert self.run().code == 0
         text = self.map.read_text().replace("request: imported", f"request: {REQUEST}")
         assert old in text
@@ -53,7 +53,7 @@ def migration(tmp_path: Path, demandops: Run) -> Migration:
 
 
 def ledger(repo: Path) -> dict[str, str]:
-    """Return the claim files by path, without the times of booking."""
+    """Return the claim files by path, without the times at which the claims were booked."""
     files = GitRepo(repo).files("ledger/")
     return {path: re.sub("booked: .*", "", files[path]) for path in claims(repo)}
 
@@ -84,7 +84,7 @@ def test_counts_alone_end_with_as_many_shutdowns(migration: Migration) -> None:
 
 
 def test_the_same_requesters_twice_are_two_demands(tmp_path: Path, demandops: Run) -> None:
-    """The reference counts the requesters twice; with one id DemandOps would count them once."""
+    """The reference counts the requesters twice; under one id DemandOps would count them once."""
     migration = Migration(tmp_path, demandops, 0)
     for topics in (["/t"], ["/t", "/u"]):
         migration.reference.send({"connections": [connection(topics=topics, who=["v"])]})
@@ -214,7 +214,7 @@ def test_what_cannot_be_read_is_refused(migration: Migration, text: str, message
     assert not migration.map.exists()
 
 
-def test_nothing_held_is_an_error(migration: Migration) -> None:
+def test_an_import_that_finds_no_demands_fails(migration: Migration) -> None:
     refused = migration.run("-", files="no such file", stdin="{}")
     assert (refused.code, refused.err) == (
         1,

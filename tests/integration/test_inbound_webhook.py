@@ -1,4 +1,4 @@
-"""The inbound webhook, over real HTTP on loopback."""
+"""Real HTTP calls on loopback to the inbound webhook."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_who_does_not_is_refused_and_the_log_holds_nothing_of_it(
         assert send(signed, FORGED[case]) == (403, "not signed with the secret")
     assert heard.times == 0
     warnings = [record for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warnings) == 1, "not one for each"
+    assert len(warnings) == 1, "several refusals must give one warning"
     for text in (SECRET.decode(), *(value for value in FORGED[case].values() if value)):
         assert text not in caplog.text
 
@@ -210,7 +210,7 @@ def test_a_close_waits_for_no_slow_sender(heard: Heard) -> None:
         raw.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\nx")
         began = time.monotonic()
         hook.close()
-    assert time.monotonic() - began < 9, "a sender has ten seconds"
+    assert time.monotonic() - began < 9, "the close waited for the slow sender"
     with pytest.raises(ConnectionError):
         _connected(hook)
 

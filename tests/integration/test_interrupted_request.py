@@ -1,4 +1,4 @@
-"""A command that books ends at once after Ctrl-C or SIGTERM, and reports what has an answer."""
+"""After Ctrl-C or SIGTERM, a command that books ends at once and lists the answered demands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.kit import rig
 def test_a_request_that_is_interrupted_says_what_has_an_answer(
     bare: Path, data_home: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int
 ) -> None:
-    """After the first demands are booked, a folder blocks the branch's lock file."""
+    """Once the first demands are booked, a folder stands where the branch's lock file must be."""
     file = tmp_path / "demands.yaml"
     file.write_text(yaml.safe_dump_all(rig.goal(each) for each in range(60)))
     lock = bare / "refs" / "heads" / "main.lock"

@@ -72,7 +72,7 @@ def test_its_example_demand_runs(laid: Path, demandops: Run, tmp_path: Path) -> 
 
 
 def test_a_fleet_from_nothing(demandops: Run, tmp_path: Path) -> None:
-    """As docs/appdef.md says, commands alone make five nodes and an application."""
+    """Commands alone make five nodes and an application, as docs/appdef.md says."""
     repo = tmp_path / "fleet"
     assert demandops("init", repo, "--example", "none").code == 0
     ran = demandops(*APPLICATION, "-C", repo)

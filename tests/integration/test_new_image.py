@@ -1,4 +1,4 @@
-"""`demandops new image` writes valid pipelines and a script whose proposal `check` accepts."""
+"""`demandops new image` writes valid pipelines, and a script whose proposal `check` accepts."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_proposed_image_passes_check(
 
 
 @pytest.mark.parametrize("args", [("1; reboot", DIGEST), ("1.0", "latest"), ("$(x)", DIGEST)])
-def test_what_is_no_tag_or_digest_is_refused(
+def test_an_invalid_tag_or_digest_is_refused(
     package: Path, tmp_path: Path, args: tuple[str, str]
 ) -> None:
     ran = propose(package, tmp_path / "unused.git", *args)

@@ -1,4 +1,4 @@
-"""`check` suggests an override instead of a manual edit; `upgrade` respects overrides."""
+"""For a manual edit, `check` suggests an override; `upgrade` respects overrides."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
     assert bodies(state.files()[path]) == bodies(text)
 
 
-def test_the_deletion_suggested_stops_what_was_deleted_by_hand(
+def test_the_override_that_check_suggests_stops_a_release_deleted_by_hand(
     demandops: Run, state: Any, book: Callable[..., Any], clone: Path
 ) -> None:
     (clone / CLIENT).unlink()
@@ -116,7 +116,7 @@ def test_a_release_that_is_held_keeps_the_controller_from_being_changed(
 def test_an_upgrade_takes_in_what_people_changed_before_it(
     demandops: Run, state: Any, book: Callable[..., Any]
 ) -> None:
-    """One commit deletes an application's claims and adds an override that keeps it."""
+    """One commit deletes an application's claims and adds an override that keeps it running."""
     book()
     keep = override({"applications": ["*"]}, keep=True)
     claims = dict.fromkeys(state.files("ledger/applications/"))

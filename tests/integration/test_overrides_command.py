@@ -1,4 +1,4 @@
-"""The output of ``demandops get overrides``, check, bookkeeping and schema about overrides."""
+"""The output of ``get overrides``, ``check``, ``bookkeeping`` and ``schema`` about overrides."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def text(select: dict[str, list[str]], **fields: Any) -> str:
 
 @pytest.fixture
 def overridden(state: GitRepo, request_json: Callable[..., Ran]) -> GitRepo:
-    """A state repo with vehicle00's demand and an override of each kind in effect."""
+    """A state repo with vehicle00's demand, and an override of each kind in effect."""
     request_json(perception())
     many = {
         "values": {"replicas": 2, "nodeSelector": None},
@@ -211,7 +211,7 @@ def test_why_tells_what_overrides_do(demandops: Run, overridden: GitRepo) -> Non
     assert all(one["suspended_by"] is None for one in shaped["claims"])
 
 
-def test_why_of_what_an_override_keeps(
+def test_why_names_the_override_that_keeps_a_claim(
     demandops: Run, overridden: GitRepo, request_json: Callable[..., Ran]
 ) -> None:
     overridden.commit({"overrides/closed.yaml": None, "overrides/off.yaml": None})

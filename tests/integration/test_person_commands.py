@@ -1,4 +1,4 @@
-"""Commands by which a person makes overrides, suspensions and approvals in their own name."""
+"""Commands with which a person makes overrides, suspends and approves demands in their own name."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ pytestmark = pytest.mark.usefixtures("git_environment")
 
 @pytest.fixture
 def joined(request_json: Callable[..., Ran], state: GitRepo) -> GitRepo:
-    """A state repo with one demand of vehicle00."""
+    """A state repo with one demand, by vehicle00."""
     assert request_json(perception()).code == 0
     return state
 
 
 @pytest.fixture(params=["folder", "url"])
 def where(request: pytest.FixtureRequest, joined: GitRepo) -> tuple[str, str]:
-    """The options that name the state repo: once as a folder, once as a URL."""
+    """The options that name the state repo; each test runs with its folder and with its URL."""
     address = str(joined.path) if request.param == "folder" else joined.path.as_uri()
     return "--state-repo", address
 
@@ -119,7 +119,9 @@ class TestOverride:
         person.merge("override/calm")
         assert demandops("get", "overrides", *where, "-o", "name").out == "calm\n"
 
-    def test_what_is_not_valid_changes_nothing(self, demandops: Run, joined: GitRepo) -> None:
+    def test_an_invalid_override_is_refused_and_nothing_committed(
+        self, demandops: Run, joined: GitRepo
+    ) -> None:
         before, where = joined.tip, ("--state-repo", joined.path)
         for options, told in (
             ((), "give the reason: -m TEXT"),
@@ -143,7 +145,7 @@ class TestOverride:
 
 
 class TestSuspend:
-    def test_what_is_suspended_rests_until_it_is_resumed(
+    def test_suspended_demands_run_again_after_a_resume(
         self, demandops: Run, joined: GitRepo, where: tuple[str, str]
     ) -> None:
         files = joined.manifests()

@@ -1,4 +1,4 @@
-"""The pipelines that `init` writes: valid by their schemas, with few rights; their scripts run."""
+"""The pipelines that `init` writes are valid by their schemas, have few rights, and work."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def environment(tmp_path: Path, **more: str) -> dict[str, str]:
 
 
 def helm(tmp_path: Path) -> dict[str, str]:
-    """Return the environment for a fake helm that accepts every chart without output."""
+    """Return the environment for a fake helm that accepts every chart and prints nothing."""
     program = tmp_path / "helm"
     program.write_text(f"#!{BASH}\n")
     program.chmod(0o755)
@@ -83,7 +83,7 @@ def helm(tmp_path: Path) -> dict[str, str]:
 
 
 def put_demandops(at: Path) -> None:
-    """Write a `demandops` that runs this program to the path where the pipeline installs it."""
+    """Write a script `demandops` that runs this program, where the pipeline would install it."""
     at.parent.mkdir(parents=True)
     at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m demandops.cli.main "$@"\n')
     at.chmod(at.stat().st_mode | stat.S_IXUSR)
@@ -220,7 +220,7 @@ def test_gitlab_brings_helm_as_its_digest_says(
 
 
 class Notes:
-    """A part of GitLab's API: the caller's own id, and the notes of one merge request."""
+    """A stand-in for GitLab's API: the caller's own id, and the notes of one merge request."""
 
     def __init__(self) -> None:
         self.url = ""

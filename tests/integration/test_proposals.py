@@ -1,4 +1,4 @@
-"""Approval from the command line: demands are proposed, listed, awaited, or tried in a dry run."""
+"""Demands that need approval are proposed, listed, awaited and tried in a dry run by commands."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:
 
 @contextmanager
 def decided(state: GitRepo, *command: str) -> Iterator[None]:
-    """During the block a person runs a git command on the first proposal's branch."""
+    """During the block, a person runs a git command on the branch of the first proposal."""
 
     def decide() -> None:
         wait_until(lambda: branches(state.path), "a demand waits")

@@ -47,7 +47,7 @@ def book(bare: Path, step: str) -> None:
 
 @pytest.fixture
 def branch(bare: Path, tmp_path: Path) -> Path:
-    """A clone in which a new branch `edit` is checked out."""
+    """A clone of the state repo, with a new branch `edit` checked out."""
     folder = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(bare), str(folder))
     git(folder, "checkout", "--quiet", "-b", "edit")
@@ -188,9 +188,7 @@ def test_an_edit_that_no_override_does_is_refused_all_the_same(branch: Path, che
     assert check()[0] == 1
 
 
-def test_what_is_deleted_added_or_the_generators_own_is_refused_with_what_to_do(
-    branch: Path, check: Run
-) -> None:
+def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, check: Run) -> None:
     (branch / DETECTION).unlink()
     (branch / CLIENT).unlink()
     (branch / EDGE / "extra.yaml").write_text("kind: Secret\n")
@@ -500,7 +498,7 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
 
 
 def without_code(text: str) -> str:
-    """Return a Markdown text without its code spans and fences, by CommonMark's rule."""
+    """Return a Markdown text without its code spans and fences, by CommonMark's rules."""
     kept, rest = "", text
     while "`" in rest:
         before, _, rest = rest.partition("`")

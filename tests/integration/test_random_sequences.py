@@ -1,4 +1,4 @@
-"""Long random sequences of requests go through the command line into a real state repo.
+"""The command line books long random sequences of requests in a real state repo as the model does.
 
 The model in ``tests/model`` takes the same requests. After each call, and at commits in between,
 the bookkeeping of both must be equal.
@@ -26,19 +26,18 @@ SEEDS = range(1, 1 + int(os.environ.get("DEMANDOPS_EXAMPLES", "1")))
 
 
 class CommandLine:
-    """``demandops`` in this process, on one state repo."""
+    """``demandops`` on one state repo, run in this process."""
 
     def __init__(self, repo: GitRepo, run: Run) -> None:
         self.repo, self._run = repo, run
 
     def __call__(self, *arguments: str) -> tuple[int, Any]:
-        """Run a command and return its exit code and the JSON that it prints."""
+        """Run a command; return its exit code and the JSON that it prints."""
         ran = self._run(*arguments, "--state-repo", self.repo.path, "--output", "json")
         assert ran.out, ran.err
         return ran.code, ran.json()
 
     def commits(self) -> list[str]:
-        """Return every commit, the oldest first."""
         return git(self.repo, "rev-list", "--reverse", "main").split()
 
     def view(self, revision: str) -> dict[str, Any]:
@@ -56,7 +55,7 @@ def command(demandops: Run, state: GitRepo) -> CommandLine:
 
 
 def written(goals: list[Goal], folder: Path, name: str) -> list[str]:
-    """Write goals into two YAML files with many documents each; return the files' paths."""
+    """Write goals into two YAML files, one document for each goal; return the files' paths."""
     half = len(goals) // 2
     files = {f"{name}-a.yaml": goals[:half], f"{name}-b.yaml": goals[half:]}
     for file, documents in files.items():
@@ -68,12 +67,12 @@ def written(goals: list[Goal], folder: Path, name: str) -> list[str]:
 def assert_told_as_expected(
     rows: list[dict[str, Any]], expected: list[Result], goals: list[Goal], new: list[str]
 ) -> None:
-    """Check the outcome and the commit of each request in the rows of one call."""
+    """Check the outcome and the commit of each request in the rows that one call printed."""
     assert [row["outcome"] for row in rows] == [result.outcome for result in expected]
     assert [row["index"] for row in rows] == list(range(len(goals)))
     assert [row["request"] for row in rows] == [goal["id"] for goal in goals]
     done = [row["commit"] for row in rows if row["outcome"] in ("booked", "released")]
-    assert done == new, "one commit for each demand that changes something, in order"
+    assert done == new, "each demand that changes something must have a commit, in order"
     for row in rows:
         assert bool(row["faults"]) == (row["outcome"] == "refused")
         assert (row["commit"] is None) == (row["outcome"] == "refused")
@@ -100,7 +99,7 @@ def test_a_state_repo_says_what_the_model_says_after_any_sequence_of_requests(
 
         after = command.commits()
         new = after[len(before) :]
-        assert after[: len(before)] == before, "history is only ever added to"
+        assert after[: len(before)] == before, "the history must only grow"
         assert_told_as_expected(rows, expected, asked, new)
         assert code == (1 if any(result.outcome == "refused" for result in expected) else 0)
         assert command.view("main") == books.view()

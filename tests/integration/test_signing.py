@@ -1,4 +1,4 @@
-"""Commits signed by an SSH key: the real git checks them, and `verify` reports on them."""
+"""The real git accepts commits signed with an SSH key, and `verify` reports on signatures."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def key(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def book(demandops: Run, state: Any) -> Run:
-    """Return a function that books a connection by ``demandops request``."""
+    """Return a function that books a connection with ``demandops request``."""
     import yaml
 
     def call(id: str, *more: str | Path) -> Any:
@@ -54,7 +54,7 @@ def book(demandops: Run, state: Any) -> Run:
 
 @pytest.fixture
 def agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An ssh-agent for the test, which has no keys yet."""
+    """An ssh-agent without keys, for one test."""
     said = subprocess.run(
         ["ssh-agent", "-a", str(tmp_path / "agent")], check=True, capture_output=True, text=True
     ).stdout
@@ -94,7 +94,9 @@ def test_an_rsa_key(book: Run, state: Any, tmp_path: Path) -> None:
     assert git_says(state, listed(key), tmp_path).returncode == 0
 
 
-def test_a_key_that_an_agent_holds(book: Run, state: Any, agent: None, tmp_path: Path) -> None:
+def test_the_ssh_agent_can_sign_with_a_key_that_has_no_file(
+    book: Run, state: Any, agent: None, tmp_path: Path
+) -> None:
     key = keygen(tmp_path / "key")
     subprocess.run(["ssh-add", "-q", str(key)], check=True)
     key.unlink()
@@ -157,7 +159,7 @@ def test_a_generator_without_a_key_warns_once_where_keys_are_listed(
 
 
 class TestProposals:
-    """Demands that wait for approval: the generator signs the commits of their branches."""
+    """The generator also signs the commits on the branches of demands that wait for approval."""
 
     @pytest.fixture(autouse=True)
     def _strict(self, state: Any) -> None:
@@ -200,7 +202,7 @@ def test_what_people_changed_is_carried_out_by_a_signed_commit(
 
 
 class TestKeysThatCannotSign:
-    """A key that cannot sign is reported at the start, before anything is booked."""
+    """The start reports a key that cannot sign, before anything is booked."""
 
     def told(self, book: Run, state: Any, key: Path | str) -> str:
         before = state.tip
@@ -344,7 +346,7 @@ class TestVerify:
     def test_keys_may_change(
         self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path
     ) -> None:
-        """Each commit is checked with the list of keys in effect before it."""
+        """For each commit, `verify` uses the list of keys that was in effect before it."""
         new = keygen(tmp_path / "new")
         since = state.tip
         state.commit({SIGNERS: listed(key)})

@@ -42,7 +42,8 @@ NEWER = (
 )
 
 
-# Runs the command line and standard input of each line of its input, all in one process.
+# This program runs a command for each line of its input, all in one process. A line has the
+# arguments and the standard input of the command.
 SERVE = """
 import io, json, os, sys
 from contextlib import redirect_stderr, redirect_stdout

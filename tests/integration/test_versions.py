@@ -1,6 +1,7 @@
-"""Demands that ask for a version, by the command line.
+"""Demands that ask for a version, on the command line.
 
-Tested are the output of commands, approval of an update, and a channel that names a new version.
+The tests look at the output of commands, at the approval of an update, and at a channel that gets a
+new version.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ Send = Callable[..., Ran]
 
 
 def listed(**channels: str) -> str:
-    """Return a ``registry/versions.yaml`` with these channels, which pins the detection's image."""
+    """Return a ``registry/versions.yaml`` with these channels; it pins the detection's image."""
     versions = {
         v: {"images": {"object-detection": {"tag": v}}} for v in ("1.0.0", "1.1.0", "2.0.0")
     }
@@ -56,7 +57,7 @@ def tag(state: GitRepo) -> str:
     return str(release["spec"]["values"]["image"]["tag"])
 
 
-def test_the_views_show_what_runs_and_what_is_asked_for(
+def test_the_views_show_the_running_and_the_demanded_version(
     send: Send, demandops: Run, state: GitRepo
 ) -> None:
     send("first")
@@ -91,7 +92,7 @@ def test_an_upgrade_waits_for_a_person_and_its_end_does_not(
     assert tag(state) == "1.0.0"
     (branch,) = branches(state.path)
     person.merge(branch)
-    assert " booked in " in send("third", "2.0.0").out, "what runs asks nobody"
+    assert " booked in " in send("third", "2.0.0").out, "a version that runs must need no approval"
     assert tag(state) == "2.0.0"
     assert send("second", operation="release").code == 0
     assert tag(state) == "2.0.0"

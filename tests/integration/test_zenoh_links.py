@@ -1,8 +1,8 @@
-"""The real Zenoh reads the bridges' configuration, and the nodes connect.
+"""The real Zenoh reads the rendered configuration of the bridges, and the nodes connect.
 
 Zenoh's library stands in for the bridges. It reads the same configuration and refuses unknown
-fields, except in the plugin's part, because the plugin is missing. Only our schema checks that
-part.
+fields, except in the part for the bridges' plugin, which the library lacks. Only our schema checks
+that part.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.kit.golden import rendered
 
 DEADLINE_S = 30.0
 STEP = "2-station00-joins"
-"""The step of the golden case `zenoh`; in it the edge and the station have an endpoint."""
+"""A step of the golden case `zenoh` in which the edge and the station have an endpoint."""
 
 
 def free_port() -> int:
@@ -54,7 +54,7 @@ def configurations() -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def sessions(configurations: dict[str, str]) -> Iterator[dict[str, Any]]:
-    """Open a Zenoh session with each node's configuration, without the plugin's part."""
+    """Open a Zenoh session for each node with its configuration, except the plugin's part."""
     opened = {}
     for node, text in configurations.items():
         whole = json.loads(text)

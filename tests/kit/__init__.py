@@ -1,1 +1,1 @@
-"""What all tests share: goals, configuration, repos, the command line, generators, HTTP, ROS."""
+"""The tools of all tests: goals, configuration, repos, the command line, generators, HTTP, ROS."""

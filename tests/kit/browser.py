@@ -65,7 +65,7 @@ class Visit:
         return self.page
 
     def longest_task_ms(self) -> float:
-        """Return the longest task of the browser's main thread since the page was opened, in ms."""
+        """Return the longest task of the main thread since the page was opened, in milliseconds."""
         self.page.wait_for_timeout(150)  # the observer reports tasks a moment later
         return float(self.page.evaluate("Math.max(0, ...window.longTasks)"))
 

@@ -1,6 +1,6 @@
 """Settings of Hypothesis: the same examples every time, so that no build fails by chance.
 
-``DEMANDOPS_EXAMPLES=20`` tries twenty times as many, and different ones each time.
+``DEMANDOPS_EXAMPLES=20`` tries twenty times as many examples, and different ones each time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ visible = st.characters(exclude_categories=["C", "Z"], include_characters=" ")
 
 
 def examples(count: int) -> Callable[[Any], Any]:
-    """Return a decorator that tries ``count`` × ``DEMANDOPS_EXAMPLES`` examples."""
+    """Return a decorator with which a test tries ``count`` × ``DEMANDOPS_EXAMPLES`` examples."""
     return settings(
         max_examples=count * TIMES,
         derandomize=TIMES == 1,
@@ -40,7 +40,7 @@ def examples(count: int) -> Callable[[Any], Any]:
 
 
 def told(requests: list[Goal]) -> list[Goal]:
-    """Return ``requests`` unchanged; Hypothesis prints their summaries if the test fails."""
+    """Return the requests unchanged; if the test fails, Hypothesis prints their summaries."""
     for request in requests:
         note(json.dumps(summary(request)))
     return requests

@@ -12,14 +12,14 @@ import pytest
 
 
 class Ran(NamedTuple):
-    """The result of a command."""
+    """What a command returned and printed."""
 
     code: int
     out: str
     err: str
 
     def json(self) -> Any:
-        """Return standard output as JSON; it must hold nothing else."""
+        """Return the standard output, which must be one JSON document."""
         return json.loads(self.out)
 
 

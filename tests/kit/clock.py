@@ -1,4 +1,4 @@
-"""The clock that tests move instead of waiting."""
+"""A clock that tests move instead of waiting."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Clock(Runtime):
         return high if self._start else super().uniform(low, high)
 
     def condition(self) -> threading.Condition:
-        """Return a condition whose waits soon end, so that a moved clock is noticed."""
+        """Return a condition whose waits soon end, so that its users notice a moved clock."""
         return _Impatient()
 
     @property
@@ -45,7 +45,7 @@ class Clock(Runtime):
         self._passed += seconds
 
     def set_by(self, seconds: float) -> None:
-        """Set the wall clock but not the monotonic clock, as a person does."""
+        """Set the wall clock and not the monotonic clock, as a person does."""
         self._set += seconds
 
 

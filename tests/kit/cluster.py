@@ -7,9 +7,9 @@ from typing import Any
 
 
 class Letters:
-    """A stand-in for the Git history; its commits are named by letters, in alphabetical order.
+    """A stand-in for the Git history; the names of its commits are letters in alphabetical order.
 
-    ``changing`` lists the changes that commits make, each as (commit, path).
+    ``changing`` lists what the commits change, as pairs of commit and path.
     """
 
     def __init__(self, changing: Iterable[tuple[str, str]] = ()) -> None:

@@ -13,7 +13,6 @@ from demandops.staterepo.skeleton import files
 
 @lru_cache
 def skeleton(gitops: str = "flux") -> Mapping[str, str]:
-    """Return every file of a new state repo."""
     return files(gitops)
 
 
@@ -27,21 +26,20 @@ def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, 
 
 
 def edited(path: str, old: str, new: str) -> dict[str, str]:
-    """Return ``{path: text}`` of a skeleton file in which ``new`` replaces the first ``old``."""
+    """Return path and text of a skeleton file in which ``new`` replaces the first ``old``."""
     text = skeleton()[path]
     assert old in text, f"{path} does not contain {old!r}"
     return {path: text.replace(old, new, 1)}
 
 
 def brokers(*nodes: str) -> dict[str, str]:
-    """Return ``{path: text}`` of ``inventory/brokers.yaml`` with a broker on each of ``nodes``."""
+    """Return the path and the text of an ``inventory/brokers.yaml`` with a broker on each node."""
     entries = [{"node": node, "host": f"broker-{node}"} for node in nodes]
     head = {"apiVersion": "demandops/v1", "kind": "Brokers"}
     return {"inventory/brokers.yaml": yaml.safe_dump(head | {"brokers": entries})}
 
 
 def override(*select: Mapping[str, Any], **fields: Any) -> str:
-    """Return the text of an override."""
     head = {"apiVersion": "demandops/v1", "kind": "Override"}
     why = {"reason": "a field test", "owner": "petra"}
     return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)

@@ -1,4 +1,4 @@
-"""Short-form demands for connections, and states whose nodes can carry the connections."""
+"""Demands for connections in a short form, and states whose nodes can carry the connections."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any
 
 
 def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ``Demand`` document for a short-form demand of connections.
+    """Return the ``Demand`` document for a demand of connections in short form.
 
-    A short-form connection has its ``topics`` as the ledger writes them and its ``type`` by name.
+    A connection in short form has ``topics`` as the ledger writes them, and its ``type`` by name.
     It may list ``requesters``. The whole demand gets the requesters of the first connection.
     """
     connections = []
@@ -80,5 +80,5 @@ def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decided(before: State, demand: Mapping[str, Any]) -> State:
-    """Return the state after a demand in short form; raises :class:`Refused`."""
+    """Return the state after a demand in short form; raise :class:`Refused` if it is refused."""
     return MemoryRepo(state=before).decide(routes(demand)).state

@@ -19,12 +19,12 @@ SOURCES = {
 
 
 def demand(**fields: Any) -> dict[str, Any]:
-    """Return the demand template of a rule; it names the entities of the event."""
+    """Return a demand template for a rule; it names the entities of the event."""
     return {"demand": "{rule}/{entity}", "requesters": ["{entity}"]} | fields
 
 
 def rule(name: str, **fields: Any) -> dict[str, Any]:
-    """Return a rule; it gets a default ``demand`` unless it has a ``deploymentRequest``."""
+    """Return a rule; it has a default ``demand`` unless it has a ``deploymentRequest``."""
     subjects = ["{rule}"]
     subjects += [] if {"count", "schedule"} & set(fields) else ["{entity}"]
     subjects += ["{other}"] if "together" in fields else []
@@ -33,7 +33,6 @@ def rule(name: str, **fields: Any) -> dict[str, Any]:
 
 
 def text_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> str:
-    """Return the text of a rule file."""
     head = {"apiVersion": "demandops/v1", "kind": "DetectorRules"}
     return strict_yaml.dump({**head, "sources": sources, "rules": [*rules]})
 
@@ -47,7 +46,7 @@ def at(time: float, entity: str, x: float, y: float = 0.0, source: str = "cars")
 
 
 class Run:
-    """An event engine and its current state."""
+    """An event engine and its newest state."""
 
     def __init__(self, *rules: dict[str, Any], now: float = 0.0) -> None:
         self.engine = EventEngine(file_of(*rules))

@@ -1,4 +1,4 @@
-"""A command on a terminal of its own, and a person who reads and types there."""
+"""A command on a terminal of its own, and the person who reads and types there."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SILENCE_S = 5.0
 
 
 class Dialogue:
-    """``demandops`` with its input, output and errors on a pseudoterminal."""
+    """``demandops`` on a pseudoterminal, which has its input, output and errors."""
 
     def __init__(self, *args: str | Path, folder: Path | None = None, **environment: str) -> None:
         self.text, self._typed = "", b""
@@ -38,21 +38,20 @@ class Dialogue:
         os.close(self._master)
 
     def read_until(self, wanted: str) -> None:
-        """Read output until it contains ``wanted``; fail if it does not in time."""
+        """Read output until it contains ``wanted``; fail after ``PATIENCE_S``."""
         end = time.monotonic() + PATIENCE_S
         while wanted not in self.text:
             assert self._read(end - time.monotonic()), f"no {wanted!r} in:\n{self.text}"
 
     def type(self, text: str) -> None:
-        """Type on the terminal."""
         self._typed = text.encode()
         os.write(self._master, self._typed)
 
     def end(self) -> int:
         """Read until the command ends; return its exit code.
 
-        After some seconds of silence, the last typed text is typed again, as people do: Python can
-        miss a signal that arrives just before it begins to read.
+        After some seconds of silence, this types the last text again, as people do: Python can miss
+        a signal that arrives just before it begins to read.
         """
         end = time.monotonic() + PATIENCE_S
         while self._read(_SILENCE_S) or self._runs_silently():

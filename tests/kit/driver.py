@@ -1,11 +1,10 @@
-"""A program that runs generators for tests to kill; each run reports its events as lines of JSON.
+"""A program that runs generators for tests to kill; each run prints its events as lines of JSON.
 
 The program imports the modules once and forks for every run. It reads each run from standard input,
 as one line of JSON. A run has lanes of demands. Each lane is a client that waits for an answer
-before it sends its next demand. A run may have an opening demand: the lanes start when the worker
-has admitted it and is busy with it, so that their first demands become one batch. ``die_at``
-(``<point>`` or ``<point>:<n>``) ends the process with SIGKILL when it reaches the point for the
-n-th time.
+before it sends its next demand. If a run has an opening demand, the lanes start while the worker is
+busy with it, so that their first demands become one batch. ``die_at`` (``<point>`` or
+``<point>:<n>``) ends the process with SIGKILL when it reaches the point for the n-th time.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ def die() -> None:
 
 
 class _At:
-    """A callable that kills this process when it is called for the n-th time."""
+    """A callable that does its last act and kills this process when it is called the n-th time."""
 
     def __init__(self, times: int, last_act: Callable[[], object]) -> None:
         self._left, self._last_act = times, last_act
@@ -84,7 +83,8 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""For each point: whether it follows (true) or precedes (false) its calls, and these calls."""
+"""For each point: whether the kill comes after (true) or before (false) its calls, and the calls.
+"""
 
 
 def arm(where: str, address: str) -> None:
@@ -100,14 +100,14 @@ def arm(where: str, address: str) -> None:
 
 
 class Lanes:
-    """Clients that each send a demand when the one before it is answered.
+    """Clients; each sends its next demand when its last one is answered.
 
     A demand marked ``withdraw`` is withdrawn as soon as a demand of any lane is admitted.
     """
 
     @staticmethod
     def withdrawn() -> None:
-        """Do nothing; :func:`arm` replaces this method to kill the process after a withdrawal."""
+        """Do nothing; for a kill after a withdrawal, :func:`arm` replaces this method."""
 
     def __init__(self, generator: Generator, lanes: list[list[Demand]]) -> None:
         self._generator = generator
@@ -120,7 +120,7 @@ class Lanes:
             self.ended.set()
 
     def start(self) -> None:
-        """Send the first demand of each lane; return when all of them are journaled."""
+        """Send the first demand of each lane; return when all of these are in the journal."""
         wait([ticket.journaled for lane in self._lanes if (ticket := self._next(lane, 0))])
 
     def _next(self, lane: list[Demand], index: int) -> Ticket | None:

@@ -1,4 +1,4 @@
-"""A generator in this process, and listeners to its demands."""
+"""A generator in this process, and listeners that follow its demands."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from demandops.service import Generator, Receipt, Ticket
 from tests.kit.goals import Goal
 
 PATIENCE_S = 60.0
-"""How long a test waits for an answer, in seconds."""
+"""How many seconds a test waits for an answer."""
 
 
 @contextmanager
 def running(address: str | Path, **options: Any) -> Iterator[Generator]:
-    """Run a generator for the length of a block."""
     generator = Generator(str(address), **options)
     try:
         yield generator
@@ -29,7 +28,7 @@ def running(address: str | Path, **options: Any) -> Iterator[Generator]:
 
 
 def restart(address: str | Path) -> bool:
-    """Start and close a generator; return whether it published all that journals still held."""
+    """Start and close a generator; return whether it published all demands of its journals."""
     return Generator(str(address)).close(timeout=PATIENCE_S)
 
 
@@ -38,12 +37,12 @@ def receipt(ticket: Ticket, timeout: float = PATIENCE_S) -> Receipt:
 
 
 def book(generator: Generator, *goals: Goal) -> list[Receipt]:
-    """Book demands one after another; return their receipts."""
+    """Book demands one after the other; return their receipts."""
     return [receipt(generator.submit(made)) for made in goals]
 
 
 class Gate:
-    """A listener that blocks the worker at a stage of a demand until ``open`` is set."""
+    """A listener that stops the worker at a stage of a demand until a test sets ``open``."""
 
     def __init__(self, stage: str = "admitted") -> None:
         self._stage = stage
@@ -58,7 +57,7 @@ class Gate:
 
 @dataclass
 class Stages:
-    """A listener that records stages and texts."""
+    """A listener that records the stages of a demand and their texts."""
 
     told: list[tuple[str, str]] = field(default_factory=list)
 
@@ -78,7 +77,7 @@ def wait_until(true: Callable[[], object], what: str, timeout: float = PATIENCE_
 
 
 class Proposed:
-    """A submitted demand that needs approval, and its branch."""
+    """A submitted demand that needs approval, with its branch."""
 
     def __init__(self, generator: Generator, made: Any, operation: str | None = None) -> None:
         stages = Stages()

@@ -1,4 +1,4 @@
-"""The Git server of ``tests.e2e.rig`` in the test's own process, with faults to switch on."""
+"""The Git server of ``tests.e2e.rig`` in the test's own process, with faults that a test sets."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ _LOCK = threading.Lock()
 
 @dataclass
 class Faults:
-    """The faults of a server; a test changes them at any time."""
+    """The faults of a server; a test may change them at any time."""
 
     away: bool = False
-    """Whether every request is answered with 503."""
+    """Whether the server answers every request with 503."""
     no_pushes: int = 0
-    """How many of the next pushes to refuse with ``status``."""
+    """How many of the next pushes the server refuses with ``status``."""
     status: int = 503
     cut_answers: int = 0
-    """How many of the next pushes to carry out without an answer."""
+    """How many of the next pushes the server carries out without an answer."""
     away_after_cut: bool = False
     """Whether a push without an answer also sets ``away``."""
     hang: threading.Event | None = None
-    """If set, each request first waits for this event."""
+    """If set, each request waits for this event before anything else."""
     cuts: Callable[[], bool] = lambda: False
-    """Called before each request is carried out and before its answer; true cuts the connection."""
+    """Called before a request is carried out and before its answer; true cuts the connection."""
 
 
 @dataclass
@@ -41,9 +41,9 @@ class Server:
     url: str
     faults: Faults = field(default_factory=Faults)
     taken: int = 0
-    """How many pushes were carried out, even if their answers were cut off."""
+    """How many pushes the server carried out, with or without an answer."""
     refused: int = 0
-    """How many requests were answered with an error because of a fault."""
+    """How many requests a fault made the server answer with an error."""
     cut: int = 0
     """How many connections ``Faults.cuts`` has cut."""
 
@@ -65,7 +65,7 @@ class _Handler(githttp.Handler):
     ordered: tuple[Server, str]
 
     def log_message(self, format: str, *args: object) -> None:
-        """Log nothing."""
+        """Print no request."""
 
     def serve(self) -> None:
         self.close_connection = True
@@ -90,7 +90,7 @@ class _Handler(githttp.Handler):
         to_client, self.wfile = self.wfile, io.BytesIO()
         self.run_backend(path, query)
         answer, self.wfile = self.wfile.getvalue(), to_client
-        # before a push, git asks whether it may by sending only a flush ("0000")
+        # before a push, git sends only a flush ("0000") to ask whether it may push
         if push and len(self._received) > 4:
             with _LOCK:
                 server.taken += 1

@@ -12,7 +12,7 @@ Goal = dict[str, Any]
 Item = dict[str, Any]
 
 Topic = tuple[str, str]
-"""A topic's name and the node that publishes the topic."""
+"""The name of a topic, and the node that publishes it."""
 
 APP = "edge/object_detection_fusion"
 CLOUD: Topic = ("/vehicles/vehicle00/drivers/lidar/pointcloud", "vehicle00")
@@ -39,7 +39,7 @@ def application(
     clouds: Iterable[Topic] = (CLOUD,),
     type: int = 1,
 ) -> Item:
-    """Return one application of a goal."""
+    """Return an application for a goal of the reference's action."""
     return {
         "header": {"id": id, "node_id": node},
         "type": type,
@@ -52,7 +52,7 @@ def application(
 
 
 def input_topic(topic: Topic) -> dict[str, str]:
-    """Return one topic of an application."""
+    """Return a topic as an application of the reference's action lists it."""
     return {"topic_name": topic[0], "source_node_id": topic[1]}
 
 
@@ -66,7 +66,7 @@ def connection(
     broker: str = "edge",
     type: int = 1,
 ) -> Item:
-    """Return one connection of a goal; target topics equal source topics unless given."""
+    """Return a connection for a goal; by default, the target topics equal the source topics."""
     return {
         "id": id,
         "broker_node_id": broker,
@@ -86,7 +86,6 @@ def goal(
     id: str = "request",
     shutdown: bool = False,
 ) -> Goal:
-    """Return a goal of the reference's action."""
     return {
         "id": id,
         "apps": list(apps),
@@ -96,15 +95,15 @@ def goal(
 
 
 def perception(**changed: Any) -> Goal:
-    """Return a goal that is always accepted: perception on the edge, and its point cloud."""
+    """Return a goal that is accepted: perception on the edge, with its point cloud's connection."""
     return goal([application()], [connection()]) | changed
 
 
 def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None) -> Goal:
     """Return demand ``number``.
 
-    Its requester ``user<number>`` belongs to this demand alone. Its application and its connection
-    are shared with other demands.
+    Its requester ``user<number>`` belongs to this demand alone. It shares its application and its
+    connection with other demands.
     """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
     who = [f"user{number}", "station00"]
@@ -115,19 +114,18 @@ def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None)
 
 
 def leave(number: int) -> Goal:
-    """Return the shutdown of demand ``number``."""
     return numbered(number, shutdown=True)
 
 
 def impossible() -> Goal:
-    """Return a demand that is always refused."""
+    """Return a demand that is always refused, because its node does not exist."""
     made = numbered(0)
     made["apps"][0]["header"]["node_id"] = "nowhere"
     return made
 
 
 def link(number: int, **more: Any) -> Goal:
-    """Return a goal of one connection; its ids, requester and topic contain ``number``."""
+    """Return a goal with one connection; its ids, requester and topic contain ``number``."""
     item = connection(f"c{number}", who=[f"r{number}"], topics=[f"/t{number}"], broker="")
     return goal([], [item | more], id=f"request{number}")
 

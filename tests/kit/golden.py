@@ -1,9 +1,9 @@
-"""The golden cases: requests played in memory on a state repo, and what they must render.
+"""The golden cases: requests played in memory on a state repo, and the files that they must render.
 
-``tests/golden/<case>/requests/*.yaml`` are played in order. ``expected/<step>/`` holds the files
-that a step writes, as real files that a reviewer and `kubectl` can read. The file ``DELETED`` in it
-lists the paths that the step deletes. The first step, ``0-start``, is what `init` renders. The
-files in a case's ``state-repo/`` replace or extend the skeleton's files.
+The requests are ``tests/golden/<case>/requests/*.yaml``, in order. ``expected/<step>/`` has the
+files that a step writes, as real files that a reviewer and `kubectl` can read. The file ``DELETED``
+in it lists the paths that the step deletes. The first step, ``0-start``, is what `init` renders.
+The files in a case's ``state-repo/`` replace or extend the skeleton's files.
 
 The case ``experiment`` stores its whole start. Every other case stores how its start differs from
 the start of ``experiment``. A later step stores how it differs from the step before. A case in
@@ -57,7 +57,7 @@ def requests_of(case: str) -> list[Path]:
 
 
 def start(case: str) -> tuple[State, dict[str, str]]:
-    """Return the state before the first request, and the generated files."""
+    """Return the state before the first request, and the files generated from it."""
     overlay = GOLDEN / case / "state-repo"
     files = {p.relative_to(overlay).as_posix(): p.read_text() for p in overlay.rglob("*.yaml")}
     state = MemoryRepo(files).state
@@ -95,7 +95,7 @@ def read(case: str) -> dict[str, dict[str, str]]:
 
 @lru_cache
 def whole(case: str) -> Mapping[str, Files]:
-    """Return all expected files after each step, from the stored changes."""
+    """Return all expected files after each step; they follow from the stored changes."""
     stored = read(case)
     steps: dict[str, Files] = {}
     files: dict[str, str] = {}
@@ -106,7 +106,7 @@ def whole(case: str) -> Mapping[str, Files]:
 
 
 def to_store(case: str) -> dict[str, dict[str, str]]:
-    """Return the files that ``expected/`` must hold, by step; a step without change is left out."""
+    """Return the files that ``expected/`` must have, by step; leave out a step without a change."""
     steps: dict[str, dict[str, str]] = {}
     before: Files = {}
     for step, files in rendered(case).items():
@@ -119,7 +119,7 @@ def to_store(case: str) -> dict[str, dict[str, str]]:
 def _base(
     case: str, step: str, before: Files, steps_of: Callable[[str], Mapping[str, Files]]
 ) -> dict[str, str]:
-    """Return the files to which the stored change of a step is applied."""
+    """Return the files that a step's stored change starts from."""
     if case == EXPERIMENT or (step != START and case not in FOLLOWING):
         return dict(before)
     steps: dict[str, Files] = {"": {}, **steps_of(EXPERIMENT)}

@@ -1,4 +1,4 @@
-"""HTML pages as lists of elements, so that tests can check what a person reads."""
+"""HTML pages as lists of elements, in which tests look for what a person reads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _APART = {"td", "th", "p", "li", "dt", "dd", "h1", "h2", "h3", "summary"}
 
 @dataclass
 class Element:
-    """An element: its attributes, its text with its descendants' text, its ancestors' tags."""
+    """An element: its attributes, the text in it at any depth, and its ancestors' tags."""
 
     tag: str
     attributes: dict[str, str]
@@ -20,7 +20,7 @@ class Element:
 
 
 class Page(HTMLParser):
-    """All elements of a page, in order; fails if they are not nested properly."""
+    """All elements of a page, in order; badly nested elements are an error."""
 
     def __init__(self, text: str) -> None:
         super().__init__(convert_charrefs=True)
@@ -57,15 +57,15 @@ class Page(HTMLParser):
         return [element for element in self.elements if element.tag == tag]
 
     def texts(self, tag: str) -> list[str]:
-        """Return the text of each element with this tag; white space becomes single spaces."""
+        """Return the text of each element with this tag, with single spaces for white space."""
         return [" ".join(element.text.split()) for element in self.all(tag)]
 
     @property
     def text(self) -> str:
-        """The text of the ``main`` element; white space becomes single spaces."""
+        """The text of the ``main`` element, with single spaces for white space."""
         (main,) = self.texts("main")
         return main
 
     def link(self, text: str) -> str:
-        """Return where the first link with this text leads."""
+        """Return the address of the first link with this text."""
         return next(e.attributes["href"] for e in self.all("a") if e.text.strip() == text)

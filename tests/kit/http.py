@@ -28,7 +28,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a server answers."""
+    """An HTTP answer of a server."""
 
     status: int = 200
     body: bytes = b""
@@ -43,7 +43,7 @@ class Answer:
 
 @dataclass
 class Server:
-    """A running server: its URL, the calls so far, and how it answers the next ones."""
+    """A running server: its URL, the calls so far, and the function that answers further calls."""
 
     answer: Callable[[Call], Answer] = lambda call: Answer()
     url: str = ""
@@ -76,7 +76,7 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
     class Recorder(BaseHTTPRequestHandler):
         def log_message(self, format: str, *args: object) -> None:
-            """Log nothing."""
+            """Print no request."""
 
         def _serve(self) -> None:
             length = int(self.headers.get("Content-Length") or 0)

@@ -1,4 +1,4 @@
-"""An API server with the objects that a test puts into it: to list, to watch and to annotate."""
+"""An API server whose objects a test puts into it; clients list, watch and annotate them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BEAT_S = 0.5
 
 
 class KubeApi:
-    """The objects of one cluster, by the plural name of their kind, namespace and name."""
+    """The objects of one cluster, by plural name of the kind, namespace and name."""
 
     def __init__(self) -> None:
         self.url = ""
@@ -30,7 +30,6 @@ class KubeApi:
         self._log: list[tuple[str, str, Item]] = []
 
     def put(self, plural: str, namespace: str, name: str, status: Item, **more: Any) -> None:
-        """Create or replace an object."""
         with self._changed:
             metadata = {"name": name, "namespace": namespace, "generation": 1}
             metadata |= more.pop("metadata", {})
@@ -60,7 +59,7 @@ class KubeApi:
     def events(self, plural: str, namespace: str, since: int) -> Iterator[Item]:
         """Yield the changes of a kind of objects in a namespace until the server is closed.
 
-        ``since`` is the version after which the changes begin.
+        The changes begin after the version ``since``.
         """
         while not self.closed:
             with self._changed:
@@ -79,28 +78,27 @@ class KubeApi:
         self.put("kustomizations", namespace, domain, status)
 
     def service(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
-        """Report a Helm release as ready, or as failed if there is a ``fault``."""
+        """Report a Helm release as ready, or with a ``fault`` as failed."""
         ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
         ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"
         status = {"observedGeneration": 1, "conditions": [ready]}
         self.put("helmreleases", namespace, name, status)
 
     def deployment(self, namespace: str, name: str, available: int = 1) -> None:
-        """Report how many replicas of a Deployment are available; one is desired."""
+        """Report a Deployment that wants one replica, with this number of available replicas."""
         status = {"observedGeneration": 1, "updatedReplicas": 1, "availableReplicas": available}
         self.put("deployments", namespace, name, status, spec={"replicas": 1})
 
 
 @contextmanager
 def kube_api() -> Iterator[KubeApi]:
-    """Run an API server for the length of a block."""
     api = KubeApi()
 
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"
 
         def log_message(self, format: str, *args: object) -> None:
-            """Log nothing."""
+            """Print no request."""
 
         def do_GET(self) -> None:
             address = urlsplit(self.path)

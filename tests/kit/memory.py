@@ -1,4 +1,4 @@
-"""A state repo in memory: goals are decided on it one after another, without Git."""
+"""A state repo in memory, without Git, on which a test decides one goal after the other."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MemoryRepo:
         state: State | None = None,
         now: datetime = NOW,
     ) -> None:
-        """Start from the skeleton with some files changed, or from a state."""
+        """Start from the skeleton's files with the ``changed`` ones, or from a state."""
         self.now = now
         if state is not None:
             self.state, self._initial = state, rendered_files(state)
@@ -56,22 +56,20 @@ class MemoryRepo:
         self.files = dict(self._initial)
 
     def copy(self) -> MemoryRepo:
-        """Return a second repo with the same content."""
         twin = copy.copy(self)
         twin.files = dict(self.files)
         return twin
 
     @property
     def config(self) -> Config:
-        """The configuration in effect."""
         return self.state.config
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal without changing the repo; raises :class:`Refused`."""
+        """Decide a goal without a change of the repo; raise :class:`Refused` if it is refused."""
         return decide(self.state, goal, now or self.now, self.files.get)
 
     def send(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal and commit the decision; raises :class:`Refused`."""
+        """Decide a goal and commit the decision; raise :class:`Refused` if it is refused."""
         decision = self.decide(goal, now)
         self.state = decision.state
         for path, text in decision.files.items():
@@ -83,7 +81,7 @@ class MemoryRepo:
         return decision
 
     def scale_down(self, now: datetime) -> list[str]:
-        """Remove the replicas whose time to be kept is over, as the generator does.
+        """Remove the replicas that were kept until now, as the generator does.
 
         Return the names of the changed releases.
         """
@@ -97,7 +95,7 @@ class MemoryRepo:
         return names
 
     def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
-        """Decide a goal and commit the decision, or return the refusal."""
+        """Decide a goal and commit the decision; return the decision or the refusal."""
         before = dict(self.files), self.state
         try:
             return self.send(goal, now)
@@ -106,14 +104,14 @@ class MemoryRepo:
             return refusal
 
     def take_all(self, goals: Iterable[Goal]) -> list[str]:
-        """Send goals a minute apart; return the outcome of each in one word."""
+        """Send goals at intervals of a minute; return the outcome of each in one word."""
         return [
             outcome(self.take(goal, self.now + timedelta(minutes=minute)))
             for minute, goal in enumerate(goals)
         ]
 
     def forget_shutdowns(self) -> None:
-        """Remove the recent shutdowns, so that a shutdown that is sent again is a new one."""
+        """Remove the recent shutdowns, so that a repeated shutdown counts as a new one."""
         shutdowns = self.state.ledger.shutdowns
         self.state = replace(
             self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
@@ -122,13 +120,13 @@ class MemoryRepo:
             del self.files[recent_shutdowns.path_of(digest)]
 
     def faults(self, goal: object) -> list[str]:
-        """Return the faults of a goal that must be refused, each as ``field: message``."""
+        """Send a goal that must be refused; return its faults, each as ``field: message``."""
         refusal = self.take(goal)
         assert isinstance(refusal, Refused), f"not refused, but {refusal.outcome}"
         return [f"{fault.field}: {fault.message}" for fault in refusal.faults]
 
     def bookkeeping(self) -> dict[str, Any]:
-        """Return the bookkeeping as plain data; the commit's id in it is empty."""
+        """Return the bookkeeping as plain data; its commit id is empty."""
         return as_data(bookkeeping(self.state), "")
 
     def books(self) -> dict[str, Any]:
@@ -157,7 +155,7 @@ class MemoryRepo:
         }
 
     def objects(self, kind: str) -> dict[str, dict[str, Any]]:
-        """Return the objects of a kind that demands added, by name."""
+        """Return the objects of a kind in :meth:`rendered`, by name."""
         documents = [
             document
             for text in self.rendered().values()
@@ -170,7 +168,7 @@ class MemoryRepo:
 
 
 def rebuilt(claims: Iterable[Claim]) -> Ledger:
-    """Return the ledger that holds ``claims``, added one by one."""
+    """Return a ledger with these claims, added one by one."""
     ledger = Ledger()
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
@@ -188,7 +186,7 @@ def is_booked(path: str) -> bool:
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
-    """Return the ledger that the ledger files among ``files`` describe."""
+    """Return the ledger that the ledger's files among ``files`` describe."""
     booked = {path: text for path, text in files.items() if is_booked(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
@@ -201,12 +199,11 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
 
 
 def outcome(taken: Decision | Refused) -> str:
-    """Return the outcome of a goal in one word."""
     return "refused" if isinstance(taken, Refused) else taken.outcome
 
 
 def books_after(goals: Iterable[Goal]) -> dict[str, Any]:
-    """Return the bookkeeping after ``goals`` are decided one by one."""
+    """Return the bookkeeping after ``goals``, decided one by one."""
     repo = MemoryRepo()
     for goal in goals:
         repo.send(goal)

@@ -1,4 +1,4 @@
-"""Documents with one mistake of form each, and what a JSON schema says about documents."""
+"""Documents with one mistake of form each, and the verdict of a JSON schema on documents."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ _SAME = {str: "text", bool: "a truth", int: "a number", list: "a list", dict: "a
 class Mutation(NamedTuple):
     """A copy of a document with one mistake.
 
-    ``place`` is where the mistake is, ``kind`` says what it is, and ``value`` is what was at
-    ``place`` before. For a misspelt field, ``new_place`` has the new name; otherwise it equals
+    ``place`` is where the mistake is, ``kind`` names the mistake, and ``value`` is the former value
+    at ``place``. For a misspelt field, ``new_place`` has the new name; otherwise it equals
     ``place``.
     """
 
@@ -46,11 +46,14 @@ class Mutation(NamedTuple):
     new_place: Place
 
     def is_at(self, field: str) -> bool:
-        """Return whether a fault's field is the mistake's place, contains it or is inside it."""
+        """Return whether a fault names the mistake's place, a part of it, or a value around it."""
         return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the keys of the place and all texts in its old value; references may use them."""
+        """Return the texts that a fault about a broken reference may quote.
+
+        These are the keys of the mistake's place and all texts in its former value.
+        """
         names = {str(part) for part in self.place}
         values = [self.value]
         while values:
@@ -105,7 +108,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 
 
 def _one(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
-    """Return one mistake, a different one each turn; all if ``DEMANDOPS_EXAMPLES`` is above 1."""
+    """Return one mistake, another one each turn, or all if ``DEMANDOPS_EXAMPLES`` is above 1."""
     kinds = [*mistakes] if TIMES > 1 else [[*mistakes][turn % len(mistakes)]]
     return {kind: mistakes[kind] for kind in kinds}
 
@@ -143,7 +146,7 @@ def path(place: Place) -> str:
 
 
 def _is_around(field: str, place: str) -> bool:
-    """Return whether a fault's field is the place, contains it or is inside it."""
+    """Return whether a fault's field is the place, a part of it, or a value around it."""
     short, long = sorted((field, place), key=len)
     return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
 
@@ -151,12 +154,12 @@ def _is_around(field: str, place: str) -> bool:
 def problem(
     mutation: Mutation, faults: Sequence[Fault], form: Form, *, free: Container[str], file: str = ""
 ) -> str:
-    """Return what is wrong with the faults of a mutation, or an empty string.
+    """Return the problem in the faults of a mutation, or an empty string.
 
-    There must be a fault at the mutation's place if the schema forbids the mutated document, or if
-    a text got a control character. Control characters may be in the ``free`` fields. A fault at
-    another place must concern a reference, so it must quote a name from the mutation's place. No
-    fault at the mutation's place may contain words of Python.
+    A fault must be at the mutation's place if the schema forbids the mutated document, or if a text
+    got a control character; only the ``free`` fields may have control characters. A fault at
+    another place must concern a reference, so it must quote a name from the mutation's place. A
+    fault at the mutation's place must not contain words of Python.
     """
     place = path(mutation.place)
     here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
@@ -176,7 +179,7 @@ def problem(
 
 
 class Form:
-    """What a JSON schema says about documents."""
+    """The verdicts of a JSON schema on documents, and the fields that it describes."""
 
     def __init__(self, schema: Schema) -> None:
         self._schema = schema
@@ -187,11 +190,11 @@ class Form:
         return not self._validator.is_valid(document)
 
     def fields(self) -> set[str]:
-        """Return all fields of all mappings, as ``Node.id``."""
+        """Return all fields of all mappings in the schema, as ``Node.id``."""
         return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
 
     def limits(self) -> list[int]:
-        """Return the whole numbers just below a field's minimum or just above its maximum."""
+        """Return the whole numbers one below a field's minimum or one above its maximum."""
         limits = set()
         for part in self._parts():
             for field in part["properties"].values():
@@ -201,7 +204,7 @@ class Form:
         return sorted(limits)
 
     def free(self) -> set[str]:
-        """Return the fields that may have any value, or a mapping of any keys and values."""
+        """Return the fields that may have any value, or a mapping with any keys."""
         return {
             f"{part['title']}.{name}"
             for part in self._parts()
@@ -216,7 +219,6 @@ class Form:
         return [part for part in parts if "properties" in part]
 
     def fields_in(self, document: Any) -> set[str]:
-        """Return the fields that a document uses, as ``Node.id``."""
         return set(self._used(document, self._schema))
 
     def _used(self, value: Any, schema: Schema) -> Iterator[str]:

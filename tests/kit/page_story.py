@@ -1,4 +1,4 @@
-"""A running fleet for tests of the web page, with healthy services and one that fails."""
+"""A running fleet for tests of the web page; all services are healthy except one."""
 
 from __future__ import annotations
 
@@ -87,9 +87,9 @@ class Story:
         return self.server.url.rstrip("/")
 
     def settle(self, *, mended: bool = False) -> None:
-        """Have the API server report that the cluster has applied the newest commit.
+        """Make the API server report that the cluster has applied the newest commit.
 
-        The release ``FAILING`` is reported as failed unless ``mended`` is true.
+        It reports the release ``FAILING`` as failed unless ``mended`` is true.
         """
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -33,7 +33,7 @@ _COMMAND = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """One block of code, with the comment before it."""
+    """A block of code, and the comment before it."""
 
     line: int
     language: str
@@ -78,8 +78,8 @@ def blocks(markdown: str) -> Iterator[Block]:
 def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
     """Write the files of a page and run its commands.
 
-    Raise an AssertionError if a command prints something else than the page shows. A command whose
-    output the page does not show must succeed.
+    Raise an AssertionError if a command prints something else than the page shows, or if a command
+    fails whose output the page does not show.
     """
     state = folder / ".state"
     state.write_text(f"cd {folder}\n")
@@ -99,7 +99,7 @@ def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
 
 
 def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
-    """Yield each command of a block and the output that the page shows for it, if any."""
+    """Yield each command of a block, with the output that the page shows for it, or None."""
     if block.language != "console":
         yield block.text, None
         return
@@ -111,7 +111,7 @@ def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
 def _ran(
     command: str, state: Path, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command in the folder and with the exported variables of the command before."""
+    """Run a command in the folder and with the exported variables that the command before left."""
     script = (
         f"set -e\n. {state}\n"
         f'trap \'{{ printf "cd %q\\n" "$PWD"; export -p; }} >{state}\' EXIT\n{command}\n'
@@ -128,7 +128,7 @@ def _ran(
 
 
 def _pattern(expected: str) -> re.Pattern[str]:
-    """Return a pattern for the expected output; it accepts any number of spaces between words."""
+    """Return a pattern for the expected output; between words it accepts any number of spaces."""
     lines = []
     for line in expected.splitlines():
         words = [".*?".join(map(re.escape, word.split("…"))) for word in line.split()]

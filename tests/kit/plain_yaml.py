@@ -10,5 +10,4 @@ FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def load(text: str) -> Any:
-    """Return the plain data of a text that holds one YAML document."""
     return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader

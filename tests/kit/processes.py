@@ -24,26 +24,24 @@ _SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
 
 
 def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any]:
-    """Return a demand in the form that the lanes of a run take."""
+    """Return a demand in the form in which :meth:`Drivers.start` takes it."""
     return {"name": name, "goal": made, "operation": operation or f"op-{name}"}
 
 
 @dataclass
 class Told:
-    """The events that a run reported."""
+    """The events of a run, as its process reported them."""
 
     sent: list[str] = field(default_factory=list)
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
     waits: dict[str, float] = field(default_factory=dict)
-    """Seconds from sending each demand to its answer, by the demand's name."""
+    """The seconds from sending a demand to its answer, by the demand's name."""
     first: float = 0.0
+    """When the first demand was sent, by the monotonic clock."""
     last: float = 0.0
-    """``first``: when the first demand was sent; ``last``: when the last event came.
-
-    Both are times of the monotonic clock.
-    """
+    """When the last event came, by the monotonic clock."""
 
 
 class Run:
@@ -56,7 +54,7 @@ class Run:
         self.pid = 0
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Read and return events until the process ends; call ``on_ready`` when it is ready."""
+        """Return the events until the process ends; call ``on_ready`` when it can take demands."""
         sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
@@ -82,7 +80,6 @@ class Run:
         return self._told
 
     def kill(self) -> None:
-        """Send SIGKILL to the process if it runs."""
         if self.pid and not self._ended:
             with suppress(ProcessLookupError):
                 os.kill(self.pid, signal.SIGKILL)
@@ -131,7 +128,7 @@ class Drivers:
         return self._runs[-1]
 
     def kill_runs(self) -> None:
-        """Kill the runs that a failed test left."""
+        """Kill the processes that a failed test did not end."""
         while self._runs:
             self._runs.pop().kill()
 

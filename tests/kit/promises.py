@@ -1,4 +1,4 @@
-"""Random requests with leases, and claims in the form of the model of leases."""
+"""Random requests with leases, and the ledger's claims in the form of the model of leases."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Maker:
         return self._message(shutdown=kind > 17)
 
     def _of_known(self, kind: int) -> Goal:
-        """Return a renewal of a recent put, the put again, or the put with another lease."""
+        """Return a renewal of a recent put, or the put again, with the same or another lease."""
         known = self._random.choice(self._puts[-2:])
         if kind < 3:
             return {key: known[key] for key in ("kind", "demand", "requesters")} | {
@@ -118,13 +118,13 @@ MESSAGES = {
 
 
 def name_of(claim: Claim) -> Name:
-    """Return the name that the model of leases gives to a claim."""
+    """Return the name of a claim in the model of leases."""
     demand = MESSAGES.get(claim.demand, claim.demand)
     return demand, (claim.subject.kind.value, claim.subject.id)
 
 
 def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
-    """Return what each claim holds and for whom, in the form of ``Promises.claims``."""
+    """Return the holds and the requesters of each claim, in the form of ``Promises.claims``."""
     found = {}
     for claim in ledger:
         what: dict[str, Any]

@@ -1,8 +1,8 @@
 """A stand-in for the reference: it turns goals into custom resources and operators' files.
 
-It is our own code, with the reference's names and formats. It was compared with the real operators,
-which ran on a stand-in for their cluster's API: after random goals, all files were equal. It
-repeats the operators' oddities too: see :meth:`Reference._note`.
+The stand-in is our own code, with the reference's names and formats. It was compared with the real
+operators, which ran on a stand-in for their cluster's API: after random goals, all files were
+equal. It also repeats an oddity of the operators: see :meth:`Reference._note`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Reference:
             self._apply(*_of_connection(connection, shutdown))
 
     def _apply(self, name: str, kind: str, spec: Item) -> None:
-        """Create a resource, or merge a patch into it; its operator records any change."""
+        """Create a resource, or merge a patch into it; its kind's operator records any change."""
         known = self.resources.get(name)
         merged = _merged(known["spec"], spec) if known else copy.deepcopy(spec)
         if known and merged == known["spec"]:
@@ -67,7 +67,7 @@ class Reference:
         self._note(name, kind, copy.deepcopy(merged["operator"]), created=known is None)
 
     def _note(self, name: str, kind: str, request: Item, *, created: bool) -> None:
-        """Write the versioning, then the bookkeeping.
+        """Write an operator's versioning file and its bookkeeping file.
 
         The operators have an oddity: for a new connection or detection, the bookkeeping and the
         first request share one list of requesters. So in the versioning file, the first request
@@ -95,7 +95,7 @@ class Reference:
             del self.resources[name], book[name]
 
     def texts(self) -> dict[str, str]:
-        """Return the texts by name: the operators' files, and the custom resources as one file."""
+        """Return the texts by file name: the operators' files, and the custom resources in one."""
         files = {}
         for kind, operator in OPERATORS.items():
             files[f"{operator}_bookkeeping.yml"] = yaml.dump(self.books[kind])
@@ -105,7 +105,7 @@ class Reference:
         return files | {"resources.yaml": yaml.safe_dump(listed)}
 
     def write(self, folder: Path) -> list[Path]:
-        """Write all files into a folder and return them."""
+        """Write all files into a folder; return their paths."""
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in self.texts().items():
             folder.joinpath(name).write_text(text)

@@ -44,11 +44,13 @@ GIT_ENVIRONMENT = NO_GIT_CONFIG | {
 POLICY = "policy/access-domains.yaml"
 
 FORGER = (GENERATOR_NAME, GENERATOR_EMAIL, 1_770_000_000)
-"""Author data of a person who uses the generator's name; only a signature shows the forgery."""
+"""The author of a forged commit: a person with the generator's name.
+
+Only a signature shows that the generator did not make the commit.
+"""
 
 
 def init(path: Path, *, bare: bool = True) -> Path:
-    """Make a state repo, as ``demandops init`` does."""
     new_repo.init(path, NOW, bare=bare, gitops="flux")
     return path
 
@@ -84,15 +86,13 @@ def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:
 
 
 class GitRepo:
-    """A bare state repo of one test, read with pygit2 and not with the program."""
+    """A bare state repo of a test; pygit2 reads it, not the program."""
 
     def __init__(self, path: Path) -> None:
-        """Use the repository in a folder."""
         self.path = path
 
     @property
     def tip(self) -> str:
-        """The id of the newest commit on main."""
         return tip(self.path)
 
     def __fspath__(self) -> str:
@@ -104,12 +104,12 @@ class GitRepo:
         return [commit.message for commit in repo.walk(self.tip)]
 
     def files(self, under: str = "", revision: str = "main") -> dict[str, str]:
-        """Return path → text of the files at a revision whose paths start with ``under``."""
+        """Return the text of each file at a revision whose path starts with ``under``, by path."""
         repo, index = _index(self.path, revision)
         return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
 
     def manifests(self) -> dict[str, str]:
-        """Return path → text of the YAML files that a GitOps controller reads."""
+        """Return the text of each YAML file that a GitOps controller reads, by path."""
         return {p: text for p, text in self.files("clusters/").items() if p.endswith(".yaml")}
 
     def commit(
@@ -133,7 +133,7 @@ class GitRepo:
 
 
 class Person:
-    """A person who changes the state repo at its forge, or in a clone and then pushes."""
+    """A person who changes the state repo at its forge, or in a clone and by a push."""
 
     def __init__(self, remote: Path, folder: Path) -> None:
         self.bare, self.folder = remote, folder
@@ -142,7 +142,7 @@ class Person:
         return git(self.folder, *args)
 
     def fetch(self) -> None:
-        """Fetch the branches into the clone and check out main; clone first if needed."""
+        """Fetch the branches into the clone and check out main; make the clone if there is none."""
         if not self.folder.exists():
             git(self.folder.parent, "clone", "--quiet", str(self.bare), str(self.folder))
             return
@@ -159,7 +159,7 @@ class Person:
         message: str = "A person's change",
         who: tuple[str, str, int] | None = None,
     ) -> str:
-        """Commit ``files`` (``None``: remove) on the newest main; return the commit."""
+        """Commit ``files`` on top of main (``None`` removes a file); return the commit's id."""
         who = who or ("Petra Platform", "petra@example.org", int(time.time()))
         for _ in range(100):
             with suppress(pygit2.GitError):  # a generator published first: try again
@@ -167,7 +167,7 @@ class Person:
         raise AssertionError("main never stood still")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Commit ``files`` in the clone, push, return the commit; fails if another push came."""
+        """Commit ``files`` in the clone and push; return the commit. Fail if another push came."""
         self.fetch()
         for path, text in files.items():
             target = self.folder / path
@@ -182,17 +182,17 @@ class Person:
         return self._git("rev-parse", "HEAD")
 
     def edit(self, path: str, old: str, new: str) -> str:
-        """Replace text in a file; return the commit."""
+        """Replace a text in a file; return the commit's id."""
         text = self.read(path)
         assert old in text, f"{path} does not hold {old!r}"
         return self.change({path: text.replace(old, new)})
 
     def override(self, **named: str | None) -> str:
-        """Commit ``overrides/<name>.yaml`` files; ``None`` removes one. Return the commit."""
+        """Commit ``overrides/<name>.yaml`` files; ``None`` removes one. Return the commit's id."""
         return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
 
     def policy(self, **changed: Any) -> None:
-        """Set the ``changed`` fields of every access domain."""
+        """Set fields of every access domain in the policy."""
         data = plain_yaml.load(self.read(POLICY))
         for domain in data["domains"]:
             domain.update(changed)
@@ -225,8 +225,6 @@ class Person:
 
 @dataclass(frozen=True)
 class Commit:
-    """A commit, as ``git log`` shows it."""
-
     id: str
     parents: tuple[str, ...]
     summary: str
@@ -243,7 +241,7 @@ _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
 
 
 def commits(repo: Path, revisions: str = "main") -> list[Commit]:
-    """Return the commits of ``revisions`` except the repository's first one, oldest first."""
+    """Return the commits of ``revisions``, oldest first, without the repository's first commit."""
     text = git(repo, "log", "--reverse", f"--format={_FORMAT}", revisions)
     found = []
     for record in text.split("\x1d"):
@@ -256,7 +254,7 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
 
 
 def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
-    """Install a script as a repository's hook; return its file."""
+    """Install a script as a hook of a repository; return its path."""
     path = Path(os.fspath(repo), "hooks", name)
     path.parent.mkdir(exist_ok=True)
     path.write_text(f"#!/bin/sh\n{script}\n")
@@ -266,7 +264,7 @@ def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
 
 @contextmanager
 def away(repo: Path) -> Iterator[None]:
-    """Move a repository's folder away for the length of a block."""
+    """Rename a repository's folder for the length of a block, so that nobody finds it."""
     elsewhere = repo.rename(repo.with_name("away.git"))
     try:
         yield
@@ -275,7 +273,6 @@ def away(repo: Path) -> Iterator[None]:
 
 
 def tip(repo: Path | str) -> str:
-    """Return the id of the newest commit of main."""
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
 
 
@@ -285,14 +282,14 @@ def read(repo: Path, path: str) -> str:
 
 
 def without_vehicle01(repo: Path) -> dict[str, str | None]:
-    """Return ``{path: text}`` of the node inventory without vehicle01, which demand 1 needs."""
+    """Return path and text of the nodes' inventory without vehicle01, which demand 1 needs."""
     path = "inventory/nodes.yaml"
     before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
     return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
 
 
 def operations(repo: Path) -> list[str]:
-    """Return the operation ids of all demands' commits, oldest first."""
+    """Return the operation id of each demand's commit, oldest first."""
     return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
 
 
@@ -307,13 +304,13 @@ def books(repo: Path, revision: str = "main") -> dict[str, Any]:
 
 
 def claims(repo: Path, needle: str = "") -> list[str]:
-    """Return the paths of claim files whose text contains ``needle``."""
+    """Return the paths of the claim files whose text contains ``needle``."""
     files = GitRepo(repo).files("ledger/")
     return [path for path, text in files.items() if "Claim\n" in text and needle in text]
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the commits that `demandops verify` rejects: summary → differing files.
+    """Return the differing files of the commits that `demandops verify` rejects, by summary.
 
     Only commits after ``since`` are verified, by default all after the first one.
     """
@@ -324,20 +321,16 @@ def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]
 
 
 def root(repo: Path) -> str:
-    """Return the id of the first commit."""
     *_, first = pygit2.Repository(str(repo)).walk(tip(repo))
     return str(first.id)
 
 
 def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
-    """Check objects, history and commits of a state repo.
+    """Check the objects, the history and the commits of a state repo.
 
-    The objects are whole, the history is linear, no operation is committed twice, and the commits
-    pass `demandops verify`.
-
-    Args:
-        verify_last: how many of the newest commits to verify, as each takes a tenth of a second;
-            0: all.
+    Nothing may be missing or damaged, the history must be linear, no operation may be committed
+    twice, and the commits must pass `demandops verify`. This verifies only the newest
+    ``verify_last`` commits, because each takes a tenth of a second; 0 means all.
     """
     fsck = subprocess.run(
         ["git", "-C", str(repo), "fsck", "--strict", "--no-dangling", "--no-progress"],
@@ -357,8 +350,8 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
 FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
 """The bundle of a state repo from the first version: render version 1, ``demandops.ledger/v1``.
 
-It holds three joins of the experiment (tag ``three-joins``), two overrides, of which one ended, a
-join by another request, a demand with a lease, and a shutdown.
+The repo has three joins of the experiment (tag ``three-joins``), two overrides, of which one ended,
+a join by another request, a demand with a lease, and a shutdown.
 """
 
 

@@ -324,7 +324,7 @@ def rich() -> dict[str, str]:
 
 
 def rich_with_api() -> dict[str, str]:
-    """Return the files of :func:`rich`, for Argo CD, with ``proposals.api``, not ``labels``."""
+    """Return the files of :func:`rich` for Argo CD, with ``proposals.api``, without ``labels``."""
     return rich() | {"demandops.yaml": _PROPOSALS_BY_API}
 
 

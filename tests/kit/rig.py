@@ -1,4 +1,4 @@
-"""What tests of generators on real state repos import, gathered in one module."""
+"""All that tests of generators on real state repos import, gathered in one module."""
 # ruff: noqa: F401
 
 from tests.kit.generator import (

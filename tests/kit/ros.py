@@ -44,7 +44,7 @@ STATUS = {
 }
 
 _LAST = 100
-"""The highest domain to use: Linux gives the ports of higher ones to any socket."""
+"""The highest ROS domain to use; Linux gives the ports of higher ones to any socket."""
 
 
 @contextmanager
@@ -87,7 +87,7 @@ class Served:
     domain: int
 
     def demandops(self, *args: str) -> str:
-        """Run a command on the state repo in this process and return its output."""
+        """Run a command on the state repo in this process; return its output."""
         with redirect_stdout(io.StringIO()) as printed:
             assert run([*args, "--state-repo", self.state_repo]) == 0
         return printed.getvalue()
@@ -99,8 +99,8 @@ class Served:
     def wait_for(self, text: str, seconds: float = DEADLINE_S) -> None:
         """Wait until the log contains ``text``; fail with :meth:`last_words` if it is late.
 
-        Time in which the process waits for a processor does not count. On a busy machine, a start
-        that needs two seconds once waited for half a minute.
+        The time in which the process waits for a processor does not count. On a busy machine, a
+        start that needs two seconds once waited for half a minute.
         """
         began = time.monotonic()
         while True:
@@ -115,7 +115,7 @@ class Served:
     def last_words(self) -> str:
         """Return how the process ended, and its log.
 
-        A process that still runs is aborted; the result then also says what each thread was doing.
+        A process that still runs is aborted; then the result also says what each thread was doing.
         """
         code, pid = self.process.poll(), self.process.pid
         lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
@@ -148,7 +148,7 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain; ``warm`` commands, if given, start faster."""
+    """Starts `demandops serve` in one ROS domain; with ``warm`` commands it starts faster."""
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str
@@ -194,7 +194,7 @@ class Servers:
 
 @dataclass
 class Sent:
-    """A goal that was sent, and what the server has answered so far."""
+    """A goal that was sent, and the server's answers so far."""
 
     at: float
     handle: Any = None
@@ -212,7 +212,7 @@ class Sent:
 
     @property
     def commit(self) -> str:
-        """Return the commit that the result names."""
+        """The commit that the result names."""
         return self.message.splitlines()[0].split()[-1]
 
 
@@ -239,7 +239,7 @@ class Client:
         )
 
     def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
-        """Spin until a condition holds; fail the test if it does not in time."""
+        """Spin until a condition is true; fail the test after ``seconds``."""
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, "the condition did not hold in time"
@@ -264,7 +264,7 @@ class Client:
         self.wait(is_answered)
 
     def send(self, goal: dict[str, Any]) -> Sent:
-        """Send a goal; its answers arrive while the client waits for a condition."""
+        """Send a goal; its answers arrive only while the client spins in :meth:`wait`."""
         sent, id = Sent(time.monotonic()), uuid.uuid4().bytes
         self._sent[id] = sent
         future = self._client.send_goal_async(
@@ -300,7 +300,6 @@ class Client:
         return bool(future.result().goals_canceling)
 
     def call(self, sent: dict[str, Any]) -> Sent:
-        """Send a goal and wait for its answer."""
         under_way = self.send(sent)
         self.wait(lambda: under_way.answered)
         return under_way

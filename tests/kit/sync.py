@@ -1,4 +1,4 @@
-"""Forced writes to disk: off in tests, unless a test is marked ``synced``.
+"""Forced writes to disk are off in tests, except in tests that are marked ``synced``.
 
 Without forced writes, a killed process loses no data; only a power cut does. The program has no
 switch for forced writes, so the tests replace the functions that it calls.
@@ -17,12 +17,12 @@ _CALLS: Mapping[str, object] = {name: getattr(os, name) for name in ("fsync", "f
 
 
 def force(on: bool) -> None:
-    """Switch forced writes of this process on or off."""
+    """Switch this process's forced writes on or off."""
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, int(on))
     for name, call in _CALLS.items():
         setattr(os, name, call if on else lambda file: None)
 
 
 def force_in(repo: Path, on: bool) -> None:
-    """Switch forced writes of git on or off in a repository."""
+    """Switch git's forced writes in a repository on or off."""
     pygit2.Repository(str(repo)).config["core.fsync"] = "committed" if on else "none"

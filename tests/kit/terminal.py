@@ -12,7 +12,7 @@ import pytest
 
 
 class Screen:
-    """What was printed on the terminal."""
+    """All text that was printed on a terminal."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -39,7 +39,7 @@ def terminal(
 ) -> Iterator[Screen]:
     """Make standard output a terminal for the length of a block; yield its screen.
 
-    After the block, the screen has everything that was printed.
+    The text of the screen is complete after the block.
     """
     master, slave = os.openpty()
     screen = Screen()

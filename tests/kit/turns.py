@@ -1,4 +1,4 @@
-"""A runtime that plays all threads in one; a seed determines their order and times."""
+"""A runtime that runs all threads in one; a seed determines their order and times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.kit.memory import NOW
 
 
 class Turns(Clock):
-    """Threads take turns when they wait; a wait takes no real time, but moves the clock."""
+    """A runtime whose threads take turns when they wait; a wait only moves the clock."""
 
     def __init__(self, seed: int) -> None:
         super().__init__(NOW)
@@ -44,7 +44,7 @@ class Turns(Clock):
         return thread
 
     def wait(self, is_over: Callable[[], bool], timeout: float | None = None) -> None:
-        """Let other threads run until ``is_over`` holds or the timeout has passed."""
+        """Let other threads run until ``is_over`` returns true or the timeout has passed."""
         me = getcurrent()
         self._waiting[me] = (is_over, inf if timeout is None else self.monotonic() + timeout)
         self._turn = self._next()
@@ -62,7 +62,7 @@ class Turns(Clock):
             self._turn.switch()
 
     def end(self, threads: Iterable[greenlet]) -> None:
-        """Unwind threads that were stopped, so that their resources are released."""
+        """Unwind stopped threads, so that they release their resources."""
         self._waiting.clear()
         for thread in threads:
             self._turn = self._main

@@ -2,8 +2,8 @@
 
 The imports of a node take a second, and many tests start a node. Each command still has its own
 process, threads, signals, log and exit code. Python must have only one thread when it forks. The
-tests' own process has several, so a further process forks. ROS is imported after the fork, because
-its tracing starts threads and a process that is forked from them can crash.
+tests' own process has several, so a further process forks. It does not import ROS, because the
+tracing of ROS starts threads, and a fork of a process with threads can crash; the fork imports ROS.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import IO, Any
 
 
 class WarmCommand:
-    """A command that was forked; its interface is that of `subprocess.Popen`."""
+    """A forked command, with the interface of `subprocess.Popen`."""
 
     def __init__(self, told: IO[str]) -> None:
-        """Read the command's process id from ``told``; its exit code comes there later."""
+        """Read the command's process id from ``told``, which later gives its exit code."""
         self._told = told
         self.pid = int(told.readline())
         self.returncode: int | None = None
@@ -61,7 +61,7 @@ class WarmCommand:
 
 
 class WarmCommands:
-    """Starts commands as forks of a process that has imported what they need."""
+    """Starts commands as forks of a process that has done their imports."""
 
     def __init__(self, folder: Path) -> None:
         """Start the process that forks; put its pipes into ``folder``."""
@@ -101,7 +101,7 @@ def _watch(wanted: dict[str, Any]) -> int:
     """Fork for a command.
 
     In the command's process, return 0. In the parent, write the command's process id and exit code
-    into its pipe, and return the process id.
+    into the command's pipe, and return the process id.
     """
     with Path(wanted["pipe"]).open("w", buffering=1) as pipe:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)

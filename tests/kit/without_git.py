@@ -1,4 +1,4 @@
-"""A pytest plugin for the tests of the core: they cannot import Git.
+"""A pytest plugin that keeps the tests of the core from importing Git.
 
 Load it with ``-p tests.kit.without_git``. The scenarios use the timers of ``demandops.service``,
 which need no Git. The plugin replaces that package by an empty one with the same modules, because

@@ -1,1 +1,1 @@
-"""Independent models of the bookkeeping; the tests compare the program with them."""
+"""Independent models of the bookkeeping, with which the tests compare the program."""

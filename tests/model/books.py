@@ -1,8 +1,8 @@
 """A second bookkeeping, written only from docs/demand.md and decision 23.
 
 It uses plain dicts and sets over goals as they come in YAML. It imports nothing of the program and
-shares no idea with it. So a mistake stays unnoticed only if it is made in both. Where the design
-leaves something open, a comment says what this model does.
+shares no idea with it, so a mistake stays unnoticed only if both make it. Where the design leaves
+something open, a comment says what this model does.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Item = dict[str, Any]
 Demand = tuple[str, tuple[str, ...]]
-"""The request id and the sorted, de-duplicated requesters of a join: they tell claims apart."""
+"""The request id and the sorted, distinct requesters of a join; they tell a subject's claims apart.
+"""
 
 Subject = tuple[str, str]
-"""The kind (``application`` or ``connection``) and the id."""
+"""A subject: its kind (``application`` or ``connection``) and its id."""
 
 Topic = tuple[str, ...]
-"""A connection's source topic, or an application's role, topic and source."""
+"""A topic: a connection's source topic, or an application's role, topic and source."""
 
 Claim = dict[str, Any]
 Claims = dict[Subject, dict[Demand, Claim]]
@@ -45,11 +46,11 @@ class World:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one request.
+    """What became of a request.
 
-    ``not_held`` has each (id, topic, requester) that a shutdown lists although it is not held. The
-    topic is ``None`` if the shutdown lists no topics. ``touched`` has the claims that the request
-    adds, changes or removes.
+    ``not_held`` has each (id, topic, requester) that a shutdown lists although the requester does
+    not hold the topic. The topic is ``None`` if the shutdown lists no topics. ``touched`` has the
+    claims that the request adds, changes or removes.
     """
 
     outcome: Outcome
@@ -59,7 +60,7 @@ class Result:
 
     @property
     def effective(self) -> bool:
-        """Whether the request must lead to a commit."""
+        """Whether the request must become a commit."""
         return self.outcome in ("booked", "released")
 
 
@@ -73,13 +74,12 @@ def absolute(topic: str) -> str:
 
 
 def requesters(item: Item) -> list[str]:
-    """Return the requesters of an application or a connection."""
     body = item.get(_BODY, {}) if "header" in item else item
     return list(body.get("requester_ids", []))
 
 
 def demand_of(goal: Goal, item: Item) -> Demand:
-    """Return what tells an item's claim from the other claims on the same subject."""
+    """Return the demand of an item, which tells its claim from other claims on the same subject."""
     return goal.get("id", ""), tuple(sorted(set(requesters(item))))
 
 
@@ -162,7 +162,7 @@ class Books:
         if not joining:
             return
         if connection.get("type", 0) != MQTT:
-            yield "the inventory lets nothing but MQTT be carried"  # no bridges, no addresses
+            yield "the inventory lets nothing but MQTT be carried"  # the inventory has no bridges
         if not sources:
             yield "a connection without topics"
         ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")
@@ -175,8 +175,8 @@ class Books:
     def _broker(self, item: Item) -> str:
         """Return the broker of an item, or an empty text if the item names none.
 
-        If the inventory has only one broker, it is that one. Otherwise it is the first broker among
-        the named node, the target and the source.
+        With one broker in the inventory, it is that broker. Otherwise it is the first of the named
+        node, the target and the source that has a broker.
         """
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
@@ -216,10 +216,10 @@ class Books:
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
         """Take the holds that a shutdown lists.
 
-        Which claim gives up a hold follows from ``found``, the claims before the shutdown. So a
-        hold that is listed twice is taken once. One question is left open by the design: if a
-        shutdown has several requesters and no topics, each requester gives up one claim here, and
-        these claims may differ.
+        Which claim gives up a hold follows from ``found``, the claims before the shutdown, so a
+        hold that is listed twice is taken once. The design leaves one case open: a shutdown with
+        several requesters and no topics. Here each requester gives up one claim, and these claims
+        may differ.
         """
         # a shutdown repeats another one if it lists the same, in any order and any number of times
         said = frozenset(_said(item) for item in _items(goal))
@@ -271,10 +271,10 @@ class Books:
     # The view
 
     def services(self) -> dict[tuple[str, str, str], dict[str, Any]]:
-        """Return who requests each service; a key is the service, its node and what it is for.
+        """Return who requests each service; the key is the service, its node, and what it is for.
 
-        A detection is for one cloud (``source topic``), a fusion is for one application. The object
-        lists of a fusion are named by the clouds from which they are made.
+        A detection is for one cloud (``source topic``), a fusion for one application. The object
+        lists of a fusion have the names of the clouds from which they are made.
         """
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
         for id_, claim in self._on("application"):
@@ -315,7 +315,7 @@ class Books:
         return {"services": self.services(), "connections": self.connection_view()}
 
     def holds(self) -> dict[tuple[Subject, Demand], dict[Topic, set[str]]]:
-        """Return who holds which topic in each standing claim."""
+        """Return who holds each topic, for each claim."""
         return {key: claim["holds"] for key, claim in _flat(self.claims).items()}
 
 
@@ -324,7 +324,7 @@ def _flat(claims: Claims) -> dict[tuple[Subject, Demand], Claim]:
 
 
 def requesters_of(claim: Claim) -> set[str]:
-    """Return who holds anything in a claim."""
+    """Return the requesters that hold anything in a claim."""
     return {one for who in claim["holds"].values() for one in who}
 
 
@@ -341,7 +341,7 @@ def _subject(item: Item) -> Subject:
 
 
 def _fixed(item: Item) -> dict[str, Any]:
-    """Return the fields in which all claims on a subject agree: the node or the ends, and the type.
+    """Return the fields that all claims on a subject share: the node or the ends, and the type.
 
     A shutdown may leave out nodes; these are empty.
     """
@@ -359,7 +359,7 @@ def _is_meant(claim: Claim, item: Item) -> bool:
 def _topics(item: Item) -> set[Topic]:
     """Return the topics of an item.
 
-    A connection's source topic is enough to name a topic, because it has only one target.
+    A connection's source topic has only one target, so it is enough to name the topic.
     """
     if "header" not in item:
         return {(source,) for source in _pairs(item)}
@@ -462,7 +462,7 @@ def in_model_words(
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Return (node, object list topic) → the cloud from which a detection there makes the list.
+    """Return, by node and object list topic, the cloud from which a detection there makes the list.
 
     ``manifests`` are the rendered releases.
     """

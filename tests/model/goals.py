@@ -1,6 +1,6 @@
 """Random requests in the form of the reference's action.
 
-The same maker serves Hypothesis, which can shrink its ``randoms()``, and plain seeds. There are few
+The same maker serves Hypothesis, which can shrink its ``randoms()``, and plain seeds. It uses few
 subjects, requesters and topics, so that requests often concern the same ones.
 """
 
@@ -43,7 +43,7 @@ APPLICATIONS = {
     "edge/object.detection_fusion": "edge",
     "cloud/fusion": "cloud",
 }
-"""The node of each application. The first two share detections and have nearly the same name."""
+"""The node of each application; the first two share detections and have nearly the same name."""
 
 CLOUDS = (
     STATION_CLOUD,
@@ -95,7 +95,7 @@ def shutdown_of(joined: Goal) -> Goal:
 class Maker:
     """Makes random requests.
 
-    The requests of a ``calm`` maker never contradict each other, so that all can be booked
+    The requests of a ``calm`` maker never contradict each other, so all of them can be booked
     together.
     """
 
@@ -106,7 +106,7 @@ class Maker:
         self.left: list[Goal] = []
 
     def sequence(self, length: int) -> list[Goal]:
-        """Return requests of every sort, in any order."""
+        """Return random requests, each made by :meth:`any`."""
         return [self.any() for _ in range(length)]
 
     def any(self) -> Goal:
@@ -139,7 +139,7 @@ class Maker:
         return made
 
     def again(self, joined: Goal) -> Goal:
-        """Return the same goal with reordered lists and an entry of each list twice."""
+        """Return the same goal; each list is in another order and has one entry twice."""
         made = deepcopy(joined)
         for item in made["apps"]:
             body = item["object_detection_fusion_app"]
@@ -155,7 +155,7 @@ class Maker:
         return made
 
     def leave(self) -> Goal:
-        """Return a shutdown of an earlier join: whole, in part, or with mistakes."""
+        """Return a shutdown of an earlier join: of all of it, of a part, or with mistakes."""
         place = self._random.randrange(len(self.joined))
         made = shutdown_of(self.joined[place])
         if not self._odds(3):  # else it may be sent again
@@ -209,7 +209,7 @@ class Maker:
         return [first, STATION if first != STATION else self._pick(VEHICLES)]
 
     def _disturb(self, made: Goal) -> None:
-        """Now and then, make a part of the goal contradict other goals or make no sense."""
+        """Sometimes make a part of the goal contradict other goals or make no sense."""
         for app in made["apps"]:
             self._disturb_application(app)
         for item in made["connections"]:

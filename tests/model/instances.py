@@ -1,4 +1,4 @@
-"""A model of instances by version, nodes in two access domains, and replicas that are kept.
+"""A model of instances by version, of nodes in two access domains, and of kept replicas.
 
 It is written from what docs/versions.md, docs/policy.md and docs/appdef.md promise, and imports
 nothing of the program. In this model, each demand for an instance has one application, which runs
@@ -25,20 +25,20 @@ MAY = {
     "vehicle01": frozenset({HALL, FURTHER}),
     "traffic": frozenset({FURTHER}),
 }
-"""The access domains in which each requester may demand something, by the node's names there."""
+"""The access domains in which each requester may demand, by the names of the node in them."""
 MOST = 3
 KEPT_FOR = timedelta(seconds=120)
 
 Instance = tuple[str, str]
-"""The id of an application, and its node."""
+"""An instance: the id of an application, and its node."""
 
 
 @dataclass
 class Instances(Places):
     """The model of places, with instances.
 
-    ``testing`` is the version in the channel of this name. ``kept`` maps numbers of replicas that
-    an instance no longer needs to the time until which it keeps so many.
+    ``testing`` is the version in the channel of this name. ``kept`` has the instances with more
+    replicas than they need, with the time until which each number of replicas is kept.
     """
 
     testing: str = NEXT
@@ -81,7 +81,7 @@ class Instances(Places):
         return app | {"id": id, "node": node, "version": asked}
 
     def running(self) -> dict[Instance, frozenset[Any]]:
-        """Return the topics of each instance."""
+        """Return the topics of each instance that is demanded."""
         found: dict[Instance, frozenset[Any]] = {}
         for subjects in self.held.values():
             for (_, id), held in subjects.items():
@@ -91,7 +91,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Note the replicas that were needed ``before`` and are not needed now; they are kept."""
+        """Keep the replicas that were needed ``before`` and are needed no longer, for a time."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -100,9 +100,9 @@ class Instances(Places):
                 self.kept[one] = kept
 
     def come_down(self, one: Instance, record: Mapping[int, datetime], now: datetime) -> None:
-        """Check the record of replicas that an instance keeps, and adopt it.
+        """Check and adopt the record of replicas that an instance keeps.
 
-        The record may lack replicas whose time is over by ``now``.
+        The record may lack replicas whose time is over at ``now``.
         """
         least = needed(self.running().get(one, ()))
         kept, told = _ends(self.kept.get(one, {}), least), _ends(record, least)
@@ -114,12 +114,12 @@ class Instances(Places):
             self.kept[one] = told
 
     def replicas(self, one: Instance) -> int:
-        """Return how many replicas an instance has."""
+        """Return the number of replicas that an instance has."""
         return max(needed(self.running()[one]), *self.kept.get(one, ()), 0)
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return until when at least so many replicas are kept, for each number above ``least``."""
+    """Return, for each number above ``least``, until when at least so many replicas are kept."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)
@@ -127,5 +127,5 @@ def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
 
 
 def needed(topics: Collection[Any]) -> int:
-    """Return how many replicas an instance with these topics needs."""
+    """Return the number of replicas that an instance with these topics needs."""
     return min(MOST, len(topics))

@@ -1,4 +1,4 @@
-"""A model of demands in DemandOps' own format and of leases, written only from what is promised.
+"""A model of leases and of demands in DemandOps' own format, written only from what is promised.
 
 It uses plain dicts over goals as they come in YAML, and imports nothing of the program. Where a
 sentence leaves something open, a comment says what this model does. Times are whole seconds.
@@ -14,10 +14,10 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Outcome = Literal["booked", "released", "unchanged", "refused"]
 Subject = tuple[str, str]
-"""The kind (``applications`` or ``connections``) and the id."""
+"""A subject: its kind (``applications`` or ``connections``) and its id."""
 
 BY_MESSAGE = "by message: "
-"""The start of the name of a demand that comes from a goal of the reference."""
+"""The start of the name that a demand from a goal of the reference has."""
 
 
 REPEATS_WITHIN_S = 15 * 60
@@ -30,7 +30,7 @@ def by_message(request: str, who: Iterable[str]) -> str:
 
 @dataclass
 class Held:
-    """What one demand holds on one subject, and until when.
+    """The hold of a demand on a subject, and its lease.
 
     ``seconds`` is the lease, and ``promised`` is the last renewal plus the lease; both are None for
     a demand without an end. A demand that comes from a goal of the reference also has ``holders``
@@ -46,14 +46,14 @@ class Held:
     booked: int = 0
 
     def same(self, other: Held | None) -> bool:
-        """Return whether this equals ``other`` except for the times."""
+        """Return whether the two differ only in their times."""
         if other is None:
             return False
         mine = (self.what, self.requesters, self.seconds, self.holders)
         return mine == (other.what, other.requesters, other.seconds, other.holders)
 
     def holds(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return who holds each topic of a connection, below the key ``holds``.
+        """Return the requesters that hold each topic of a connection, below the key ``holds``.
 
         All requesters hold a topic unless ``holders`` names some of them. For an application, the
         result is empty.
@@ -64,7 +64,7 @@ class Held:
 
 @dataclass
 class Promises:
-    """The model: what each demand holds on each subject, and until when.
+    """The model: the hold of each demand on each subject, with its lease.
 
     ``slack`` is how many seconds after ``promised`` a release may come. ``default`` is the lease of
     a demand that names none.
@@ -80,8 +80,8 @@ class Promises:
     def take(self, goal: Goal, now: int) -> Outcome:
         """Apply a goal as a whole or refuse it as a whole; return the outcome.
 
-        The outcome is ``unchanged`` if a renewal only prolongs leases. It depends on the slack
-        whether the recorded end changes too, so the generator may make a commit or not.
+        The outcome is ``unchanged`` if a renewal only prolongs leases. The generator then makes a
+        commit only if the recorded end changes, which depends on the slack.
         """
         if goal.get("kind") == "Demand":
             return self._own(goal, now)
@@ -228,11 +228,11 @@ class Promises:
     # time
 
     def may_go(self, now: int) -> set[tuple[str, Subject]]:
-        """Return what may be released at ``now``: the lease since the last renewal is over."""
+        """Return the holds whose leases are over at ``now``; the generator may release them."""
         return self._over(now)
 
     def must_go(self, now: int) -> set[tuple[str, Subject]]:
-        """Return what a check of the leases at ``now`` must release: the slack is over as well."""
+        """Return the holds that a check must release at ``now``, because their slack is over."""
         return self._over(now - self.slack)
 
     def _over(self, now: int) -> set[tuple[str, Subject]]:
@@ -244,16 +244,16 @@ class Promises:
         }
 
     def gone(self, released: Iterable[tuple[str, Subject]]) -> None:
-        """Forget what was released at the end of its lease."""
+        """Forget the holds that were released at the end of their leases."""
         for demand, subject in released:
             self._drop(demand, subject)
 
     # the view
 
     def claims(self) -> dict[tuple[str, Subject], tuple[dict[str, Any], frozenset[str]]]:
-        """Return what each demand holds on each subject, and the requesters.
+        """Return the content and the requesters of each demand's hold on each subject.
 
-        For a connection, ``holds`` has who holds each topic.
+        For a connection, ``holds`` in the content has the requesters that hold each topic.
         """
         return {
             (demand, subject): (deepcopy(held.what) | held.holds(), held.requesters)
@@ -265,7 +265,7 @@ class Promises:
 def _subjects(goal: Goal) -> dict[Subject, dict[str, Any]]:
     """Return what a put demands of each subject.
 
-    The tests' puts list no subject twice and leave nothing to derive.
+    The puts of these tests list no subject twice, and nothing has to be derived from them.
     """
     found: dict[Subject, dict[str, Any]] = {}
     for app in goal.get("applications", []):

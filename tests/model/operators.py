@@ -20,7 +20,7 @@ _WHOLE = [""]
 class Resource:
     """A custom resource: its last request, and the requesters that its operator counts.
 
-    While it ``is_stuck``, the operator fails. A fusion that was stuck ``is_uncounted``: the
+    While it ``is_stuck``, its operator fails. A fusion that was stuck ``is_uncounted``: its
     operator counts nothing for it.
     """
 
@@ -31,16 +31,13 @@ class Resource:
 
 
 class Operators:
-    """Who requests what, as the operators count it.
-
-    :meth:`take` counts a goal, and :meth:`books` returns the counts.
-    """
+    """The model: :meth:`take` counts a goal, and :meth:`books` returns the counted requesters."""
 
     def __init__(self) -> None:
         self._resources: dict[str, Resource] = {}
 
     def books(self) -> dict[str, list[str]]:
-        """Return the sorted requesters by resource, or by a fusion's resource and topic."""
+        """Return the sorted requesters by resource; of a fusion, by resource and topic."""
         return {
             f"{name} {topic}".strip(): sorted(who)
             for name, resource in self._resources.items()
@@ -49,7 +46,7 @@ class Operators:
         }
 
     def take(self, goal: Goal) -> set[str]:
-        """Count a goal; return the reasons why parts of it are not counted as requested.
+        """Count a goal; return why the operators' counts differ from what the goal says.
 
         A reason is the name of a row in docs/reference.md.
         """

@@ -1,4 +1,4 @@
-"""A model of demands without a node, of nodes that are full or drained, and of waiting.
+"""A model of demands without a node, of full and drained nodes, and of waiting.
 
 It is written from what docs/placement.md promises, and imports nothing of the program. In this
 model, each such demand has one application of its own, and each of the ``nodes`` has room for one
@@ -16,12 +16,12 @@ from tests.model import leases
 from tests.model.leases import Goal, Promises, Subject
 
 Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "waits"]
-"""``waiting``: the demand waits from now on; ``waits``: it already waited in the same way."""
+"""``waiting``: the demand waits from now on; ``waits``: it already waits in the same way."""
 
 
 @dataclass(frozen=True)
 class Waiting:
-    """A waiting demand: its priority, since when it waits, its requesters and its goal."""
+    """A waiting demand: its priority, the start of its wait, its requesters and its goal."""
 
     priority: int
     since: str
@@ -84,8 +84,8 @@ class Places(Promises):
     def _put_again(self, goal: Goal, now: int, held: tuple[Subject, leases.Held]) -> Outcome:
         """Apply a put to a demand that already has a node; return the outcome.
 
-        The application stays on its node unless the node is drained. Then it needs another free
-        node.
+        The application stays on its node unless the node is drained. Then the application needs
+        another free node.
         """
         subject, what = held
         node = what.what["node"]
@@ -111,7 +111,7 @@ class Places(Promises):
         return self.waiting[demand].turn(demand)
 
     def free(self) -> frozenset[str]:
-        """Return the nodes with room that are not drained."""
+        """Return the nodes that have room and are not drained."""
         taken = {
             held.what.get("node") for subjects in self.held.values() for held in subjects.values()
         }
@@ -120,7 +120,7 @@ class Places(Promises):
     def has_room(self, demand: str, now: int) -> None:
         """Book the waiting demand that is first in turn; fail if ``demand`` is another one.
 
-        ``now`` is the earliest time at which it can be booked.
+        ``now`` is the earliest time at which the generator can have booked it.
         """
         assert demand in self.waiting, f"{demand} is booked, and did not wait"
         first = min(self.waiting, key=self._turn)
@@ -134,11 +134,11 @@ class Places(Promises):
         self.held[demand][subject] = replace(held, what=held.what | {"node": self._told(subject)})
 
     def drain(self, node: str, drained: bool) -> None:
-        """Take a node out of service, or back in."""
+        """Begin or end the draining of a node."""
         self.drained = self.drained | {node} if drained else self.drained - {node}
 
     def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return the priority, the time and the requesters of each waiting demand."""
+        """Return the priority, the time and the requesters of each waiting demand, by its name."""
         return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
 
 

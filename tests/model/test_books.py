@@ -21,10 +21,10 @@ STEPS = (
     ("7-vehicle02-leaves", "S 3", "", "3"),
     ("8-vehicle03-leaves", "", "", ""),
 )
-"""The requesters after each file.
+"""The requesters after each of the experiment's files.
 
-First come the requesters of what the station's data feeds, then those of what vehicle 0's data
-feeds, then the other vehicles that have a connection.
+First come the requesters of the services that the station's data feeds, then those of the services
+that vehicle 0's data feeds, then the other vehicles that have a connection.
 """
 
 

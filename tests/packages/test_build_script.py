@@ -80,7 +80,7 @@ fi
 
 @pytest.fixture
 def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """A copy of the script with a prefix of its own, which calls the fake CMake above."""
+    """A copy of the script with a prefix of its own; it calls the fake CMake above."""
     copy, prefix, tools = (tmp_path / name for name in ("interfaces", "prefix", "bin"))
     shutil.copytree(INTERFACES, copy, ignore=shutil.ignore_patterns("__pycache__"))
     spec = importlib.util.spec_from_file_location("interfaces_build", copy / "build.py")
@@ -115,7 +115,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def calls(script: ModuleType) -> list[str]:
-    """Return the stages that CMake was called for since the last call of `calls`."""
+    """Return the stages for which the script has called CMake since the last call of `calls`."""
     log: Path = script.PREFIX / "calls"
     lines = log.read_text().split() if log.exists() else []
     log.unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """The ROS packages build in a colcon workspace, as they do in a ROS 2 installation.
 
-colcon takes the ROS 2 wheels of PyPI for the underlay of the workspace. There are no wheels of
-ros2run and ros2launch. So the tests launch nothing, but find the files that both would look up.
+In the test, the ROS 2 wheels of PyPI are the underlay of the workspace. They lack ros2run and
+ros2launch, so the tests launch nothing: they find the files that both would look up.
 """
 
 from __future__ import annotations

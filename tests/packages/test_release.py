@@ -1,4 +1,4 @@
-"""`make release`: what it builds, and that all files name the same version."""
+"""`make release` builds a wheel that works, and all files name the same version."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The wheel contains templates, appdefs and skeleton, so it renders demands without a checkout.
 
-The tests build the wheel of only those files that deploy/Containerfile copies.
+The tests build the wheel from only those files that deploy/Containerfile copies.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
 
 
 def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
-    """The test looks up what `ros2 run` and `ros2 launch` look up; neither is a wheel on PyPI."""
+    """The test looks up the files that `ros2 run` and `ros2 launch` need; neither has a wheel."""
     packages = pytest.importorskip("ament_index_python.packages")
     # without --ignore-installed pip would remove the package under test from its environment
     options = ["-q", "--no-deps", "--no-index", "--ignore-installed", "--prefix", str(tmp_path)]
@@ -85,7 +85,7 @@ def test_a_demand_is_rendered_from_the_installed_wheel(wheel: Path, tmp_path: Pa
     venv.create(tmp_path / "env", with_pip=False)
     site = next((tmp_path / "env" / "lib").glob("python*/site-packages"))
     zipfile.ZipFile(wheel).extractall(site)
-    # the libraries come from this environment; a path file does not bring in the checkout
+    # the libraries come from this environment, by a path file that does not add the checkout
     (site / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
     request = ROOT / "examples" / "experiment" / "1-vehicle00-joins.yaml"
 

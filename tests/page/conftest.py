@@ -39,7 +39,7 @@ Visits = Callable[..., Visit]
 def visit(browser: Browser, fleet: Story) -> Iterator[Visits]:
     """Return a function that opens a visit of the page.
 
-    At the end the fixture checks that the page called no other host and reported no error.
+    At the end, the fixture checks that the page called no other host and reported no error.
     """
     made: list[Visit] = []
 

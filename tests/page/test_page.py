@@ -1,4 +1,4 @@
-"""The page in a browser: what a person sees, by mouse, by keyboard, and by a screen reader."""
+"""The page in a real browser, for a mouse, a keyboard, a phone and a screen reader."""
 
 from __future__ import annotations
 
@@ -93,7 +93,9 @@ def test_a_commit_is_on_the_page_within_a_second(visit: Visits, fleet: Story) ->
     assert min(waits) < 1.0, waits
 
 
-def test_an_update_keeps_where_a_person_is(visit: Visits, fleet: Story) -> None:
+def test_an_update_of_the_page_keeps_the_focus_and_the_typed_text(
+    visit: Visits, fleet: Story
+) -> None:
     page = visit().open("/demands?q=vehicle01")
     expect(page.locator("#live")).to_have_text("live")
     link = page.get_by_role("link", name="vehicle01-to-cloud").first
@@ -131,7 +133,7 @@ def test_a_keyboard_reaches_everything(visit: Visits) -> None:
     page.wait_for_url("**/services?**")
 
 
-def test_the_map_leads_to_what_is_on_a_node(visit: Visits) -> None:
+def test_a_node_of_the_map_links_to_its_services(visit: Visits) -> None:
     page = visit().open("/map")
     page.locator(".node", has_text="edge").first.click()
     page.wait_for_url("**/services?q=node%3Dedge")

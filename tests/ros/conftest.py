@@ -20,7 +20,7 @@ APPDEFS = Path(__file__).parents[1] / "appdefs"
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain for the nodes of single tests, in which no other node answers."""
+    """A ROS domain for nodes that serve only one test; no other node answers in it."""
     with reserved() as domain:
         yield domain
 
@@ -36,7 +36,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
 def servers(
     tmp_path: Path, data_home: Path, ros_domain: int, warm: WarmCommands
 ) -> Iterator[Servers]:
-    """What starts commands that use ROS; the end of the test kills those that still run."""
+    """The starter of commands that use ROS; the end of the test kills those that still run."""
     made = Servers(tmp_path, ros_domain, warm)
     yield made
     made.kill()
@@ -64,9 +64,9 @@ def client(ros_domain: int) -> Iterator[Client]:
 
 @pytest.fixture(scope="session")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """A node that serves many tests, each of which uses ids of its own.
+    """A node that serves many tests; each test uses ids of its own.
 
-    Its state repo has the recorder as a further type of application, and a policy rule that
+    The node's state repo has the recorder as a further type of application, and a policy rule that
     names the requesters.
     """
     folder = tmp_path_factory.mktemp("shared")

@@ -1,4 +1,4 @@
-"""Goals over ROS 2 await approval, report so, and are then merged, rejected or cancelled."""
+"""Goals over ROS 2 that await approval say so, and are then merged, rejected or cancelled."""
 
 from __future__ import annotations
 

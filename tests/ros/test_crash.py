@@ -1,4 +1,4 @@
-"""A node is killed in a burst of goals: each accepted goal is booked, or the log has its refusal.
+"""After kills of the node in bursts of goals, each accepted goal is booked, or refused in the log.
 
 The node is killed three times by default, and a hundred times with ``GOAL_KILLS=100``.
 """
@@ -23,15 +23,15 @@ BURST = 40
 
 
 def _goal(number: int) -> rig.Goal:
-    """Return a goal; if its number is a multiple of four, its node is unknown and it is refused."""
+    """Return a goal; the node refuses every fourth one, which names an unknown node."""
     wrong = {} if number % 4 else {"target_node_id": "egde"}
     return {**connection(number % BURST, **wrong), "id": f"request{number}"}
 
 
 def _killed_in_a_burst(served: Served, client: Client, goals: range, answers: int) -> list[Sent]:
-    """Send the goals, kill the node between its answers, and return what was sent.
+    """Send the goals, kill the node between its answers, and return the sent goals.
 
-    The kill comes after at least `answers` answers, while an accepted goal has none.
+    The kill comes after at least `answers` answers, while an accepted goal still waits for one.
     """
     served.wait_for("taking demands")
     for _ in range(30):  # the client may still know only the node that was killed
@@ -78,7 +78,7 @@ def test_killed_in_a_burst_each_accepted_goal_is_booked_or_refused_in_the_log(
     shown = {n for n in answered if any(f"'request{n}'" in line for line in refused)}
     assert shown == {number for number in answered if number % 4 == 0}
     assert {f"request{number}" for number in answered.keys() - shown} <= set(booked)
-    assert len(booked) == len(set(booked)), "booked twice"
+    assert len(booked) == len(set(booked)), "a goal was booked twice"
     unanswered = [number for number, is_answered in answered.items() if not is_answered]
     print(f"{KILLS} kills: {len(answered)} accepted, {len(unanswered)} of them not answered")
-    assert unanswered, "no kill came in the middle"
+    assert unanswered, "no kill came while a goal waited for its answer"

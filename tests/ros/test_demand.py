@@ -49,13 +49,13 @@ def operations(served: Served, since: str) -> list[str]:
 
 @pytest.fixture
 def before(shared: Served) -> str:
-    """The newest commit of the shared node's state repo before the test."""
+    """The newest commit of the shared node's state repo when the test begins."""
     return tip(shared.state_repo)
 
 
 @pytest.fixture
 def raw(shared: Served) -> Iterator[SingleThreadedExecutor]:
-    """An executor in the domain of the shared node, with a ROS node of its own."""
+    """An executor with a ROS node of its own, in the ROS domain of the shared node."""
     context = rclpy.Context()
     rclpy.init(context=context, domain_id=shared.domain)
     executor = SingleThreadedExecutor(context=context)
@@ -82,7 +82,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
         assert books["commit"] == held.commit
     assert shared.bookkeeping()["services"] == {}
     assert operations(shared, before) == ["put", "release"]
-    # an action client may miss the first feedback, and drops what comes after the result
+    # an action client may miss the first feedback, and drops any that comes after the result
     assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
@@ -164,7 +164,7 @@ def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
 
     monkeypatch.setattr(vehicle._sender, "_await", lose_first)
     answer = vehicle.put("again", connections=[link("again")])
-    assert answer.outcome == "unchanged", "the first one was booked"
+    assert answer.outcome == "unchanged", "the goal whose response was lost must be booked"
     assert operations(shared, before) == ["put"]
 
 
@@ -187,7 +187,7 @@ def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
 
 @pytest.fixture
 def short_leases(shared: Served) -> Iterator[None]:
-    """Make leases in the access domain end after two seconds, for the length of a test."""
+    """For the length of a test, leases in the access domain end after two seconds."""
     repo = GitRepo(Path(shared.state_repo))
     text = repo.files(POLICY)[POLICY]
     policy = yaml.safe_load(text)
@@ -208,7 +208,7 @@ def test_a_demand_of_a_client_that_died_ends_and_one_that_is_renewed_does_not(
         assert kept.answer is not None and kept.answer.lease_s == 2
         assert vehicle.put("left", connections=[link("left")]).lease_s == 2
         wait_until(lambda: "expire" in operations(shared, before), "the lease has ended", 60)
-        assert booked() == {"kept"}, "renewed every third of two seconds"
+        assert booked() == {"kept"}, "the renewed demand must stay booked"
     assert booked() == set()
 
 

@@ -1,4 +1,4 @@
-"""The event detector as a process: vehicles publish their poses, and the node books demands."""
+"""The event detector as a process: vehicles publish their poses, and it demands applications."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from tests.kit.ros import Served, Servers
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
 _MOST_AHEAD_S = 2.0
-"""How far the simulated time may run ahead of the detector's.
+"""How many seconds the simulated time may run ahead of the time that the detector has reported.
 
-The detector takes a vehicle that is silent for 5 s for gone. With less than that, a slow machine
-makes no vehicle look silent.
+The detector takes a vehicle that is silent for 5 s for gone. With this limit, no vehicle looks
+silent on a slow machine.
 """
 STATION = (-5352.679, -3363.067)
 S, V0, V1, V2, V3 = paper.S, paper.V0, paper.V1, paper.V2, paper.V3
 
 
 class Fleet:
-    """Vehicles that publish their poses ten times a second while a test waits in `until`."""
+    """Vehicles that publish their poses ten times a second, while a test waits in `until`."""
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
@@ -54,7 +54,7 @@ class Fleet:
         self._seconds, self.pace = 1000.0, 1.0
         """The simulated time in seconds, and its speed relative to the real time."""
         self._limit = inf
-        """The simulated time stops here until the detector reports a later time."""
+        """The simulated time stops here until the detector has reported a later time."""
         self._since = 0.0
         self.is_timeless = False
         """Whether the vehicles publish no simulated time."""
@@ -68,14 +68,14 @@ class Fleet:
             self._limit = told + _MOST_AHEAD_S
 
     def drive(self, vehicle: str, away: float) -> None:
-        """Place a vehicle at a distance from the station, in meters."""
+        """Place a vehicle at a distance from the station, in metres."""
         if vehicle not in self._publishers:
             topic = f"/vehicles/{vehicle}/pose"
             self._publishers[vehicle] = self.node.create_publisher(PoseStamped, topic, 10)
         self._away[vehicle] = away
 
     def forget(self) -> None:
-        """Discard what the last detector reported, so that `until` waits for the next one."""
+        """Discard the last detector's reports, so that `until` waits for those of the next one."""
         self.statuses.clear()
         self._limit, self._since = inf, self._seconds
 
@@ -97,12 +97,12 @@ class Fleet:
         self._clock.publish(message)
 
     def entities(self) -> str:
-        """Return how many entities the detector reports, as text; empty before a report."""
+        """Return the number of entities in the detector's report; empty before a report."""
         status = self.statuses.get("demandops_detector: data")
         return {pair.key: pair.value for pair in status.values}["entities"] if status else ""
 
     def until(self, true: Callable[[], object], what: str) -> None:
-        """Publish poses until `true` returns a true value; `what` names it in the error."""
+        """Publish poses until `true` returns a true value; an error says `what` did not happen."""
         next_look = [0.0]
 
         def spun() -> object:
@@ -112,7 +112,7 @@ class Fleet:
                 return False
             found = true()
             took = time.monotonic() - began
-            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles go on between
+            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles publish between
             return found
 
         wait_until(spun, what, 60)
@@ -125,7 +125,7 @@ class Fleet:
 
 @pytest.fixture
 def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
-    """Starts each command in a new process, as a person does.
+    """A starter that runs each command in a new process, as a person does.
 
     A detector from a warm process starts so fast that it still receives older bookkeeping.
     """
@@ -228,7 +228,7 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     fleet.drive(V0, 50)
     fleet.until(lambda: "unknown-node" in detecting.log.read_text(), "the demand is refused")
     fleet.until(lambda: served.log.read_text().count("unknown-node") > 2, "it is tried again")
-    assert detecting.log.read_text().count("unknown-node") == 1, "it is logged once"
+    assert detecting.log.read_text().count("unknown-node") == 1, "the refusal must be logged once"
     fleet.until(
         lambda: "failed and are tried again" in status("demands").message, "it is on /diagnostics"
     )

@@ -1,4 +1,4 @@
-"""The node follows its state repo, by polls or a webhook, and reports its own state."""
+"""The node follows its state repo, by polls or a webhook, and reports how it is doing."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_another_node_that_serves_the_same_action_is_noticed(
 def test_a_push_that_the_webhook_reports_is_followed_at_once(
     serve: Serve, client: Client, bare: Path
 ) -> None:
-    """The node does not poll, so only the webhook can report the push to it."""
+    """The node does not poll, so it can learn of the push only by the webhook."""
     args = ["--webhook", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
     served = serve(f"file://{bare}", *args)
     client.ready()
@@ -129,7 +129,7 @@ def test_a_push_that_the_webhook_reports_is_followed_at_once(
 
 
 def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, bare: Path) -> None:
-    """Nothing polls the remote, so the page can get the commit only from the node."""
+    """Nothing polls the remote, so the page can have the commit only from the node."""
     args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
     served = serve(f"file://{bare}", *args)
     client.ready()

@@ -16,14 +16,14 @@ import pytest
 
 OURS = "application_manager_interfaces"
 
-# The hash that clients of the reference announce; a server with another one would not be found.
+# The hash of the reference's action; a client of the reference finds only a server with this hash.
 TYPE_HASH = "RIHS01_1190e6ea1469f559e7fc3c50e3255e75c519f1e3ed29a5f860b0ad8f41786bd9"
 
 # The wire format
 
 
 def described(path: str) -> dict[str, str]:
-    """Return the type hashes in a generated type description, by the type's name."""
+    """Return the type hashes in a generated type description, by type name."""
     file = Path(sys.prefix) / "share" / path
     hashes = json.loads(file.read_text(encoding="utf-8"))["type_hashes"]
     return {entry["type_name"]: entry["hash_string"] for entry in hashes}
@@ -144,7 +144,7 @@ def test_a_goal_goes_round_with_nothing_set_by_hand(tmp_path: Path, ros_domain: 
 
 
 def round_trip() -> None:
-    """Send one goal to a server in this process; print its status, feedback and result as JSON."""
+    """Send a goal to a server in this process; print its status, feedback and result as JSON."""
     import rclpy
     from application_manager_interfaces.action import DeploymentRequest
     from application_manager_interfaces.msg import Application, Connection

@@ -31,7 +31,7 @@ from tests.kit.ros import Client, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
-    """Delay every push to a repository until its folder has a file ``go``; return the URL."""
+    """Delay every push to a repository until its folder has a file ``go``; return its URL."""
     hook(bare, "pre-receive", "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
 
@@ -98,7 +98,7 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.parametrize("end", ["", "thread.close(); node.destroy_node()"])
 def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> None:
-    """Python would abort at its end if the executor's thread were still in ROS.
+    """If the executor's thread were still in ROS, Python would abort at the end of the process.
 
     The program ends once with the thread closed, and once without.
     """
@@ -140,7 +140,7 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy(
     told = 0
 
     def pass_time(seconds: int) -> None:
-        """Publish a fast clock until the node reports a time that is this many seconds later."""
+        """Publish a fast clock until the node reports a time that is later by so many seconds."""
         nonlocal told
         after, began = told, time.monotonic()
 

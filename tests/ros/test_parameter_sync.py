@@ -1,4 +1,4 @@
-"""`demandops parameter-sync`: a running node follows a ConfigMap, by a watch."""
+"""`demandops parameter-sync` watches a ConfigMap and sets a running node's parameters to it."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def test_a_kubeconfig_that_is_none_is_refused(servers: Servers, tmp_path: Path) 
     )
 
 
-def test_what_is_not_set_is_named(servers: Servers) -> None:
+def test_a_parameter_that_is_not_set_is_named(servers: Servers) -> None:
     refused = servers.run("", "parameter-sync")
     assert refused.process.wait(30) == 2
     refused.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")

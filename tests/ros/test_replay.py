@@ -1,4 +1,4 @@
-"""Rules on recorded bags give the same demands as a simple script on the same poses."""
+"""For recorded bags, rules give the same demands as a plain script on the same poses."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def record(path: Path, poses: Poses, plugin: StoragePlugin) -> None:
 
 
 def plainly(poses: Poses) -> list[tuple[float, str, str]]:
-    """Return when each vehicle enters and leaves: the time, the vehicle, and `start` or `stop`.
+    """Return when each vehicle enters (`start`) and leaves (`stop`), by a plain script.
 
     A vehicle enters within 84 m, and leaves beyond 90 m or after 5 s of silence.
     """
@@ -119,7 +119,7 @@ STATE_FIELDS = "string model\nfloat64[] continuous_state\n"
 def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
     demandops: Run, tmp_path: Path, plugin: StoragePlugin
 ) -> None:
-    """The package of EgoData is not installed; the test defines only what the detector needs."""
+    """The package of EgoData is not installed; the test defines the fields that it needs."""
     types = get_typestore(Stores.ROS2_KILTED)
     types.register(get_types_from_msg(STATE_FIELDS, "perception_msgs/msg/ObjectState"))
     types.register(get_types_from_msg(EGO_FIELDS, EGO))
@@ -138,7 +138,7 @@ def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
     assert told == [(1.0, ["vehicle01"], "start"), (3.0, ["vehicle01"], "stop")]
 
 
-def test_what_is_no_bag_or_has_no_topic_of_the_rules_is_refused(
+def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
     demandops: Run, tmp_path: Path
 ) -> None:
     ran = demandops("detect", RULES, "--replay", tmp_path)

@@ -1,4 +1,4 @@
-"""What `demandops serve` refuses at its start, and how tests report a start that hangs."""
+"""What `demandops serve` refuses at its start, and what a test reports of a start that hangs."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_what_cannot_be_served_is_refused_with_a_reason(
     refused = demandops("serve", "--state-repo", bare, *args)
     assert refused.code == code
     assert message in " ".join(refused.err.split())
-    assert set(threading.enumerate()) <= threads, "what was started has ended"
+    assert set(threading.enumerate()) <= threads, "the refused start left a thread"
 
 
 def test_a_missing_state_repo_is_refused_with_the_remedy(tmp_path: Path, demandops: Run) -> None:

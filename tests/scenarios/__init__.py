@@ -1,1 +1,1 @@
-"""Scenarios in YAML: demands, and what each must cause. ``README.md`` describes their form."""
+"""Scenarios in YAML: demands, and the effects that each must have. ``README.md`` has their form."""

@@ -1,7 +1,7 @@
 """Read scenarios, and run them on a state repo in memory.
 
-Time passes only where a step has ``after`` or ``clock``. In every step, before its demand is
-sent, the generator's own lease clock decides which leases have ended.
+Time passes only where a step has ``after`` or ``clock``. In every step, before its demand is sent,
+the generator's own lease clock decides which leases have ended.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ _CHECKS = (
 
 
 class Step(FrozenModel):
-    """One event of a scenario, and its expected effects; an effect that is None is not compared.
+    """An event of a scenario, and its expected effects; an effect that is None is not compared.
 
     ``config`` changes the configuration from this step on, like a person's commit. ``after`` lets
     time pass. ``clock`` moves only the wall clock, by a duration that may be negative. ``restart``
-    discards what the generator has in memory. ``expires`` lists the demands that the generator
-    releases after these changes, in order; without it, the generator must release none.
+    discards the generator's memory. ``expires`` lists the demands that the generator releases after
+    these changes, in order; without it, the generator must release none.
     """
 
     why: str = ""
@@ -108,7 +108,7 @@ class Scenario(FrozenModel):
 
     ``config`` changes the files that ``demandops init`` writes: its mappings are merged into them,
     and any other value replaces theirs. ``appdefs`` names folders of ``tests/appdefs`` to add.
-    ``invalid`` lists the expected faults of a configuration that is not valid.
+    ``invalid`` lists the faults that the configuration must have.
     """
 
     must: str = Field(min_length=1)
@@ -145,7 +145,7 @@ def _laid_over(below: Any, above: Any) -> Any:
 def configuration(
     appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
-    """Return the configuration files of a state repo, by path, with these appdefs and changes."""
+    """Return the files of a configuration with these appdefs and changes, by path."""
     files = skeleton_config()
     overlays: list[tuple[str, Any]] = []
     for name in (*appdefs, "driver") if appdefs else ():
@@ -211,9 +211,9 @@ class World(MemoryRepo):
         )
 
     def look(self) -> list[str]:
-        """Release the demands whose leases have ended; return them in order.
+        """Release the demands whose leases have ended; return their ids in order.
 
-        Like the generator, it then removes the replicas that were kept until now, moves placed
+        Like the generator, this then removes the replicas that were kept until now, moves placed
         applications away from drained nodes, and tries the waiting demands.
         """
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
@@ -249,7 +249,7 @@ class World(MemoryRepo):
         }
 
     def leases(self) -> dict[str, datetime]:
-        """Return the latest recorded end of a lease of each demand."""
+        """Return, for each demand, the latest of its leases' recorded ends."""
         found: dict[str, datetime] = {}
         for claim in self.state.ledger:
             if claim.lease:
@@ -259,12 +259,12 @@ class World(MemoryRepo):
         return found
 
     def assert_sound(self) -> None:
-        """Check that the files contain exactly the ledger and the releases that follow from it."""
+        """Check that the files have exactly the ledger and the releases that follow from it."""
         assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
-        assert not names, f"these are there and not asked for, or the other way round: {names}"
+        assert not names, f"these files exist without need, or are missing: {names}"
         assert there == asked
 
 
@@ -278,7 +278,7 @@ def _purpose(entry: Mapping[str, Any]) -> str:
 
 
 def run(scenario: Scenario) -> None:
-    """Run every step, and raise an AssertionError if its effects are not the expected ones."""
+    """Run all steps; raise an AssertionError if a step has other effects than it expects."""
     files = configuration(scenario.appdefs, scenario.config)
     world = World(State.of(load(files), Ledger()), files)
     for number, step in enumerate(scenario.steps, 1):
@@ -328,7 +328,7 @@ def _take(step: Step, world: World, place: str) -> None:
 
 
 def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
-    """Yield each difference between the decision on a demand and what its step expects."""
+    """Yield each difference between the decision on a demand and the step's expectation."""
     if isinstance(taken, Refused):
         told = "\n".join(f"{found.code}: {found}" for found in taken.faults)
         if step.refused is None:
@@ -355,7 +355,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
 
 
 def same_faults(wanted: Iterable[Told], found: Iterable[Fault]) -> bool:
-    """Return whether every fault found is expected, and every expected fault is found."""
+    """Return whether the faults found are exactly the expected ones."""
     wanted, found = list(wanted), list(found)
     return len(wanted) == len(found) and all(
         any(told.fits(fault) for fault in found) for told in wanted
@@ -367,7 +367,7 @@ def _of_connections(world: World, what: str) -> dict[str, list[str]]:
 
 
 def _since_start(moment: datetime) -> str:
-    """Return a moment as the duration since the scenario's start, as ``1h30m``."""
+    """Return a time as the duration since the scenario's start, like ``1h30m``."""
     rest = int((moment - START).total_seconds())
     parts = []
     for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):

@@ -1,1 +1,1 @@
-"""Generators in one thread with people and faults, all from a seed: ``make simulate``."""
+"""Histories of generators, people and faults in one thread, all from a seed: ``make simulate``."""

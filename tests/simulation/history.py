@@ -1,4 +1,4 @@
-"""A random history from a seed: about thirty steps, then faults are mended and all is checked."""
+"""A random history from a seed: about thirty steps; then all faults end, and all is checked."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ watcher: {nodeName: {{ (release | ros_name) ~ "_Watcher" }}}
 
 @lru_cache(maxsize=1)
 def template() -> Path:
-    """Return the state repo that every history copies; its nodes may become full.
+    """Return the state repo that every history copies.
 
-    It is in memory, and has leases and approval.
+    It is in memory, has leases and approval, and its nodes may become full.
     """
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
     files = GitRepo(path).files()
@@ -141,7 +141,7 @@ class History:
         )
 
     def run(self, steps: int) -> None:
-        """Let random things happen in ``steps`` steps, then mend all faults and check the end."""
+        """Play ``steps`` random steps, then mend all faults and check the end."""
         things = (
             [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
             + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
@@ -181,7 +181,7 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Send the release of a place, if one is held, together with two demands for places."""
+        """Send two demands for places at once, after the release of a place if one is held."""
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
@@ -304,8 +304,8 @@ class History:
     def set_clocks(self) -> None:
         """Set the wall clocks forward or back; after a step back, only further back.
 
-        Otherwise a machine might notice neither step. It might then end a lease early that another
-        machine recorded between the two steps.
+        Otherwise a machine might notice neither of two steps. It might then end a lease early that
+        another machine recorded between the steps.
         """
         self.oracle.check()
         sign = self.chance.choice([-1, 1]) if self.turns.offset == self._latest else -1
@@ -345,7 +345,7 @@ class History:
         self._commit({NODES: yaml.safe_dump(data)})
 
     def _drain(self) -> None:
-        """Drain a node, or end its draining; the node is mostly one in use."""
+        """Drain a node, mostly one in use, or end its draining."""
         self.oracle.check()
         data, books = yaml.safe_load(self._files(NODES)[NODES]), self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
@@ -356,7 +356,7 @@ class History:
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
     def _stop_waiting(self) -> None:
-        """Delete the file of a demand that waits."""
+        """Delete the file of a waiting demand."""
         self.oracle.check()
         if found := sorted(self._files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
@@ -365,7 +365,7 @@ class History:
             self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
 
     def _come_down(self) -> None:
-        """Delete the record of replicas that a service keeps."""
+        """Delete the record of the replicas that a service keeps."""
         self.oracle.check()
         if found := sorted(self._files(KEPT_REPLICAS).items()):
             path, text = self.chance.choice(found)
@@ -420,7 +420,7 @@ class History:
 
 
 def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
-    """Play the history of a seed; return the last commit, and counts of what happened."""
+    """Play the history of a seed; return the last commit, and how often each thing happened."""
     with TemporaryDirectory(dir=MEMORY, prefix="simulation-") as folder:
         world = World(seed, template(), Path(folder), machines=1 + seed % 3)
         history = History(world)

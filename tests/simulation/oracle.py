@@ -1,4 +1,4 @@
-"""Checks of a history: each commit on main and each answer must be possible in the model."""
+"""Check a history: the model must allow each commit on main and each answer."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from tests.simulation.world import Machine, World
 
 SLACK_S = 30
 PLACES = frozenset({"rack0", "rack1"})
-"""The nodes that have room for one application each, if its demand names no node."""
+"""The nodes with room for one application each; they serve demands that name no node."""
 KEPT_REPLICAS = "ledger/replicas"
 VISITOR = "visitor"
-"""The start of the ids of requesters whose demands need approval."""
+"""A requester whose id starts with this needs approval for its demands."""
 
 
 @dataclass(eq=False)
@@ -56,7 +56,7 @@ class Asked:
     def subjects(self) -> set[Subject]:
         """The subjects of the demand, and the demand's name.
 
-        Demands that have one of these in common are booked in the order in which they were sent.
+        Demands that share one of these are booked in the order in which they were sent.
         """
         found = {("demand", self.goal["demand"])} if "demand" in self.goal else set()
         kinds = ("applications", "connections")
@@ -64,18 +64,18 @@ class Asked:
 
 
 class Oracle:
-    """Follows main and the answers, and fails when one of them contradicts the model."""
+    """Follows main and the answers, and fails when the model does not allow one of them."""
 
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
         self.edits: dict[str, Callable[[Instances], object]] = {}
-        """What people's commits change in the model, by the commit's id."""
+        """The change that a person's commit makes in the model, by the commit's id."""
         self.counts = Counter[str]()
         self._seen = world.tip
         self.books = Instances(SLACK_S, nodes=PLACES)
         self._pushed_at = world.turns.monotonic()
-        """When the oracle last found a new tip of main."""
+        """The time at which the oracle last found a new tip of main."""
         self._models = [deepcopy(self.books)]
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
@@ -100,7 +100,7 @@ class Oracle:
         return asked
 
     def check(self) -> None:
-        """Follow main; fail if anything contradicts the model since the last check."""
+        """Follow main; fail if anything since the last check contradicts the model."""
         self._guard(self._follow_main)
         if self.world.failure is not None:
             raise self.world.failure
@@ -168,7 +168,7 @@ class Oracle:
     def _compare_instances(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> None:
-        """Fail unless the rendered instances and the kept replicas are those of the model."""
+        """Fail unless the model has the rendered instances and keeps the same replicas."""
         entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
         self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
         for one in self.books.kept.keys() | records.keys():
@@ -190,7 +190,7 @@ class Oracle:
     def _time_of_own_work(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> datetime:
-        """Return when a generator acted on its own.
+        """Return the time at which a generator acted without a demand.
 
         A new record of kept replicas gives the exact time. Otherwise it is the time of the commit.
         """
@@ -216,9 +216,10 @@ class Oracle:
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
-        """Update the model with what a generator did on its own.
+        """Update the model with a generator's act that no demand asked for.
 
-        It ended leases, booked a waiting demand, or moved applications away from a drained node.
+        The generator ended leases, booked a waiting demand, or moved applications away from a
+        drained node.
         """
         both = self._claims.keys() & claims.keys()
         moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
@@ -230,12 +231,13 @@ class Oracle:
             self.books.moved(demand, subject)
         if gone := self._claims.keys() - both:
             self._end_leases(gone, machine, started, time)
-        assert moved or gone or let_in, "an operation that nobody asked for"
+        assert moved or gone or let_in, "a generator acted without a reason"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
         """Return the operations of a commit and of all commits that it merges.
 
-        Each comes with whether it was proposed. The lease of a proposed demand starts at the merge.
+        With each comes whether a proposal had it: the lease of a proposed demand starts at the
+        merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:
@@ -277,7 +279,7 @@ class Oracle:
     def _guard(self, check: Callable[[], object]) -> None:
         """Run a check; keep its failure for the next :meth:`check`.
 
-        Generators and futures would catch most errors.
+        Generators and futures catch most errors, so a failure that is only raised would be lost.
         """
         try:
             check()
@@ -308,7 +310,9 @@ class Oracle:
         else:
             assert place is not None, f"{operation} is acknowledged, but not on main"
             if not asked.needs_approval:
-                assert self._last.get(asked.machine, 0) <= place, "acknowledged in another order"
+                assert self._last.get(asked.machine, 0) <= place, (
+                    "the acknowledgements came in another order than the commits"
+                )
                 self._last[asked.machine] = place
 
     def _assert_possible(self, asked: Asked, outcome: str) -> None:
@@ -324,7 +328,7 @@ class Oracle:
     # ---- machines ----
 
     def _check_resumed(self, machine: Machine) -> None:
-        """Fail if a machine lost a demand in a crash; watch for the other demands' answers."""
+        """Fail if a machine lost a demand in a crash; watch the answers to its other demands."""
         self._last.pop(machine, None)
         assert machine.generator is not None
         tickets = machine.generator._demands._tickets
@@ -345,7 +349,7 @@ class Oracle:
                 )
 
     def check_end(self) -> None:
-        """Fail unless all demands are answered, and all that is booked is in effect.
+        """Fail unless all demands are answered, and all booked demands are in effect.
 
         The check comes long after all faults were mended.
         """
@@ -377,7 +381,7 @@ def _made(commit: pygit2.Commit) -> datetime:
 
 
 def _records_in(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    """Return how many replicas each instance keeps, and until when."""
+    """Return the numbers of replicas that each instance keeps, each with its end."""
     return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
 
 
@@ -391,7 +395,7 @@ def _record(text: str) -> tuple[Instance, dict[int, datetime]]:
 
 
 def _counters(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
-    """Yield namespace, version, topics and replicas of each instance as it is rendered."""
+    """Yield namespace, version, topics and replicas of each rendered instance."""
     for path, text in trees.texts(commit.tree, ["clusters"]).items():
         if Path(path).name.startswith("ta-"):
             yield _counter(text)

@@ -58,7 +58,7 @@ def main() -> int:
 
 
 def told(counts: Counter[str]) -> str:
-    """Return counts as one line of text."""
+    """Return the counts as one line of text."""
     names = (
         "histories",
         "demands",

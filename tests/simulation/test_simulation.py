@@ -1,4 +1,4 @@
-"""A seed determines the whole history, and the oracle finds each fault that is planted."""
+"""A seed determines the whole history, and the oracle finds each planted fault."""
 
 from __future__ import annotations
 
@@ -263,9 +263,9 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     take_the_first_domain: 1,
     forget_what_is_booked_in_a_domain: 26,
 }
-"""Each planted fault, with a seed that found it at once when this was written.
+"""Each planted fault, with a seed that found it at once when the test was written.
 
-If that seed no longer finds the fault, other seeds are tried.
+If that seed no longer finds the fault, the test tries other seeds.
 """
 
 

@@ -33,7 +33,7 @@ _JOURNAL = "outbox.jsonl"
 
 
 class Machine(Runtime):
-    """A machine with one generator, which may die and start again."""
+    """A machine with one generator, which may crash and start again."""
 
     def __init__(self, world: World, name: str) -> None:
         super().__init__()
@@ -77,22 +77,22 @@ class Machine(Runtime):
         self.world.on_start(self)
 
     def failed(self, name: str, error: Exception) -> None:
-        """Make an unexpected error the world's failure."""
+        """Take an unexpected error for the world's failure."""
         super().failed(name, error)
         if not isinstance(error, DemandOpsError):
             self.world.failure = self.world.failure or error
 
     def may_crash(self) -> None:
-        """Crash at the call that ``crashes_in`` has set; the calling thread never goes on."""
+        """Crash if ``crashes_in`` has chosen this call; the calling thread then never goes on."""
         if self.crashes_in and getcurrent() in self.threads:
             self.crashes_in -= 1
             if not self.crashes_in:
                 self.crash()
 
     def crash(self) -> None:
-        """Stop all threads and lose all but what the disk keeps.
+        """Stop all threads, and lose everything that is not on the disk.
 
-        What is kept moves to a new folder, which the stopped threads cannot reach.
+        The content of the disk moves to a new folder, which the stopped threads cannot reach.
         """
         self.world.dead += self.threads
         self.is_up, self.generator, self.crashes_in = False, None, 0
@@ -114,7 +114,7 @@ class Machine(Runtime):
 
 
 class Disk:
-    """What a disk keeps of a journal: names and contents at the last forced writes."""
+    """The durable part of a journal: names and contents at the last forced writes."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -122,7 +122,7 @@ class Disk:
         self._contents: dict[int, bytes] = {}
 
     def sync(self, path: Path) -> None:
-        """Record what a forced write of a file or a folder makes durable.
+        """Record the name or content that a forced write of a folder or file makes durable.
 
         The machine may crash before or after the write.
         """
@@ -141,7 +141,7 @@ class Disk:
     def left_of(self, folder: Path) -> bytes | None:
         """Return what is left of a journal after a crash; None if there is no journal.
 
-        The crash is one of the process, which loses nothing, or one of the whole machine.
+        Either the process crashes, which loses nothing, or the whole machine does.
         """
         chance, path = self._machine.turns.chance, folder / _JOURNAL
         now = {_JOURNAL: path.stat().st_ino} if path.exists() else {}
@@ -263,17 +263,17 @@ def _failed(command: tuple[str, ...], text: str) -> git.GitCommandError:
 
 
 class World:
-    """Machines that share a remote; the seed determines all that happens."""
+    """Machines that share a remote; the seed determines everything that happens."""
 
     def __init__(self, seed: int, template: Path, folder: Path, machines: int) -> None:
         self.turns, self.folder, self.numbers = Turns(seed), folder, count(1)
         self.remote = pygit2.Repository(str(shutil.copytree(template, folder / "remote.git")))
         self.pushed_by: dict[str, tuple[Machine, float, float]] = {}
-        """For each pushed tip of main: the machine, when its generator started, when it pushed."""
+        """For each pushed tip of main: the machine, its generator's start, the time of the push."""
         self.dead: list[Any] = []
         self.on_start: Callable[[Machine], object] = lambda machine: None
         self.failure: Exception | None = None
-        """The first thing that happened although it must not."""
+        """The first event that must not happen, if there was one."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
         self.last_jump = -1.0
@@ -281,7 +281,6 @@ class World:
 
     @property
     def tip(self) -> str:
-        """The id of the newest commit of main."""
         return str(self.remote.references[MAIN].target)
 
     @contextmanager
@@ -311,11 +310,11 @@ class World:
             self.turns.end(self.dead)
 
     def set_clocks(self, seconds: float) -> None:
-        """Move the wall clocks of all machines by some seconds, as one time server does."""
+        """Move the wall clocks of all machines by some seconds, as a common time server does."""
         self.turns.set_by(seconds)
         if seconds > 0:
             self.last_jump = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
-        """Return a wall clock's time in seconds, to be compared with other results only."""
+        """Return a wall clock's time in seconds; it can only be compared with other results."""
         return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)

@@ -1,4 +1,4 @@
-"""What each command prints on a terminal of 80 columns, for one small fleet."""
+"""The output of each command on a terminal of 80 columns, for one small fleet."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ CHANGING = (
     "version",
     "watch --state-repo fleet.git",
 )
-"""Commands that change the fleet, so each runs in a copy of it."""
+"""Commands that change the fleet; each runs in a copy of it."""
 
 NOT_SHOWN = {
     "demand": "needs a running node",
@@ -86,7 +86,7 @@ NOT_SHOWN = {
     "serve": "prints nothing but its log",
     "web": "prints an address",
 }
-"""The commands whose output has no file in `expected`, with the reason; their help has one."""
+"""The commands whose output has no file in `expected`, with the reason; each has a help text."""
 
 _HEX = re.compile(
     r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<=after commit )[0-9a-f]{12}"
@@ -99,7 +99,7 @@ _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """Make a fleet with demands, a lease, overrides and contexts in ``folder``.
 
-    Afterwards the process runs in ``folder``, and its clock stands at ``NOW``.
+    Afterwards ``folder`` is the process's working directory, and its clock stands still at ``NOW``.
     """
     made, clock = count(), [NOW - timedelta(hours=3)]
     patch.setattr(REAL, "now", lambda: clock[0])
@@ -149,7 +149,7 @@ def _done(command: str) -> None:
 
 
 def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
-    """Return what a command prints, without colors and with one fixed value for all commit ids."""
+    """Return the output of a command without colours, and with the same text for all commit ids."""
     with patch.context() as own, TemporaryDirectory() as folder:
         own.setenv("NO_COLOR", "1")
         if command in CHANGING:
@@ -190,11 +190,11 @@ def _help(command: click.Command, name: str, parent: click.Context) -> Iterator[
 
 
 def same_ids(text: str) -> str:
-    """Return a text in which every commit id consists of the letter `c`."""
+    """Return a text in which the letter `c` replaces each digit of the commit ids."""
     return _HEX.sub(lambda found: "c" * len(found[0]), text)
 
 
 def file_of(command: str) -> Path:
-    """Return the file with the expected output of a command."""
+    """Return the path of the file with the expected output of a command."""
     words = command.split(" -C ", maxsplit=1)[0].replace(" --state-repo fleet.git", "")
     return FOLDER / (re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-") + ".txt")

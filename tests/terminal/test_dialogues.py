@@ -1,4 +1,4 @@
-"""Commands on a pseudoterminal: their questions, and what they show while git is slow."""
+"""Commands on a pseudoterminal: their questions, and their output while git is slow."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.kit.http import kubeconfig
 from tests.kit.repo import GitRepo
 
 
-def test_what_is_not_given_is_asked_for(checkout: Path) -> None:
+def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
     with Dialogue("new", "application", "tracking", folder=checkout) as talk:
         talk.read_until("such as camera=sensor_msgs/msg/Image; several with spaces: ")
         talk.type("camera\n")
@@ -42,7 +42,7 @@ def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) ->
     shown, _, after = talk.text.rpartition("\x1b[2K")
     assert f"fetching {url}, 1 s" in shown
     assert "fetching" not in after
-    assert not after.strip(), "nothing is demanded"
+    assert not after.strip(), "the command printed rows although nothing is demanded"
 
 
 def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c_or_a_time_has_passed(

@@ -40,7 +40,7 @@ def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPat
 
 @pytest.fixture(autouse=True)
 def _home(data_home: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Make each test use the journals of the fleet instead of its own."""
+    """Let each test use the journals of the fleet instead of its own."""
     with pytest.MonkeyPatch.context() as made:
         made.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
         yield
@@ -53,7 +53,7 @@ def test_it_prints_what_it_printed(command: str, patch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch) -> None:
-    """In a pipe the command prints everything, so each word on the terminal must be there too."""
+    """In a pipe a command prints everything, so each word of the terminal must be there too."""
     lines = file_of(command).read_text().splitlines()
     wider = [line for line in lines if line.startswith("more columns in a wider terminal: ")]
     piped = {*words(same_ids(demandops(*shlex.split(command)).out)), *words(" ".join(wider))}
@@ -64,9 +64,9 @@ def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("command", CHANGING[:-1])
 def test_no_name_is_cut_where_something_changes(command: str, patch: pytest.MonkeyPatch) -> None:
-    """No word is cut: each one also occurs in the output at 1000 columns.
+    """No word is cut: each word also occurs in the output at 1000 columns.
 
-    ``watch`` is left out, because it cuts its output to the height of the terminal.
+    The test leaves out ``watch``, which cuts its output to the height of the terminal.
     """
     whole = {*words(printed(command, patch, columns=1000))}
     assert {*words(file_of(command).read_text())} <= whole
@@ -91,7 +91,7 @@ def test_every_command_is_shown_or_says_why_not() -> None:
 
 
 def schema_of(command: str) -> str:
-    """Return the name of the schema of a command's JSON: its name, and that of its subcommand."""
+    """Return the name of the schema of a command's JSON: the command, and its subcommand if any."""
     words = command.split()
     return "-".join(words[: 2 if words[0] in ("config", "override") else 1])
 

@@ -22,7 +22,6 @@ from tests.terminal.outputs import (
 
 
 def main() -> None:
-    """Write the expected output and the help of every command."""
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:

@@ -18,7 +18,7 @@ from demandops.http_call import HttpAnswer, NoAnswer
 
 from tests.kit.http import Answer, serving
 
-SECRET = "s3cret"  # noqa: S105 - it opens nothing
+SECRET = "s3cret"  # noqa: S105 - no real secret
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def call(url: str, timeout: float = 5.0) -> HttpAnswer:
 def speaking(
     *chunks: bytes, pause: float = 0.0, tls: ssl.SSLContext | None = None
 ) -> Iterator[str]:
-    """Serve one connection: send these chunks with a pause after each, and close it."""
+    """Serve one connection: send the chunks with a pause after each, then close it."""
 
     def speak() -> None:
         try:

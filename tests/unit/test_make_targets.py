@@ -17,7 +17,6 @@ TARGETS = ("test", "test-packages", "page", "docs", "simulate", "faults", "e2e",
 
 @lru_cache
 def files_run_by(target: str) -> frozenset[Path]:
-    """Return the test files that a target runs."""
     environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
     printed = subprocess.run(
         ["make", "--dry-run", "--no-print-directory", target],

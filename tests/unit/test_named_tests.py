@@ -1,4 +1,4 @@
-"""The tests that the documentation names exist."""
+"""Each test that the documentation names exists."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NAMED = re.compile(r"`(tests/[\w/]+\.py)::([\w:]+)(?:\[([^\]`]+)\])?`")
 
 
 def names_in(file: Path) -> set[str]:
-    """Return the functions of a test file, ``Class::function`` for methods."""
+    """Return the names of the tests in a file; a method is ``Class::function``."""
     found = set[str]()
     for node in ast.parse(file.read_text()).body:
         for each in node.body if isinstance(node, ast.ClassDef) else ():

@@ -1,4 +1,4 @@
-"""``demandops log --operation`` takes the operation of every commit that the program makes."""
+"""``demandops log --operation`` accepts the operation of every commit that the program makes."""
 
 from __future__ import annotations
 

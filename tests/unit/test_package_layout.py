@@ -26,10 +26,11 @@ SAME_NAME = {
     "flux": "render/gitops writes Flux's files, cluster/health reads Flux's objects",
     "argocd": "render/gitops writes Argo CD's files, cluster/health reads Argo CD's objects",
 }
-"""The module names that may occur more than once, and why."""
+"""The module names that may occur more than once, with the reason."""
 
 COMMANDS = PACKAGES[0] / "cli"
-"""A module in this folder has the name of its command, even if another folder has that name too."""
+"""The folder of the commands; a module in it has its command's name, which other folders may use.
+"""
 
 
 def dotted(path: Path) -> str:
@@ -73,7 +74,7 @@ def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
 
 
 def test_only_the_runtime_reads_a_clock_or_starts_threads() -> None:
-    """The import contract `door-runtime` cannot check this, because `datetime` may be imported."""
+    """The import contract `door-runtime` cannot check this, because it must allow `datetime`."""
     uses = re.compile(r"\b(datetime|date)\.(now|utcnow|today)\(|PoolExecutor\b|\burandom\(")
     assert [dotted(path) for path in MODULES if uses.search(path.read_text())] == [
         "demandops.runtime.py"

@@ -1,4 +1,4 @@
-"""The public surface is `public_surface.yaml`. A change of that file is a change for users.
+"""The public surface is `public_surface.yaml`; a change of that file is a change for users.
 
 Everything else is internal. `docs/public-api.md` is the same list for people.
 """
@@ -60,7 +60,7 @@ def client() -> Json:
 
 
 def members(exported: Any) -> Json | str:
-    """Return the documented constructor, methods and fields of a class."""
+    """Return the arguments of a class's documented constructor, public methods and fields."""
     if not inspect.isclass(exported):
         return "type"
     names = ["__init__"] if getattr(vars(exported).get("__init__"), "__doc__", None) else []
@@ -103,7 +103,7 @@ def files() -> Json:
 
 
 def fields_of_schema(schema: Json) -> Json:
-    """Return the names of fields by the path of the mapping that has them."""
+    """Return the names of the fields in each mapping of a schema, by the mapping's path."""
     found: dict[str, list[str]] = {}
     for parent, name in walk(schema, schema.get("$defs", {}), ""):
         names = found.setdefault(parent or "(top)", [])

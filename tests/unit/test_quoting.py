@@ -56,7 +56,7 @@ def test_no_kind_of_character_without_a_glyph_is_visible() -> None:
 
 def test_faults_and_errors_are_one_line_each() -> None:
     found = fault(HOSTILE, HOSTILE).within(HOSTILE)
-    assert found.file == HOSTILE, "a program finds the file by it"
+    assert found.file == HOSTILE, "a program needs the file's exact name"
     assert is_visible(str(found)) and len(str(found)) < 4 * LONGEST_LINE
     assert len(str(InvalidInput([found, found])).splitlines()) == 2
     assert is_visible(str(StateRepoError(f"cannot be read: {HOSTILE}")))

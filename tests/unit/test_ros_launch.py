@@ -1,4 +1,4 @@
-"""The launch files of the ROS package. No test can run them: PyPI has no wheels of ROS's launch."""
+"""The launch files of the ROS package; no test can run them, because PyPI lacks ROS's launch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_the_launch_file_takes_the_arguments_of_the_reference_s() -> None:
     assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", "serve")
     used = re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(node, "unicode"))
     assert sorted(used) == sorted(arguments)
-    # the values of the file come later, so they take precedence
+    # the values of the file come last, so they take precedence
     assert [sorted(each.keys()) for each in node.findall("param")] == [["name", "value"], ["from"]]
 
 

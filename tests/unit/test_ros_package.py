@@ -1,4 +1,4 @@
-"""What ``import demandops_ros`` gives, and what it imports only on use."""
+"""The public names of ``demandops_ros``, and the imports that it makes only on use."""
 
 from __future__ import annotations
 

@@ -24,12 +24,12 @@ def test_a_thread_that_fails_is_started_again_and_told_once(
     turns.sleep(0.5)
     assert turns.failures == {"watch": "KeyError('odd')"}
     thread.join()
-    assert began == [0, 1, 3, 7], "each pause is longer"
+    assert began == [0, 1, 3, 7], "each pause must be longer"
     told = [record for record in caplog.records if record.levelno >= logging.INFO]
     assert [record.getMessage() for record in told] == ["internal error in watch: KeyError('odd')"]
     assert told[0].exc_info is not None
     turns.sleep(200)
-    assert turns.failures == {}, "it works again"
+    assert turns.failures == {}, "a thread that works again has no failure"
 
 
 def test_what_works_again_may_fail_again(caplog: pytest.LogCaptureFixture) -> None:
@@ -43,7 +43,7 @@ def test_what_works_again_may_fail_again(caplog: pytest.LogCaptureFixture) -> No
     assert caplog.messages == ["the tip cannot be read"] * 2
 
 
-def test_after_what_is_unsound_nothing_is_started_again() -> None:
+def test_a_thread_that_ends_as_unsound_is_not_restarted() -> None:
     turns, told = Turns(1), list[object]()
     turns.when_unsound = lambda: told.append(turns.unsound)
 

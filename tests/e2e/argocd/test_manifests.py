@@ -1,8 +1,11 @@
 """The API server accepts all golden manifests in a dry run with Argo CD's own definitions."""
 
 from tests.e2e.common.steps import (
-    test_the_server_does_look,
+    test_the_dry_run_refuses_an_unknown_field,
     test_the_server_takes_every_golden_manifest,
 )
 
-__all__ = ["test_the_server_does_look", "test_the_server_takes_every_golden_manifest"]
+__all__ = [
+    "test_the_dry_run_refuses_an_unknown_field",
+    "test_the_server_takes_every_golden_manifest",
+]

@@ -51,7 +51,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 @pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
-    """Return a function: the Applications that the webhook refreshed since its last call."""
+    """Return a function: it names the Applications refreshed by the webhook since its last call."""
     log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
 
     def names() -> set[str]:

@@ -1,6 +1,6 @@
 """An access domain on a cluster that Argo CD reconciles: its folder's Application and its releases.
 
-It reads the API and triggers Argo CD; it changes no object that Argo CD or a release owns.
+This module reads the API and triggers Argo CD; it changes no object that Argo CD or a release owns.
 """
 
 from __future__ import annotations

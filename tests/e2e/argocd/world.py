@@ -29,8 +29,8 @@ class World(StateRepo[Domain]):
         def is_permitted() -> bool:
             """Return whether Argo CD has read the folder.
 
-            Argo CD may apply a former project of this name for minutes. If that forbids the folder,
-            this refreshes the folder.
+            Argo CD may apply a former project of this name for minutes. If that project forbids the
+            folder, refresh the folder.
             """
             trouble = domain.trouble(domain.name, NAMESPACE)
             if "is not permitted in project" in trouble:

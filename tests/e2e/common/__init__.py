@@ -1,1 +1,1 @@
-"""What the end-to-end tests with Flux and with Argo CD share, from a ROS 2 goal to the pods."""
+"""Code that the end-to-end tests with Flux and Argo CD share, from a ROS 2 goal to the pods."""

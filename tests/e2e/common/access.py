@@ -17,7 +17,7 @@ _STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
 
 
 def access_file(folder: Path, cluster: str, **connection: object) -> Path:
-    """Write and return a clusters file, in which the operator describes the access to a cluster."""
+    """Write a clusters file with an operator's access to one cluster; return its path."""
     file = folder / "clusters.yaml"
     clusters = {cluster: {key: str(value) for key, value in connection.items()}}
     content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}
@@ -26,7 +26,7 @@ def access_file(folder: Path, cluster: str, **connection: object) -> Path:
 
 
 def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
-    """Return the role rules that docs/status.md requires with a controller, by namespace."""
+    """Return the role rules that docs/status.md lists for a controller, by namespace."""
     blocks = re.findall(r"```yaml\n(.*?)```", _STATUS_PAGE.read_text(), re.DOTALL)
     (block,) = [text for text in blocks if f"# with {gitops}\n" in text.lower()]
     roles = list(yaml.safe_load_all(block))
@@ -36,7 +36,7 @@ def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
 def limited(
     kube: Kube, administrator: Path, folder: Path, rights: Mapping[str, Sequence[Manifest]]
 ) -> Path:
-    """Write and return a kubeconfig whose account has only these rights, given by namespace."""
+    """Write a kubeconfig whose account has only these rights, by namespace; return its path."""
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}

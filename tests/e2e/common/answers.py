@@ -1,4 +1,4 @@
-"""Tests of the time at which demands are answered, the same with each controller.
+"""Tests of when demands are answered; they run with Flux and with Argo CD.
 
 A test module derives its class from :class:`Answers` and defines the fixture `world`.
 """
@@ -136,7 +136,7 @@ class Answers:
     def test_a_change_is_healthy_when_the_changed_service_runs(
         self, world: World, requester: DemandClient
     ) -> None:
-        """Only the health of the changed service counts, not its health before the change."""
+        """The answer waits for the health after the change, not for the health before it."""
         domain = world.domain
         requester.put("d", [FUSION], answer="healthy")
         for vehicles in (("vehicle00", "vehicle01"), ("vehicle00",), ("vehicle00", "vehicle02")):
@@ -154,7 +154,7 @@ class Answers:
     def test_not_answered_before_it_is_healthy(
         self, world: World, requester: DemandClient, edge_is_full: Callable[[], None], rig: Rig
     ) -> None:
-        """The stage reconciled comes at once; healthy comes when the edge accepts pods again."""
+        """The demand is reconciled at once, and healthy only when the edge accepts pods again."""
         reconciled = threading.Event()
 
         def on_stage(stage: str, text: str) -> None:

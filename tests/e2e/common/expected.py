@@ -1,7 +1,7 @@
 """The objects that must exist after each step of the paper's experiment, one per line.
 
-They come from the paper's table, not from the program. The names are literals. An object exists
-if its row of `examples/experiment/paper.py` has requesters.
+The lines follow from the paper's table, not from the program; their names are literals. An object
+exists if its row of `examples/experiment/paper.py` has requesters.
 """
 
 from __future__ import annotations
@@ -39,7 +39,6 @@ WITHOUT_DEMANDS = frozenset({"ConfigMap demandops-domain", "ConfigMap kube-root-
 
 
 def demand(step: int) -> dict[str, Any]:
-    """Return the goal of a step."""
     (file,) = EXPERIMENT.glob(f"{step}-*.yaml")
     goal: dict[str, Any] = yaml.safe_load(file.read_text())
     return goal
@@ -61,7 +60,7 @@ def target_end(node: str) -> str:
 
 
 def after(step: int, nodes: Collection[str] = NODES) -> frozenset[str]:
-    """Return the lines of exactly what must exist after a step, on a cluster with these nodes."""
+    """Return a line for each object that must exist after a step on a cluster with these nodes."""
     rows = paper.expected(step) if step else {}
     lines = [line for row in rows for node, line in _of_row(row, rows) if node in nodes]
     return WITHOUT_DEMANDS | frozenset(lines)
@@ -95,5 +94,5 @@ def _deployed(node: str, name: str) -> tuple[str, str]:
 
 
 def unscheduled(lines: frozenset[str]) -> frozenset[str]:
-    """Return the same lines, but with all pods of the edge unscheduled and not ready."""
+    """Return these lines as they are while no pod of the edge is scheduled."""
     return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)

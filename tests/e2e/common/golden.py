@@ -1,4 +1,4 @@
-"""The manifests in the golden cases that a cluster gets."""
+"""The manifests that clusters get in the golden cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a mistake or an attacker might commit to the folder of an access domain."""
+"""Manifests that a mistake or an attacker might commit to the folder of an access domain."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ FORBIDDEN = {
     "any node": (pod(nodeSelector={}), _ELSEWHERE),
     "a node of nobody": (pod(nodeSelector={"kubernetes.io/os": "linux"}), _ELSEWHERE),
 }
-"""Pod specs that the skeleton's access domain may not have, each with the refusal's reason."""
+"""Pod specs that the skeleton's access domain must refuse, each with the refusal's reason."""
 
 
 def makers(spec: Manifest) -> Iterator[Manifest]:
-    """Yield one object of each kind that makes pods, all with this pod spec."""
+    """Yield one object of each kind that makes pods, with this pod spec."""
     labels = {"app": "foreign"}
     template = {"metadata": {"labels": labels}, "spec": spec}
     once = {"template": {**template, "spec": {**spec, "restartPolicy": "Never"}}}

@@ -8,7 +8,7 @@ from .namespace import Namespace
 
 
 def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of a goal with another requester."""
+    """Return a copy of a goal whose requesters are this vehicle and station00."""
     requesters = {"requester_ids": [vehicle, "station00"]}
     apps = [
         app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
@@ -19,13 +19,11 @@ def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
 
 
 def pod_template(namespace: Namespace, deployment: str) -> dict[str, Any]:
-    """Return the pod template of a Deployment."""
     template: dict[str, Any] = namespace.get("Deployment", deployment)["spec"]["template"]
     return template
 
 
 def change_image(namespace: Namespace, deployment: str) -> None:
-    """Change the image of a Deployment."""
     containers = pod_template(namespace, deployment)["spec"]["containers"]
     containers[0]["image"] = "example.invalid/other:1"
     body = {"spec": {"template": {"spec": {"containers": containers}}}}

@@ -74,7 +74,6 @@ class Namespace:
         return frozenset(found) | {f"twice: {line}" for line in repeated}
 
     def releases(self) -> dict[str, Any]:
-        """Return the spec of every release, by its name."""
         return {name_of(item): item["spec"] for item in self.find(self.RELEASE)}
 
     def inventory(self) -> frozenset[str]:
@@ -147,9 +146,9 @@ class Namespace:
         self.kube.delete(kind, name, self.namespace)
 
     def restore(self, *releases: str) -> None:
-        """Make the controller restore these releases, or without any the domain's folder.
+        """Make the controller restore these releases, or the domain's folder if none is named.
 
-        Does nothing if the controller restores them by itself.
+        By default this does nothing, for a controller that restores them by itself.
         """
 
     # --- waiting ----------------------------------------------------------------------------
@@ -159,7 +158,7 @@ class Namespace:
         return self._wait_same(self.lines, wanted, timeout)
 
     def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
-        """Wait until `inventory` returns exactly this."""
+        """Wait until `inventory` returns exactly the wanted objects."""
         self._wait_same(self.inventory, wanted, timeout)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
@@ -237,7 +236,6 @@ def fusion_inputs(config: Manifest) -> list[str]:
 
 
 def name_of(item: Manifest) -> str:
-    """Return an object's name."""
     return str(item["metadata"]["name"])
 
 

@@ -2,7 +2,7 @@
 
 The process has a read-only root file system of its own, the pod's volumes at their mount paths, the
 pod's user, no privileges, and only the container's environment. It uses the network and the process
-ids of the machine. To start it needs root.
+ids of the machine. Starting it requires root.
 
 Unlike in a cluster, the process has no shared memory. Tests restrict ROS 2 to the loopback, where
 ROS 2 would use shared memory, and a client outside the container would miss every message.
@@ -28,8 +28,8 @@ from .volumes import files
 ROOT = Path(__file__).parents[3]
 IMAGE_VARIABLE = "E2E_IMAGE_ROOT"
 
-# Arguments: the root's folder, the image, the folders and the Python that stand for an image,
-# MODE:SOURCE:TARGET for each volume, user, group, and the command.
+# Arguments: the root's folder; the image; the folders and the Python that replace an image;
+# MODE:SOURCE:TARGET for each volume; user; group; and the command.
 _START = """
 root=$1 image=$2 folders=$3 python=$4 volumes=$5 user=$6 group=$7
 shift 7
@@ -107,7 +107,6 @@ class Pod:
         return self._process.poll()
 
     def start(self) -> None:
-        """Start the container."""
         container, security = self.container, self.manifest["spec"]["securityContext"]
         assert container["securityContext"]["readOnlyRootFilesystem"]
         sources = {

@@ -43,7 +43,7 @@ class Client(ros.Client):
     def call(self, sent: Goal) -> Sent:
         """Send a goal and wait for its result; send it again if no node accepts it in 3 s.
 
-        For a while the client still sees a killed server, and goals to that server are lost.
+        A client still sees a killed server for a while, and goals to that server are lost.
         """
         end = time.monotonic() + DEADLINE_S
         under_way, since = self.send(sent), time.monotonic()

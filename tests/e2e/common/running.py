@@ -1,4 +1,4 @@
-"""Context managers: a rig that runs, and state repos that exist, for the length of a block."""
+"""Context managers that start a rig, or create state repos, for the length of a block."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
 
 @contextmanager
 def worlds(make: Callable[[], World]) -> Iterator[Callable[[], World]]:
-    """Give a function that creates state repos, which no cluster follows yet.
+    """Yield a function that creates state repos, which no cluster follows yet.
 
-    The end of the block removes them.
+    The end of the block removes these state repos.
     """
     made: list[World] = []
 

@@ -35,7 +35,7 @@ _START_S = 60.0
 
 
 class Generator:
-    """A `demandops serve` process, which can be killed and started again."""
+    """A `demandops serve` process that a test can kill and start again."""
 
     def __init__(self, state_repo: str, folder: Path, ros_domain: int, client: Client) -> None:
         self.log = folder / "generator.log"
@@ -91,7 +91,7 @@ class Generator:
 class StateRepo(Generic[Domain]):
     """A state repo with its generator, for the controller of its rig.
 
-    `domains` has the state repo's access domain on each cluster that follows it, by cluster.
+    `domains` has the access domain on each cluster that follows the state repo, by cluster.
     """
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
@@ -115,7 +115,10 @@ class StateRepo(Generic[Domain]):
         raise NotImplementedError
 
     def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
-        """Apply the manifests of a bootstrap file; note the cluster-wide ones for `remove_wide`."""
+        """Apply the manifests of a bootstrap file.
+
+        `remove_wide` later removes those that are cluster-wide.
+        """
         kube.apply(*manifests)
         self._wide += [
             (kube, item)
@@ -138,22 +141,20 @@ class StateRepo(Generic[Domain]):
 
     @property
     def domain(self) -> Domain:
-        """The access domain, if exactly one cluster follows the state repo."""
+        """The access domain on the only cluster that follows the state repo."""
         (only,) = self.domains.values()
         return only
 
     def file(self, path: str) -> str:
-        """Return the content of a file on the remote's main."""
         self._pull()
         return (self.person.folder / path).read_text()
 
     def tip(self) -> str:
-        """Return the newest commit on the remote's main."""
+        """Return the newest commit on the remote's main branch."""
         self._pull()
         return self.person.git("rev-parse", "HEAD")
 
     def changed_by(self, commit: str) -> list[str]:
-        """Return the paths that a commit changed."""
         self._pull()
         return self.person.git("show", "--name-only", "--format=", commit).split()
 
@@ -179,11 +180,11 @@ class StateRepo(Generic[Domain]):
         return sent
 
     def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Send the goal of a step, and `follow` it."""
+        """Send the goal of a step and wait until it is carried out, as `follow` does."""
         return self.follow(self.demand(demand(number)), wanted, wake=wake)
 
     def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Wait until the only cluster has exactly the wanted lines after a goal that succeeded.
+        """Wait until the only cluster has exactly these lines after a goal that succeeded.
 
         Return when the goal reached each stage. With `wake` the test triggers the controller.
         """

@@ -64,7 +64,7 @@ def test_eight_steps_and_the_fusion_is_never_restarted(world: World, say: Report
 def test_a_service_that_cannot_start_is_reconfigured_and_removed(
     world: World, edge_is_full: object
 ) -> None:
-    """Demands do not wait for the service. By default Helm would wait for it for five minutes."""
+    """Later demands do not wait for it, although Helm waits five minutes by default."""
     domain = world.domain
     for step in (1, 2, 3):
         sent = world.demand(expected.demand(step))
@@ -102,7 +102,7 @@ def test_another_requester_changes_no_object_of_a_release(world: World) -> None:
     assert domain.releases() == releases
 
 
-def test_what_a_release_holds_is_restored(world: World) -> None:
+def test_deleted_and_changed_objects_of_a_release_are_restored(world: World) -> None:
     domain = running(world)
     detection, params = DETECTION["vehicle00"], f"{FUSION}-params"
     template, inputs = pod_template(domain, detection), domain.get("ConfigMap", params)["data"]
@@ -135,7 +135,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
     """The GitOps controller leaves the number of replicas to an autoscaler, if there is one.
 
     The cluster has no metrics, so its autoscaler only enforces the bounds, every 15 seconds. The
-    fusion's chart has a fixed number in its Deployment, as a third party's chart may have.
+    fusion's chart sets a fixed number in its Deployment, as a third party's chart may do.
     """
     domain, name = world.domain, DETECTION["vehicle00"]
 
@@ -155,7 +155,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Set replicas as an autoscaler does, and an image; wait until the image is restored."""
+        """Set replicas as an autoscaler does, change the image, and wait until it is restored."""
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)
@@ -189,7 +189,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
 
 def _autoscaled(world: World) -> dict[str, str | None]:
-    """Return the files of an application with autoscalers, whose fusion has a fixed number."""
+    """Return an appdef's files with autoscalers; the fusion's chart also sets a fixed number."""
     chart, registry = f"{CHART}/Chart.yaml", "registry/charts.yaml"
     deployment = "appdefs/charts/ros-service/templates/_deployment.yaml"
     named = re.sub(
@@ -244,21 +244,24 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
 
 
 def _controller(rig: Rig) -> list[str]:
-    """Make the namespace of the golden manifests; return the controller's kinds, and Deployment."""
+    """Make the namespace of the golden manifests.
+
+    Return the kinds of the controller's own objects, and Deployment.
+    """
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
     return [*PARTS[rig.gitops].KINDS, "Deployment"]
 
 
 def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
-    """The API server checks each golden manifest in a dry run, with the controller's CRDs."""
+    """The manifests use the controller's own kinds, whose CRDs the API server knows."""
     kinds = _controller(rig)
     manifests = list(golden(rig.gitops))
     assert {*kinds, "Role"} <= {manifest["kind"] for manifest in manifests}
     rig.kube.apply(*manifests, dry_run=True)
 
 
-def test_the_server_does_look(rig: Rig) -> None:
-    """The dry run does refuse a manifest with an unknown field."""
+def test_the_dry_run_refuses_an_unknown_field(rig: Rig) -> None:
+    """Without this check, `test_the_server_takes_every_golden_manifest` might prove nothing."""
     for kind in _controller(rig):
         broken = copy.deepcopy(next(item for item in golden(rig.gitops) if item["kind"] == kind))
         broken["spec"]["interwal"] = "1m"

@@ -35,18 +35,16 @@ class Times:
 
 
 class Table:
-    """The times of several demands, by title."""
+    """A table of the times of several demands, each with a title."""
 
     def __init__(self, heading: str) -> None:
         self._heading = heading
         self._rows: list[tuple[str, Times]] = []
 
     def add(self, title: str, times: Times) -> None:
-        """Add the times of a demand."""
         self._rows.append((title, times))
 
     def show(self, say: Callable[[str], None]) -> None:
-        """Print all rows, in seconds."""
         width = max(len(title) for title, _ in self._rows)
         say(f"\n{self._heading} (seconds)")
         say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in _STAGES))

@@ -14,7 +14,7 @@ _CHUNK = 64 * 1024
 
 
 class Relay:
-    """Forwards connections to the server of a URL; `pulls` counts the fetches through the relay."""
+    """Forwards connections to a URL's server; `pulls` counts the fetches through the relay."""
 
     def __init__(self, url: str) -> None:
         self._to = urlsplit(url)
@@ -27,7 +27,7 @@ class Relay:
 
     @property
     def url(self) -> str:
-        """The server's URL, but with the relay's address."""
+        """The server's URL with the relay's address in place of the server's."""
         return urlunsplit(self._to._replace(netloc=f"{LOOPBACK}:{self._port}"))
 
     def restore(self) -> None:

@@ -16,7 +16,7 @@ from demandops.staterepo.pull_request.helm import HELM_BIN
 from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.golden import golden
 from tests.e2e.common.steps import (
-    test_the_server_does_look,
+    test_the_dry_run_refuses_an_unknown_field,
     test_the_server_takes_every_golden_manifest,
 )
 from tests.e2e.rig.cluster import Rig
@@ -25,7 +25,10 @@ from tests.kit.cli import Run
 from tests.kit.golden import CASES as CASES_OF_GOLDEN
 from tests.kit.golden import whole
 
-__all__ = ["test_the_server_does_look", "test_the_server_takes_every_golden_manifest"]
+__all__ = [
+    "test_the_dry_run_refuses_an_unknown_field",
+    "test_the_server_takes_every_golden_manifest",
+]
 ROOT = Path(__file__).resolve().parents[3]
 APPDEFS = (ROOT / "appdefs", ROOT / "examples" / "lane-detection" / "appdefs")
 DETECTION = "appdefs/object-detection-fusion/charts/object-detection"
@@ -36,7 +39,7 @@ CHARTS = {
 }
 
 
-# Values that a person may set and that no golden case has.
+# Values that a person may set, but that no golden case has.
 _COMMON: dict[str, dict[str, Any]] = {
     "as it comes": {},
     "all set": {
@@ -141,7 +144,7 @@ def test_every_golden_release_gives_what_the_server_takes(
 
 
 def templated(rig: Rig, chart: Path, values: Path, release: str) -> list[Manifest]:
-    """Return the manifests that helm renders of a chart, with the namespace of an install."""
+    """Return the manifests that helm renders for a chart, with the namespace of an install."""
     text = rig.helm(
         "template", release, str(chart), f"--namespace={NAMESPACE}", f"--values={values}"
     )
@@ -153,7 +156,7 @@ def templated(rig: Rig, chart: Path, values: Path, release: str) -> list[Manifes
 
 @pytest.mark.parametrize("case", CASES_OF_GOLDEN)
 def test_kustomize_builds_the_folder_of_a_domain(case: str, tmp_path: Path) -> None:
-    """The result of `kubectl kustomize` is what the folder contains.
+    """`kubectl kustomize` builds exactly the objects that the folder contains.
 
     The folder itself has no kustomization.yaml, because each new release would change that file.
     """

@@ -1,4 +1,4 @@
-"""Two clusters follow one state repo; the link of the vehicles' cluster can be cut."""
+"""Two clusters follow one state repo; a test can cut the link of the vehicles' cluster."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""In each step of the experiment a part is killed and restarted; the end state stays the same."""
+"""The end state is right although a part is killed and restarted in each step of the experiment."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def test_eight_steps_with_a_kill_in_each(world: World, rig: Rig, say: Report) ->
         play(world, expected.demand(step))
         domain.wait_lines(expected.after(step))
         say(f"  {step}: {what}: end state after {time.monotonic() - start:.1f} s")
-        assert world.commits_since(before) == 1, "one demand, one commit"
+        assert world.commits_since(before) == 1, "one demand must become one commit"
     domain.wait_inventory(at_first)
 
 
 def helm_at_work(world: World, goal: dict[str, Any]) -> None:
-    """Kill helm-controller as soon as Helm has stored a release, pending or just installed."""
+    """Kill helm-controller as soon as Helm has stored a release, be it pending or installed."""
     domain = world.domain
     world.demand(goal)
     domain.wake()
@@ -72,7 +72,7 @@ def send_until_committed(world: World, goal: dict[str, Any]) -> None:
 
 
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
-    """Kill the generator with a commit that it cannot push; the next generator pushes it."""
+    """Kill the generator when it has a commit that it cannot push; the next generator pushes it."""
     before = world.tip()
     world.rig.stop_component("git")
     try:
@@ -89,10 +89,10 @@ def generator_without_git(world: World, goal: dict[str, Any]) -> None:
 
 
 def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
-    """Kill the generator in a `git push`, then start it again and repeat the goal.
+    """Kill the generator in a `git push`, then start it again and send the goal again.
 
-    The push survives the generator and may succeed, which the next generator notices. The goal must
-    add demands: if it released some, its repetition could never make a second commit.
+    The push survives the generator and may succeed; the next generator must notice that. The goal
+    must add demands: the repetition of a release could never make a second commit.
     """
     world.rig.pause("git")
     try:
@@ -107,7 +107,6 @@ def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
 
 
 def killed(world: World, controller: str) -> None:
-    """Kill one of Flux's controllers and start it again."""
     world.rig.kill(controller)
     world.rig.start_component(controller)
 

@@ -117,7 +117,6 @@ class Deployed:
         self.pods = [Pod(rig.kube, name, NAMESPACE, address, folder) for name in names]
 
     def install(self) -> None:
-        """Install the chart, or upgrade it."""
         given = self.folder / "values.json"
         given.write_text(json.dumps(self.values))
         options = ["--install", f"--namespace={NAMESPACE}", f"--values={given}"]
@@ -261,7 +260,7 @@ def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
     active.kill()
     deployed.wait_text(standby, "taking demands on")
     deployed.start_git()
-    assert deployed.subjects() == before, "the other pod knows nothing of it"
+    assert deployed.subjects() == before, "the other pod must not have booked the demand"
     slow = deployed.repository / "hooks" / "pre-receive"
     slow.write_text("#!/bin/sh\nsleep 5\n")
     slow.chmod(0o755)

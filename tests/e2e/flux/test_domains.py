@@ -58,7 +58,7 @@ def slip_in(world: World, neighbour: Domain) -> Iterator[SlipIn]:
 
 
 def remove_committed(world: World) -> None:
-    """Remove the committed files that still exist, and wait until Flux has applied that."""
+    """Remove the committed files that still exist, and wait until Flux has applied the removal."""
     commit = world.tip()
     if there := {FILE, BASE} & set(world.person.git("ls-files").split()):
         commit = world.push(dict.fromkeys(there))
@@ -161,7 +161,7 @@ def test_a_base_is_not_fetched_from_elsewhere(
 
 
 def test_the_cluster_refuses_pods_that_the_domain_may_not_have(world: World) -> None:
-    """Even an administrator's pods are refused, whatever kind of object makes them."""
+    """The cluster refuses even an administrator's pods, whatever kind of object makes them."""
     kube = world.domain.kube
     told = {
         (name, maker["kind"]): kube.refusal(maker)
@@ -183,7 +183,7 @@ def test_what_the_cluster_refuses_of_a_commit_is_reported(world: World, slip_in:
 
 
 def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
-    """The policy no longer allows host-network, and the operator applies the new bootstrap file."""
+    """The policy drops host-network, and the operator applies the new bootstrap file."""
     domain = world.domain
     nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
     policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")
@@ -205,7 +205,7 @@ def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
 
 
 def wait_refused(domain: Domain, why: str, manifest: dict[str, Any] | None = None) -> None:
-    """Wait until the Kustomization reports a refusal, or the release of `manifest` if it is one."""
+    """Wait until the Kustomization reports a refusal; a HelmRelease's own report counts too."""
     objects = [("Kustomization", domain.name)]
     if manifest is not None and manifest["kind"] == "HelmRelease":
         objects.append(("HelmRelease", manifest["metadata"]["name"]))

@@ -102,7 +102,7 @@ def test_the_resources_of_the_reference_are_read_from_a_cluster(
 
 
 class Shell:
-    """Runs the page's commands in a folder from which the cluster can fetch repositories."""
+    """Runs the commands of docs/migration.md in a folder that the rig's Git server serves."""
 
     def __init__(self, rig: Rig, folder: Path, volumes: Path) -> None:
         self.folder = rig.repository("any.git").parent
@@ -120,7 +120,7 @@ class Shell:
         }
 
     def commands(self, title: str) -> list[str]:
-        """Return the commands in a section of the page, without those that never end."""
+        """Return the commands in a section of the page, except those that run for ever."""
         (section,) = re.findall(rf"^## (?:\d\. )?{title}$(.*?)(?=^## |\Z)", PAGE, re.M | re.S)
         found = re.findall(r"^    (\S.*)$", section, re.MULTILINE)
         return [one for one in found if not one.startswith(("ros2 ", "demandops serve "))]
@@ -146,7 +146,7 @@ class Shell:
 
 
 def left_by_the_reference() -> Iterator[Manifest]:
-    """Yield what an installation of the reference has, besides its CRDs and custom resources."""
+    """Yield the objects of an installation of the reference, without CRDs and custom resources."""
     for operator in ("mqtt", "object-detection", "object-fusion"):
         name = f"kopf-operator-{operator}"
         metadata = {"labels": {"app": name}}

@@ -1,4 +1,4 @@
-"""Merged overrides reach the cluster, stay in effect during demands, and can be removed."""
+"""Merged overrides reach the cluster, stay in effect during demands, and end when removed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An application with services on three nodes; connections carry each topic once while it is read.
+"""An application has services on three nodes; connections carry each topic once, while it is read.
 
 Each vehicle has a driver, which all applications share. At the edge are a detection for each
 driver, a fusion, and a planner. The plan is delivered to the vehicles.
@@ -47,7 +47,9 @@ def test_four_services_on_three_nodes_serve_two_vehicles(
     put(world, requester, "vehicle00")
     assert_exact(domain, "vehicle00")
     after = domain.pods()
-    assert after == {name: before[name] for name in after}, "what stays was restarted"
+    assert after == {name: before[name] for name in after}, (
+        "a pod that both demands need was restarted"
+    )
 
     requester.release("trip")
     follow(world)
@@ -158,7 +160,7 @@ def assert_exact(domain: Namespace, *vehicles: str) -> None:
 
 
 def lines(*vehicles: str) -> Iterator[str]:
-    """Yield the lines of what must exist for these vehicles, and of the fusion's inputs."""
+    """Yield a line for everything that must exist for these vehicles, and the fusion's inputs."""
     yield from (f"ConfigMap {FUSION}-{part}" for part in ("params", "watcher"))
     services = [(FUSION, "edge"), (PLANNER, "edge")]
     clients = []

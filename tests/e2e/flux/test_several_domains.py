@@ -35,7 +35,7 @@ FLEETS = {
     ("mqtt-derived-vehicle00-edge-target", "edge"),
 }
 SENT_TO_THE_CITY = {("mqtt-derived-vehicle00-edge-city-source", "vehicle00")}
-"""The vehicle's end of the city's connection, which is in the vehicle's domain, the first one."""
+"""The source end of the city's connection; it runs in the vehicle's own domain, the first one."""
 CITYS = {
     ("od-edge-city-vehicle00", "edge"),
     ("of-edge-lights", "edge"),
@@ -85,7 +85,9 @@ def test_two_domains_share_a_machine_and_nothing_else(
 
     assert traffic.put("lights", [application("edge/lights")]).outcome == "booked"
     wait_for({fleet: FLEETS | SENT_TO_THE_CITY, city: CITYS})
-    assert {name: fleet.pods()[name] for name in before} == before, "nothing there restarted"
+    assert {name: fleet.pods()[name] for name in before} == before, (
+        "a pod of the first domain was restarted"
+    )
     assert ros_domains(city) == {CITY_ROS}
     assert ros_domains(fleet) == {0}
     assert granted(fleet, of=fleet)
@@ -128,7 +130,7 @@ def two_domains(world: World) -> dict[str, str]:
 
 
 def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
-    """Wait until exactly these pods, given by name and node, run in each domain."""
+    """Wait until exactly these pods run in each domain; each is a pair of a name and a node."""
 
     def same() -> bool:
         for domain in wanted:
@@ -141,7 +143,7 @@ def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
 
 
 def running(domain: Domain) -> set[tuple[str, str]]:
-    """Return the name without hash and the node of each ready pod; '?' for each other pod."""
+    """Return name without hash and node of each ready pod; a pod that is not ready becomes '?'."""
     lines = (line for line in domain.lines() if line.startswith("pod of "))
     matches = map(_POD.fullmatch, lines)
     return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}

@@ -10,8 +10,8 @@ from tests.e2e.common.manual import requested_by
 from tests.e2e.common.steps import (
     running,
     test_another_requester_changes_no_object_of_a_release,
+    test_deleted_and_changed_objects_of_a_release_are_restored,
     test_plain_manifests_and_releases_are_restored,
-    test_what_a_release_holds_is_restored,
 )
 from tests.e2e.rig.kube import Manifest
 
@@ -19,8 +19,8 @@ from .world import World
 
 __all__ = [
     "test_another_requester_changes_no_object_of_a_release",
+    "test_deleted_and_changed_objects_of_a_release_are_restored",
     "test_plain_manifests_and_releases_are_restored",
-    "test_what_a_release_holds_is_restored",
 ]
 CHART = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
 REGISTRY = "registry/charts.yaml"

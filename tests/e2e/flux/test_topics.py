@@ -24,7 +24,7 @@ OF_THE_REFERENCE = {
     "/edge_object_detection_fusion_global_objectlist": FUSION.replace("-", "_"),
     "/edge_object_detection_fusion_global_trajectories": FUSION.replace("-", "_"),
 }
-"""Topics as object_detection_fusion_app.py of application_manager names them, with their nodes."""
+"""Topics with their nodes, as object_detection_fusion_app.py of application_manager names them."""
 
 
 @pytest.fixture

@@ -26,7 +26,9 @@ def test_an_update_by_demand_and_back(world: World) -> None:
     updated = {name: before[name].rpartition(":")[0] + ":next" for name in DETECTION.values()}
     domain.kube.wait("the pods of the update", lambda: images(world) == before | updated)
     domain.wait_lines(expected.after(1))
-    assert domain.identity(FUSION) == fusion, "its image is the same in both versions"
+    assert domain.identity(FUSION) == fusion, (
+        "the fusion, whose image is the same in both versions, was restarted"
+    )
 
     request(world, PUT | {"operation": "release", "applications": []})
     domain.kube.wait("the pods of before", lambda: images(world) == before)
@@ -66,7 +68,7 @@ def versions() -> str:
 
 
 def request(world: World, goal: dict[str, object]) -> None:
-    """Send a `Demand` from the command line, beside the running generator; await Flux."""
+    """Run `demandops request` with a `Demand` beside the generator; wait until Flux applied it."""
     file = world.folder / "demand.yaml"
     file.write_text(json.dumps(goal))
     demandops(world.folder, "request", str(file), "--state-repo", world.push_url)

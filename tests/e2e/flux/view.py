@@ -1,6 +1,6 @@
 """An access domain on a cluster that Flux reconciles: its source, its Kustomization, its releases.
 
-It reads the API and triggers Flux; it changes no object that Flux or a release owns.
+This module reads the API and triggers Flux; it changes no object that Flux or a release owns.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Domain(Namespace):
     def fetched_files(self) -> list[str]:
         """Return the paths that the GitRepository has fetched.
 
-        Downloads the artifact, so source-controller must be reachable from this machine.
+        This downloads the artifact, so source-controller must be reachable from this machine.
         """
         url = self._status("GitRepository", SOURCE)["artifact"]["url"]
         with (

@@ -1,9 +1,9 @@
 """Argo CD's application-controller, repo-server and server, and their Redis, as plain processes.
 
-One program contains all parts; `ARGOCD_BINARY_NAME` selects one. The server serves the webhook. The
-controller runs as the cluster's administrator. A release's AppProject and the service account that
-is impersonated for it limit what it may do, as docs/argocd.md requires. Redis is the machine's own
-`redis-server`.
+One program contains all three parts; `ARGOCD_BINARY_NAME` selects one. The server serves the
+webhook. The controller runs as the cluster's administrator. A release's AppProject, and the service
+account that the controller impersonates for the release, limit what it may do, as docs/argocd.md
+requires. Redis is the machine's own `redis-server`.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ class Rig:
     `git_of` is another rig whose Git server it uses, so that two clusters read one state repo.
     `credentials` are a user and a password, which the Git server then requires. `arguments` has
     further arguments for controllers, by the controller's name. `folder` gets data and logs. By
-    default it is a temporary folder, which is removed at the end unless E2E_KEEP is set; after a
-    failure the logs stay.
+    default it is a temporary folder, which the rig removes at the end unless E2E_KEEP is set; after
+    a failure the logs stay.
     """
 
     kube: Kube
@@ -105,7 +105,7 @@ class Rig:
             raise
 
     def stop(self, *, failed: bool = False) -> None:
-        """Stop everything; the logs stay if `failed`. May be called twice."""
+        """Stop everything; keep the logs if `failed`. A second call is allowed."""
         work, processes, kube = self._work, self._processes, getattr(self, "kube", None)
         try:
             if kube is not None and self.existing:
@@ -178,15 +178,13 @@ class Rig:
     # --- single parts -----------------------------------------------------------------------
 
     def components(self) -> list[str]:
-        """Return the names of the parts that can be killed and started again."""
+        """Return the names of the parts that a test can kill and start again."""
         return self._own().names()
 
     def pids(self) -> dict[str, int]:
-        """Return the process ids of the running parts."""
         return self._own().pids()
 
     def log(self, component: str) -> Path:
-        """Return a part's log file."""
         return self._own().log(component)
 
     def url(self, component: str) -> str:
@@ -206,7 +204,6 @@ class Rig:
         self._own().start(component)
 
     def restart(self, component: str) -> None:
-        """Stop a part and start it again."""
         self.stop_component(component)
         self.start_component(component)
 
@@ -215,7 +212,6 @@ class Rig:
         self._own().signal(component, signal.SIGSTOP)
 
     def resume(self, component: str) -> None:
-        """Continue a paused part."""
         self._own().signal(component, signal.SIGCONT)
 
     # --- starting ---------------------------------------------------------------------------
@@ -312,8 +308,6 @@ class Rig:
 
 
 class _Clock:
-    """Measures the seconds of each stage of a start."""
-
     def __init__(self, timings: dict[str, float]) -> None:
         self._timings, self._last = timings, time.monotonic()
 

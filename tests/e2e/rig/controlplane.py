@@ -19,8 +19,6 @@ _SERVICES = "10.96.0.0/16"
 
 @dataclass(frozen=True)
 class ControlPlane:
-    """The ports and files of a control plane."""
-
     binaries: dict[str, Path]
     folder: Path
     pki: Pki
@@ -29,16 +27,15 @@ class ControlPlane:
 
     @staticmethod
     def plan(binaries: dict[str, Path], folder: Path, pki: Pki) -> ControlPlane:
-        """Return a control plane, and choose free ports for it."""
+        """Return a control plane with free ports."""
         return ControlPlane(binaries, folder, pki, free_port(), free_port())
 
     @property
     def server(self) -> str:
-        """Return the API server's URL."""
         return url(self.api_port, "https")
 
     def etcd(self) -> Component:
-        """Return etcd; it keeps its data during a restart."""
+        """Return etcd, which keeps its data when it restarts."""
         client, peer = url(self.etcd_port), url(free_port())
         argv = [
             str(self.binaries["etcd"]),
@@ -55,7 +52,7 @@ class ControlPlane:
         return Component("etcd", tuple(argv), answers(self.etcd_port, "/readyz"))
 
     def apiserver(self) -> Component:
-        """Return the API server; it is ready after its own post-start hooks."""
+        """Return the API server, which is ready after its own post-start hooks."""
         pki = self.pki
         argv = [
             str(self.binaries["kube-apiserver"]),

@@ -1,4 +1,4 @@
-"""The exception of the rig; its text names the place, the fault and the remedy."""
+"""The exception of the rig; its message says where the fault is, what it is and how to mend it."""
 
 
 class RigError(RuntimeError):

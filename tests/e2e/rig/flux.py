@@ -2,8 +2,8 @@
 
 The controllers get the cluster from `KUBECONFIG`, because they have no flag for it, and run as its
 administrator. For a release they impersonate its service account, which limits what the release may
-do. They are locked down as docs/flux.md requires: for an object that names no service account they
-impersonate `default` of its namespace.
+do. As docs/flux.md requires, they are locked down: for an object that names no service account,
+they impersonate the account `default` of the object's namespace.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 The server runs as its own process (`python githttp.py --root DIR --port N`), so that tests can kill
 or pause it like any other part of the rig. It needs only Python and Git. A push to a repository
-that does not exist creates the repository. If GIT_HTTP_USER and GIT_HTTP_PASSWORD are set in its
-environment, it requires that user and password by basic authentication.
+that does not exist creates the repository. If its environment has GIT_HTTP_USER and
+GIT_HTTP_PASSWORD, the server requires that user and password by basic authentication.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PASSWORD_VARIABLE = "GIT_HTTP_PASSWORD"  # noqa: S105 - a variable's name
 HEALTH = "/-/healthz"
 _CHUNK = 64 * 1024
 
-# Git's settings, instead of the host's. A garbage collection in the background would race with
-# the next push.
+# These settings replace the host's. A garbage collection in the background would race with the next
+# push.
 _CONFIGURATION = {
     "core.fsync": "none",
     "gc.auto": "0",
@@ -44,7 +44,7 @@ _CONFIGURATION = {
 
 
 class GitServer(ThreadingHTTPServer):
-    """A server of all repositories below a folder."""
+    """Serves all repositories below a folder."""
 
     daemon_threads = True
     request_queue_size = 128
@@ -62,7 +62,6 @@ class GitServer(ThreadingHTTPServer):
         self.git = program
 
     def environment(self) -> dict[str, str]:
-        """Return the environment of Git's processes."""
         return _environment(self.root)
 
 
@@ -88,7 +87,6 @@ class Handler(BaseHTTPRequestHandler):
     server: GitServer
 
     def serve(self) -> None:
-        """Answer one request."""
         self.close_connection = True  # else the client waits for the answer's end
         path, _, query = self.path.partition("?")
         path = unquote(path)
@@ -129,7 +127,6 @@ class Handler(BaseHTTPRequestHandler):
             init_bare(repository, self.server.git)
 
     def run_backend(self, path: str, query: str) -> None:
-        """Answer a request with the output of `git http-backend`."""
         backend = subprocess.Popen(
             [self.server.git, "http-backend"],
             env=self.server.environment() | self._request_variables(path, query),
@@ -184,7 +181,6 @@ class Handler(BaseHTTPRequestHandler):
                 stdin.close()
 
     def body(self) -> Iterator[bytes]:
-        """Yield the request's body."""
         if "chunked" in self.headers.get("Transfer-Encoding", "").lower():  # packs above 1 MB
             while size := int(self.rfile.readline().split(b";")[0], 16):
                 yield from self._read(size)
@@ -221,7 +217,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def init_bare(repository: Path, git: str = "git") -> None:
-    """Create an empty bare repository whose default branch is main."""
+    """Create an empty bare repository whose default branch is `main`."""
     repository.parent.mkdir(parents=True, exist_ok=True)
     subprocess.run(
         [git, "init", "--quiet", "--bare", "--initial-branch=main", str(repository)],

@@ -2,7 +2,8 @@
 
 Only this module runs `go`, and only `tools` uses it. A build follows the committed `go.mod` and
 `go.sum`, and ignores the caller's Go settings. It uses the installed Go and fetches no toolchain.
-It runs at the lowest priority, because a cold build uses two cores for about twenty minutes.
+It runs at the lowest priority, because a build with an empty cache uses two cores for about twenty
+minutes.
 """
 
 from __future__ import annotations
@@ -39,8 +40,6 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Go:
-    """An installed Go toolchain."""
-
     program: str
     version: str  # like go1.26.8
     target: str  # like linux/amd64
@@ -92,7 +91,7 @@ class Workspace:
     def vendor(self, go: Go, wrapper: Path, report: Report) -> None:
         """Copy the sources of all packages that the wrapper needs into its vendor folder.
 
-        Go checks them against `go.sum`.
+        Go compares the sources with `go.sum`.
         """
         pins = [
             (folder / name) for folder in (self.module, wrapper) for name in ("go.mod", "go.sum")
@@ -111,7 +110,6 @@ class Workspace:
         shutil.rmtree(self.folder / "modules", ignore_errors=True)
 
     def remove(self) -> None:
-        """Remove the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
@@ -149,7 +147,7 @@ class _Counter:
         self._last = self._start
 
     def line(self, line: str) -> bool:
-        """Count a line if it is only progress; return whether it is."""
+        """Count a line if it reports only progress; return whether it does."""
         progress = line.startswith("go: downloading")
         if self._expected is not None:
             progress = progress or line in self._expected
@@ -226,9 +224,9 @@ def _pump(stream: IO[str], lines: queue.Queue[str | None]) -> None:
 def _follow(
     lines: queue.Queue[str | None], line: Callable[[str], bool], tick: Callable[[], None]
 ) -> deque[str]:
-    """Pass each line to `line` until None; return the last lines that are not progress.
+    """Pass each line to `line` until None comes; return the last lines that do not report progress.
 
-    `tick` is called each second without a line, as there are many while Go links.
+    `tick` is called after each second without a line; Go prints none for long while it links.
     """
     shown: deque[str] = deque(maxlen=_SHOWN_LINES)
     while True:

@@ -52,7 +52,7 @@ _VERSIONS = {
 class Kube:
     """A cluster's API.
 
-    A kind has the API version in `_VERSIONS`, or else `v1`, unless `version` is given.
+    The API version of a kind is `version` if given, else the one in `_VERSIONS`, else `v1`.
     """
 
     def __init__(
@@ -66,7 +66,6 @@ class Kube:
         self._dynamic: Any = None
 
     def close(self) -> None:
-        """Close the connections."""
         self.api.close()
 
     def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
@@ -94,7 +93,6 @@ class Kube:
         return ""
 
     def get(self, kind: str, name: str, namespace: str = "", version: str = "") -> Manifest | None:
-        """Return an object, or None if it does not exist."""
         try:
             found = self._resource(kind, version).get(name=name, namespace=namespace or None)
         except NotFoundError:
@@ -111,7 +109,6 @@ class Kube:
         return [dict(item) for item in found.to_dict()["items"]]
 
     def delete(self, kind: str, name: str, namespace: str = "", version: str = "") -> None:
-        """Delete an object, if it exists."""
         try:
             self._resource(kind, version).delete(name=name, namespace=namespace or None)
         except NotFoundError:
@@ -120,7 +117,6 @@ class Kube:
     def patch(
         self, kind: str, name: str, body: Manifest, namespace: str = "", version: str = ""
     ) -> None:
-        """Merge-patch an object."""
         self._resource(kind, version).patch(
             name=name,
             namespace=namespace or None,
@@ -198,7 +194,6 @@ class Kube:
     def wait_gone(
         self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
     ) -> None:
-        """Wait until an object does not exist."""
         what = f"{kind} {namespace}/{name} to go"
         self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
 
@@ -237,7 +232,7 @@ def handled(manifest: Manifest, token: str) -> bool:
 
 
 def _condition(found: Manifest | None) -> str:
-    """Return why an object is not ready, or its newest generation is not; empty if it is."""
+    """Return why the newest generation of an object is not ready; empty if it is."""
     if found is None:
         return "does not exist"
     status = found.get("status", {})

@@ -1,4 +1,4 @@
-"""Fake nodes, and the kwok process that keeps them and their pods alive.
+"""Fake nodes, and the kwok process that reports them and their pods as running.
 
 A fake node represents a node of the inventory. It has the label `node_id`, which releases select,
 and the annotation that makes kwok manage it, also in an existing cluster.
@@ -46,7 +46,7 @@ def component(binary: Path, kubeconfig: Path, certificates: Pki) -> Component:
 
 
 def node_name(node_id: str) -> str:
-    """Return a Kubernetes name for a node id; different ids have different names."""
+    """Return the Kubernetes name for a node id; different ids get different names."""
     slug = re.sub(r"[^a-z0-9]+", "-", node_id.lower()).strip("-")
     if slug == node_id:
         return slug
@@ -54,7 +54,7 @@ def node_name(node_id: str) -> str:
 
 
 def manifest(node_id: str, labels: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the Node of an inventory node; raise RigError if its id is not a label value."""
+    """Return the Node of an inventory node; raise RigError if its id is no valid label value."""
     if not _LABEL_VALUE.fullmatch(node_id):
         raise RigError(f"node {node_id!r}: not a label value; use letters, digits, '-', '_', '.'")
     name = node_name(node_id)

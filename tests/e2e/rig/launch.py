@@ -19,7 +19,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def command(program: Path | str, *arguments: str, niceness: int = 0) -> list[str]:
-    """Return the arguments that start `program` under this launcher in the calling process."""
+    """Return the command line that starts `program` under this launcher."""
     interpreter = [sys.executable, "-I", "-S", str(Path(__file__).resolve())]
     return [*interpreter, str(os.getpid()), str(niceness), str(program), *arguments]
 

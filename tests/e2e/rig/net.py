@@ -1,7 +1,7 @@
 """Free loopback ports and readiness probes.
 
-A probe returns None if its component is ready, else the reason, which then becomes part of the
-error of a failed start.
+A probe returns None if its component is ready. Otherwise it returns the reason, which becomes part
+of the error of a failed start.
 """
 
 from __future__ import annotations

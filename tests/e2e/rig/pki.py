@@ -25,8 +25,6 @@ _AUTHORITY = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig-authority")
 
 @dataclass(frozen=True)
 class Pki:
-    """The paths of the control plane's certificates and keys."""
-
     authority: Path
     server_certificate: Path
     server_key: Path
@@ -37,7 +35,10 @@ class Pki:
 
 
 def make(folder: Path) -> Pki:
-    """Write the certificates and keys of an authority, a server, an administrator and tokens."""
+    """Create the certificates and keys of a control plane, and write them into a folder.
+
+    The keys include those that sign the tokens of service accounts.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     authority = ec.generate_private_key(ec.SECP256R1())
     root = _builder(_AUTHORITY, authority.public_key(), authority).sign(authority, hashes.SHA256())
@@ -77,7 +78,7 @@ def make(folder: Path) -> Pki:
 def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
     """Write an administrator's kubeconfig that contains all certificates; return its path.
 
-    It is written as JSON, which is valid YAML.
+    The file is JSON, which is valid YAML.
     """
 
     def inline(path: Path) -> str:

@@ -1,9 +1,9 @@
 """The rig's processes: start, watch, stop.
 
 Each process leads its own process group, has a log file, and dies with this process. Because of the
-group Ctrl-C reaches only the tests, which then stop everything in order; and a stop ends the
-children of a process too. A stop asks each process to end, and kills it after a deadline. The
-processes that started last stop first.
+group, Ctrl-C reaches only the tests, which then stop everything in order, and a stop also ends the
+children of a process. A stop asks each process to end, and kills it after a deadline. Processes
+stop in the reverse order of their start.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _GROUP_SECONDS = 3.0  # some init processes never reap orphans, which must not d
 
 @dataclass(frozen=True)
 class Component:
-    """A process to start: its command, the probe that reports whether it is ready, and its URL."""
+    """A process to start: its command, a probe that says whether it is ready, and its URL."""
 
     name: str
     argv: tuple[str, ...]
@@ -44,8 +44,6 @@ class Component:
 
 
 class Processes:
-    """The processes of a rig, by component name."""
-
     def __init__(self, logs: Path, environment: Mapping[str, str]) -> None:
         self._logs = logs
         self._environment = dict(environment)
@@ -130,7 +128,6 @@ class Processes:
             self._running.clear()
 
     def pids(self) -> dict[str, int]:
-        """Return the ids of the running processes."""
         return {name: process.pid for name, process in self._running.items()}
 
     def names(self) -> list[str]:
@@ -138,7 +135,7 @@ class Processes:
         return list(self._components)
 
     def url(self, name: str) -> str:
-        """Return the URL of a component that tests call."""
+        """Return the URL of a component that has one."""
         return self._known(name).url
 
     def log(self, name: str) -> Path:
@@ -195,7 +192,7 @@ class Processes:
 def _exit_code(process: subprocess.Popen[bytes]) -> int | None:
     """Return the exit code of a process without reaping it; None while it runs.
 
-    Once it is reaped, a new process could get its pid, and `_end` would kill that one's group.
+    After a reap, the kernel could give the pid to a new process, and `_end` would kill its group.
     """
     if process.returncode is not None:
         return process.returncode

@@ -1,10 +1,12 @@
 """Build the rig's programs from pinned Go modules, once, into a cache outside the checkout.
 
-This is the first stage of the rig: the others take the paths that `ensure` returns. A wrapper
-module under `tests/e2e/tools/` pins each program, so that its `go.sum` covers all dependencies. The
-name of a cache entry is a digest of everything that decides the program's bytes. An entry appears
-by one rename, so each existing entry is complete. `python -m tests.e2e.rig.tools` builds all
-programs and prints how long each took. With `--for flux` it builds the programs of a rig with Flux.
+The other modules of the rig take the paths that `ensure` returns. A wrapper module under
+`tests/e2e/tools/` pins each program, so that its `go.sum` covers all dependencies. The name of a
+cache entry is a digest of everything that decides the program's bytes. An entry appears by one
+rename, so each existing entry is complete.
+
+`python -m tests.e2e.rig.tools` builds all programs and prints how long each took. With `--for flux`
+it builds the programs of a rig with Flux.
 """
 
 from __future__ import annotations
@@ -76,8 +78,8 @@ TOOLS = {
 def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
     """Return the paths of the named programs, by default of all; build those that the cache lacks.
 
-    `report` gets lines of progress; by default they go to standard error. Raises RigError if a
-    name is unknown, Go is missing or too old, or a build fails.
+    `report` gets lines of progress; by default they go to standard error.  Raises RigError if a
+    name is unknown, if Go is missing or too old, or if a build fails.
     """
     wanted = list(TOOLS) if names is None else list(names)
     unknown = sorted(set(wanted) - set(TOOLS))
@@ -104,14 +106,13 @@ def needed_with(*gitops: str) -> list[str]:
 
 
 def crd_files(binaries: dict[str, Path]) -> list[Path]:
-    """Return the CRD manifests that came with the given programs."""
+    """Return the CRD manifests in the cache entries of these programs."""
     return sorted(
         path for binary in binaries.values() for path in binary.parent.glob("crds/*.yaml")
     )
 
 
 def cache_root() -> Path:
-    """Return the cache folder of the built programs."""
     named = os.environ.get(CACHE_VARIABLE)
     if named:
         return Path(named).expanduser().resolve()
@@ -132,7 +133,7 @@ def _digest(tool: Tool, go: gobuild.Go) -> str:
 
 
 def _flags(tool: Tool) -> list[str]:
-    """Return build flags for small binaries whose bytes do not depend on the checkout's path."""
+    """Return build flags for small binaries; the bytes must not depend on the checkout's path."""
     linker = ["-s", "-w"]
     if tool.wrapper == "kubernetes":
         # Without a version stamp the server reports v0.0.0-master, which clients refuse.
@@ -156,7 +157,7 @@ def _pinned(go_mod: Path, module: str) -> str:
 
 @contextlib.contextmanager
 def _turn(root: Path, say: Report) -> Iterator[None]:
-    """Hold the build lock during the block: two builds of Kubernetes do not fit into memory."""
+    """Hold the build lock: two builds of Kubernetes at once would not fit into memory."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / "build.lock").open("w") as lock:
         waited = False

@@ -21,7 +21,10 @@ _YOUNG_SECONDS = 60  # a younger lock file may be one that its rig has not locke
 
 
 class Workdir:
-    """A rig's folder with data and logs."""
+    """The folder of a rig.
+
+    Its lock is held until `clear`.
+    """
 
     def __init__(self, name: str, path: Path | None = None) -> None:
         if path is None:
@@ -37,7 +40,7 @@ class Workdir:
 
     @property
     def home(self) -> Path:
-        """The HOME of the rig's processes, which has none of the user's files."""
+        """The HOME of the rig's processes, which contains no file of the user."""
         return self.path / "home"
 
     @property

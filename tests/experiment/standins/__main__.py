@@ -16,7 +16,7 @@ OURS = ("demandops_ros", "parameter_sync.launch.xml")
 
 
 def main(launch: str, package: str, file: str, *arguments: str) -> None:
-    """Run the program that a launch file starts, or its stand-in."""
+    """Run the program that a launch file starts, or the program's stand-in."""
     assert launch == "launch", launch
     given = dict(argument.split(":=", 1) for argument in arguments)
     if (package, file) == OURS:

@@ -1,4 +1,4 @@
-"""Detection: a point cloud becomes a list of objects."""
+"""A stand-in for the detection: a point cloud becomes a list of objects."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FEWEST_POINTS = 5
 
 
 def cluster(points: Iterable[Point]) -> list[tuple[float, float]]:
-    """Return the centres of groups of nearby points; groups of few points are left out."""
+    """Return the centres of groups of nearby points, except groups with few points."""
     groups: list[tuple[float, float, int]] = []  # sums of x and y, and how many
     for x, y, _ in points:
         for index, (sum_x, sum_y, count) in enumerate(groups):
@@ -30,14 +30,14 @@ def cluster(points: Iterable[Point]) -> list[tuple[float, float]]:
 
 
 def pose_at(x: float, y: float) -> Pose:
-    """Return the pose of an object of unknown heading."""
+    """Return the pose of an object whose heading is unknown."""
     pose = Pose()
     pose.position.x, pose.position.y, pose.orientation.w = x, y, 1.0
     return pose
 
 
 def main(given: dict[str, str]) -> None:
-    """Detect objects in each cloud of a topic until the program is asked to end."""
+    """Detect objects in each cloud of a topic until a signal ends the program."""
     start()
     node = Node(given["node_name"])
     sender = node.create_publisher(PoseArray, given["object_list_topic"], 10)

@@ -1,4 +1,7 @@
-"""Fusion: object lists and ego data become one list; its inputs change while it runs."""
+"""A stand-in for the fusion: object lists and ego data become one list.
+
+Its inputs can change while it runs.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +27,8 @@ _INPUTS = {
 class Fusion(Node):
     """Fuses the newest message of each input, and publishes all objects and the vehicles' tracks.
 
-    The times come from the messages and a steady clock. The chart sets `use_sim_time` by default,
-    and there is no simulated clock here.
+    It takes times from the messages and a steady clock, not from ROS: the chart sets `use_sim_time`
+    by default, and no simulated clock runs here.
     """
 
     def __init__(self, given: dict[str, str]) -> None:
@@ -85,6 +88,6 @@ def _is_among(pose: Any, others: list[Any]) -> bool:
 
 
 def main(given: dict[str, str]) -> None:
-    """Fuse until the program is asked to end."""
+    """Fuse until a signal ends the program."""
     start()
     spin(Fusion(given))

@@ -1,4 +1,4 @@
-"""The folder that stands for the image of every container."""
+"""The folder that takes the place of every container's image."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _PROGRAMS = {"ros2": __package__, "zenoh-bridge-ros2dds": f"{__package__}.zenoh_
 
 
 def image(folder: Path) -> Path:
-    """Fill the containers' working directory with the stand-in programs; return it."""
+    """Fill the containers' working directory with the stand-in programs; return the directory."""
     setup = folder / "install" / "setup.bash"
     setup.parent.mkdir(exist_ok=True)
     setup.write_text(f'PATH="{folder}:$PATH"\n')

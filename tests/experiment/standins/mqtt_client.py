@@ -1,7 +1,7 @@
 """A stand-in for mqtt_client: it carries serialized ROS messages over a real broker.
 
-It reads the real parameter file. Like mqtt_client, it publishes the type of each topic in a
-further, retained MQTT topic for the other end.
+It reads the real parameter file. Like mqtt_client, it publishes each topic's type in a further,
+retained MQTT topic for the other end of the connection.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class MqttClient(Node):
         return self.get_parameter_or(name, rclpy.Parameter(name, value=default)).value
 
     def _find_types(self) -> None:
-        """Subscribe to the topics whose types the ROS graph has by now."""
+        """Subscribe to the topics whose types have appeared in the ROS graph."""
         known = dict(self.get_topic_names_and_types())
         for topic in sorted(self._unknown & known.keys()):
             (name,) = known[topic]
@@ -81,13 +81,12 @@ class MqttClient(Node):
             self._senders[source].publish(message.payload)
 
     def close(self) -> None:
-        """Disconnect from the broker."""
         self._broker.disconnect()
         self._broker.loop_stop()
 
 
 def main(given: dict[str, str]) -> None:
-    """Carry messages until the program is asked to end."""
+    """Carry messages until a signal ends the program."""
     ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params_file"]]
     start(["mqtt_client", "--ros-args", *ros_args])
     client = MqttClient()

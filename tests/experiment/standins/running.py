@@ -1,4 +1,4 @@
-"""Helpers of all stand-ins: find a message type by its name, and spin a ROS node until SIGTERM."""
+"""Helpers of all stand-ins: find a message type by name; spin a node until a signal comes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def message_class(type_name: str) -> Any:
 
 
 def start(args: list[str] | None = None, domain: int | None = None) -> None:
-    """Initialize ROS for :func:`spin`, which handles the signals."""
+    """Initialize ROS without its own signal handlers, because :func:`spin` handles the signals."""
     rclpy.init(args=args or [], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
 
 

@@ -1,7 +1,7 @@
 """A stand-in for zenoh-bridge-ros2dds: it carries serialized ROS messages over the real Zenoh.
 
-It reads the real configuration. The real bridge is a plugin that Zenoh's Python wheels lack. The
-stand-in sends a topic's type with each message.
+It reads the real configuration. The real bridge is a plugin that Zenoh's Python wheels lack. Unlike
+the real bridge, the stand-in sends a topic's type with each message.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _LOOK_S = 0.1
 
 
 class Bridge(Node):
-    """One node's bridge, for all its connections."""
+    """The bridge of one node, for all connections of the node."""
 
     def __init__(self, plugin: dict[str, Any], session: Any) -> None:
         super().__init__(plugin["nodename"])
@@ -36,7 +36,7 @@ class Bridge(Node):
         self.create_timer(_LOOK_S, self._find)
 
     def _find(self) -> None:
-        """Subscribe to the topics that the configuration lets out, once the ROS graph has them."""
+        """Subscribe to the topics that the configuration lets out and that the ROS graph has."""
         for topic, (kind, *_) in self.get_topic_names_and_types():
             if topic not in self._readers and self._given.search(topic):
                 self._readers[topic] = self.create_subscription(
@@ -58,7 +58,7 @@ class Bridge(Node):
 
 
 def main() -> None:
-    """Carry messages until the program is asked to end."""
+    """Carry messages until a signal ends the program."""
     parser = argparse.ArgumentParser()
     parser.add_argument("-c", dest="config", type=Path, required=True)
     config = json.loads(parser.parse_args().config.read_text())

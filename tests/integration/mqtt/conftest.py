@@ -1,4 +1,4 @@
-"""Fixtures: a real mosquitto on loopback, and pods' configuration as their containers see it."""
+"""Fixtures: a real mosquitto on loopback, and a pod's configuration as its containers see it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.e2e.rig import pki
 
 USER = "fleet 007"
 PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test
-"""A password with characters that break YAML, a shell or a command line if they are not quoted."""
+"""A password with characters that would break YAML, a shell or a command line without quotes."""
 
 DEADLINE_S = 60.0
 
@@ -96,9 +96,9 @@ def _wait_until_it_listens(process: subprocess.Popen[bytes], port: int, log: Pat
 
 
 class Pod:
-    """The pod of a connection's end without a cluster: folders are its volumes.
+    """The pod of a connection's end, without a cluster.
 
-    Its init containers run as processes.
+    Folders are its volumes, and its init containers run as processes.
     """
 
     def __init__(self, manifest: str, secrets: dict[str, dict[str, str]], folder: Path) -> None:
@@ -157,7 +157,7 @@ class Pod:
 
 
 class Client:
-    """A stand-in for mqtt_client that does only what its parameters require at the broker."""
+    """A stand-in for mqtt_client that does at the broker only what its parameters require."""
 
     def __init__(self, parameters: dict[str, Any]) -> None:
         """Connect, subscribe to the MQTT topics of this end, and collect the messages."""
@@ -189,7 +189,7 @@ class Client:
         self.arrived.append((message.topic, message.payload, message.qos, message.retain))
 
     def publish(self, ros_topic: str, payload: bytes) -> None:
-        """Publish a message of a ROS topic at the broker as the parameters require."""
+        """Publish a message of a ROS topic to the broker as the parameters require."""
         prefix = f"bridge.ros2mqtt.{ros_topic}"
         sent = self._client.publish(
             self.parameters[f"{prefix}.mqtt_topic"],
@@ -201,7 +201,7 @@ class Client:
         assert sent.is_published()
 
     def ready(self) -> None:
-        """Wait until the broker confirmed every subscription."""
+        """Wait until the broker has confirmed every subscription."""
         topics = self.parameters.get("bridge.mqtt2ros.mqtt_topics", [])
         self.wait(lambda: len(self.acknowledged) == len(topics))
 
@@ -213,6 +213,5 @@ class Client:
             time.sleep(0.01)
 
     def close(self) -> None:
-        """Disconnect from the broker."""
         self._client.disconnect()
         self._client.loop_stop()

@@ -1,4 +1,4 @@
-"""Print as JSON which parameters a ROS node gets from its arguments, as the real rcl reads them."""
+"""Print as JSON the parameters that the real rcl gives a ROS node from its arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages go from one end of a connection to the other, by a real broker with TLS and password.
+"""A real broker with TLS and a password carries messages between both ends of a connection.
 
 The clients use only the rendered manifests: the tests run the init containers, and the real rcl
 reads the parameters. paho stands in for mqtt_client.
@@ -101,7 +101,7 @@ def test_a_message_passes_both_ways_as_the_parameters_say(connect: Callable[...,
     assert (payload, qos) == (b"ice", 2)
 
 
-def test_who_comes_late_gets_what_is_retained_and_nothing_else(
+def test_a_late_client_gets_the_retained_message_only(
     connect: Callable[..., Client],
 ) -> None:
     source = connect("source")

@@ -1,4 +1,4 @@
-"""Fixtures: a clock, a Git server with faults, and the person Petra, as whom every test commits."""
+"""Fixtures: a clock, a Git server with faults, and a person named Petra, who makes all commits."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,18 +13,18 @@ from tests.kit.repo import Person
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """Make Petra the author of the commits in every test."""
+    """In every test, the author of the commits is Petra."""
 
 
 @pytest.fixture
 def clock() -> Clock:
-    """A running clock for generators, which a test can also move."""
+    """A clock that runs by itself, and that a test can also move."""
     return Clock()
 
 
 @pytest.fixture
 def server(bare: Path) -> Iterator[Server]:
-    """A Git server of the state repo, whose faults a test can set."""
+    """A Git server of the state repo; a test can set its faults."""
     with serving(bare.parent) as running:
         yield running
 
@@ -37,7 +37,7 @@ def http(server: Server) -> str:
 
 @pytest.fixture
 def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
-    """A person who approves demands; all demands need approval, and generators check often."""
+    """Petra, who approves demands: all demands need approval, and generators check for it often."""
     monkeypatch.setattr(check_timer, "CHECK_LOCAL_S", 0.05)
     monkeypatch.setattr(check_timer, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")

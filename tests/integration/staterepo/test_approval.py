@@ -1,6 +1,6 @@
 """Demands that need approval wait on a branch, which a person merges or deletes.
 
-The tests run git for the person: merges, squashes, rebases, deleted branches.
+The tests run git in the person's place: merges, squashes, rebases, deleted branches.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_
         petra.merge(branch, "--ff-only")
         receipt = rig.receipt(proposed.ticket)
         assert (receipt.outcome, receipt.commit) == ("booked", commit.id)
-        rig.wait_until(lambda: not branches(bare), "the merged branch is taken away")
+        rig.wait_until(lambda: not branches(bare), "the merged branch is deleted")
     assert [stage for stage, _ in proposed.told] == ["admitted", "booked", "proposed", "pushed"]
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert rig.restart(address) is True
-    assert rig.tip(bare) == commit.id, "the merge fits, so nothing follows"
+    assert rig.tip(bare) == commit.id, "a merge that fits needs no further commit"
 
 
 Way = Callable[[Person, str], None]
@@ -81,13 +81,13 @@ def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
             petra.change({"inventory/README.md": "Ours"})
         way(petra, branch)
         assert proposed.outcome() == "booked"
-        rig.wait_until(lambda: not branches(bare), "the merged branch is taken away")
+        rig.wait_until(lambda: not branches(bare), "the merged branch is deleted")
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert_rendered(bare)
 
 
 def assert_rendered(bare: Path) -> None:
-    """Check that the files below clusters/ are those that ledger and configuration render."""
+    """Check that the files below clusters/ are those that ledger and configuration give."""
     import pygit2
     from demandops.decision import rendered_files
     from demandops.staterepo.git import tree as trees
@@ -177,12 +177,12 @@ def test_a_proposal_outlives_the_generator(url: str, bare: Path, petra: Person) 
         again = Proposed(generator, goal(2), "op-2")  # it comes after op-1, so op-1 was handled
         other = again.branch
         assert sorted(branches(bare)) == sorted([branch, other])
-        assert git(bare, "rev-parse", branch) == stands, "no second push"
-        assert generator.withdraw("op-1") is True, "it is known"
-        rig.wait_until(lambda: branches(bare) == [other], "the branch is taken away")
+        assert git(bare, "rev-parse", branch) == stands, "the branch was pushed again"
+        assert generator.withdraw("op-1") is True, "the second generator must know the operation"
+        rig.wait_until(lambda: branches(bare) == [other], "the branch is deleted")
 
 
-def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
+def test_decisions_made_while_no_generator_runs_take_effect_at_the_next_start(
     url: str, bare: Path, petra: Person
 ) -> None:
     with rig.running(url) as generator:
@@ -191,8 +191,8 @@ def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
     petra.merge(yes)
     petra.delete(no)
     with rig.running(url) as generator:
-        rig.wait_until(lambda: branches(bare) == [], "the merged branch is taken away")
-        rig.wait_until(lambda: generator.operations == (), "both are answered")
+        rig.wait_until(lambda: branches(bare) == [], "the merged branch is deleted")
+        rig.wait_until(lambda: generator.operations == (), "both demands are answered")
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert branches(bare) == []
 
@@ -201,7 +201,7 @@ def test_what_is_decided_while_no_generator_runs_is_seen_at_the_next_start(
 def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
     bare: Path, petra: Person, how: str
 ) -> None:
-    """Both proposals change the same fusion, so the second conflicts once the first is merged."""
+    """Both proposals change the same fusion, so after the merge of one the other conflicts."""
     one, two = goal(0, vehicle=0), goal(5, vehicle=1)
     with rig.running(bare) as generator:
         first, second = Proposed(generator, one, "op-1"), Proposed(generator, two, "op-2")
@@ -210,7 +210,9 @@ def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
         if how == "generator-runs":
             petra.merge(a, "--no-ff", "-m", "First")
             assert first.outcome() == "booked"
-            rig.wait_until(lambda: git(bare, "rev-parse", b) != stood, "it is laid anew")
+            rig.wait_until(
+                lambda: git(bare, "rev-parse", b) != stood, "the second branch is rebuilt"
+            )
             petra.merge(b, "--no-ff", "-m", "Second")
             assert second.outcome() == "booked"
     if how == "merged-while-away":
@@ -235,7 +237,7 @@ def test_a_proposal_that_still_fits_is_left_where_it_is(bare: Path, petra: Perso
         second = Proposed(generator, goal(2, vehicle=2))
         assert second.branch != first.branch
         tip = rig.tip(bare)
-        rig.wait_until(lambda: str(generator.snapshot.commit) == tip, "main is taken in")
+        rig.wait_until(lambda: str(generator.snapshot.commit) == tip, "the generator follows main")
         assert git(bare, "rev-parse", first.branch) == stood
 
 
@@ -340,7 +342,9 @@ def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
         names = git(bare, "ls-tree", "-r", "--name-only", branch, "ledger/applications/")
         path = next(line for line in names.splitlines() if line.endswith(".yaml"))
         claim = yaml.safe_load(git(bare, "show", f"{branch}:{path}"))
-        assert claim["lease"] == {"seconds": 600, "slack": 30}, "no end yet"
+        assert claim["lease"] == {"seconds": 600, "slack": 30}, (
+            "a lease must have no end before the merge"
+        )
         petra.merge(branch)
         receipt = rig.receipt(proposed.ticket)
         assert (receipt.outcome, receipt.lease_s) == ("booked", 600)
@@ -385,7 +389,7 @@ def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
         assert one.outcome() == "booked"
         with pytest.raises(Refused, match="contradicts an existing claim"):
             rig.receipt(two.ticket)
-        rig.wait_until(lambda: gone not in branches(bare), "the branch is taken away")
+        rig.wait_until(lambda: gone not in branches(bare), "the branch is deleted")
 
 
 def test_what_was_merged_before_it_was_replaced_is_booked(bare: Path, petra: Person) -> None:
@@ -442,7 +446,7 @@ def test_what_replaced_a_proposal_waits_on_after_two_restarts(
     hook.unlink()
     before = git(bare, "rev-parse", branch)
     with rig.running(url):
-        rig.wait_until(lambda: git(bare, "rev-parse", branch) != before, "it is rebuilt")
+        rig.wait_until(lambda: git(bare, "rev-parse", branch) != before, "the branch is rebuilt")
     assert rig.restart(url)
     petra.merge(branch)
     assert rig.restart(url)
@@ -479,7 +483,7 @@ def test_demands_that_need_none_go_on_meanwhile(bare: Path, petra: Person) -> No
 
 @pytest.fixture
 def hooked(bare: Path) -> Iterator[Path]:
-    """The file in which the server's hook lists refs and push options."""
+    """The file in which the server's hook lists the refs and push options that it gets."""
     git(bare, "config", "receive.advertisePushOptions", "true")
     log = bare / "options"
     rig.hook(
@@ -557,11 +561,11 @@ def test_killed_while_proposing_there_is_one_branch_after_the_restart(
     with rig.running(address) as generator:
         other = Proposed(generator, goal(2))
         other_branch = other.branch
-        rig.wait_until(lambda: len(branches(bare)) == 2, "both wait")
+        rig.wait_until(lambda: len(branches(bare)) == 2, "both demands wait")
         [branch] = [one for one in branches(bare) if one != other_branch]
         assert [c.one("Operation-Id") for c in rig.commits(bare, f"main..{branch}")] == ["op-one"]
         petra.merge(branch)
-        rig.wait_until(lambda: branches(bare) == [other_branch], "the merge was seen")
+        rig.wait_until(lambda: branches(bare) == [other_branch], "the generator has seen the merge")
     assert rig.books(bare) == rig.books_after([goal(1)])
 
 
@@ -573,7 +577,7 @@ def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the
     drivers.start(url, lanes, opening=opening, die_at="retracting").listen()
     with rig.running(url) as generator:
         rig.wait_until(lambda: not branches(bare), "the branch is deleted")
-        rig.wait_until(lambda: generator.operations == (), "both are answered")
+        rig.wait_until(lambda: generator.operations == (), "both demands are answered")
     assert rig.claims(bare) == []
 
 
@@ -597,7 +601,7 @@ def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
         assert [proposed.branch] == branches(bare)
         server.faults.away = True
         assert generator.withdraw("op-1") is True
-        rig.wait_until(lambda: server.refused, "it was tried in vain")
+        rig.wait_until(lambda: server.refused, "the generator has tried in vain")
         server.faults.away = False
         with pytest.raises(Withdrawn):
             rig.receipt(proposed.ticket)
@@ -632,7 +636,7 @@ def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Person) -> None
 
 
 def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Person) -> None:
-    """Joins of one request add up, so the branch gets one commit for each of the two."""
+    """The second join adds to the first, so the branch gets a commit for each of the two."""
     more = goal(1, vehicle=2) | {"connections": []}
     with rig.running(bare) as generator:
         first = Proposed(generator, goal(1), "op-1")
@@ -644,14 +648,17 @@ def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petr
         assert generator.withdraw("op-2")
         with pytest.raises(Withdrawn):
             rig.receipt(second.ticket)
-        rig.wait_until(lambda: len(rig.commits(bare, f"main..{branch}")) == 1, "one is left")
+        rig.wait_until(
+            lambda: len(rig.commits(bare, f"main..{branch}")) == 1,
+            "only one commit of the two demands is left",
+        )
         petra.merge(branch)
         assert first.outcome() == "booked"
     assert rig.books(bare) == rig.books_after([goal(1)])
 
 
 def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Person) -> None:
-    """The latched bookkeeping and the trigger of the clusters need this call after a merge."""
+    """After a merge, the latched bookkeeping and the clusters' trigger depend on `on_publish`."""
     heard = threading.Event()
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))
@@ -674,10 +681,10 @@ def test_a_proposal_passes_the_check_of_pull_requests(
     assert run(["check", str(petra.folder)]) == 0, capsys.readouterr()
 
 
-def test_one_cancelled_right_before_a_crash_is_taken_away_at_the_restart(
+def test_a_demand_withdrawn_right_before_a_crash_loses_its_branch_at_the_restart(
     http: str, server: Server, bare: Path, petra: Person
 ) -> None:
-    """The withdrawal is written to disk first, so a restart deletes the branch."""
+    """The journal has the withdrawal on disk before the crash."""
     with rig.running(http) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)

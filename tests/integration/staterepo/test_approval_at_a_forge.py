@@ -1,4 +1,4 @@
-"""The generator opens a pull request for each proposal; to merge or close it there decides it.
+"""The generator opens a pull request for each proposal; a person decides by merging or closing it.
 
 The forge is a small server on the loopback that handles pull requests as GitHub's API does.
 """
@@ -22,7 +22,7 @@ from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import Person, branches
 from tests.kit.rig import goal
 
-TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 
 
 @dataclass
@@ -92,7 +92,7 @@ def test_a_pull_request_is_opened_and_its_link_told(
         assert "```text\nJoin edge/fusion-1, vehicle01/edge\n" in pull["body"]
         petra.merge(branch)
         assert proposed.outcome() == "booked"
-    assert [one["state"] for one in hub.pulls] == ["open"], "merging is the person's"
+    assert [one["state"] for one in hub.pulls] == ["open"], "the generator must not merge"
 
 
 def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra: Person) -> None:
@@ -113,7 +113,7 @@ def test_one_closed_while_no_generator_ran_is_not_opened_again(
         assert [Proposed(generator, goal(1)).branch] == branches(bare)
     hub.pulls[0]["state"] = "closed"
     with rig.running(bare):
-        rig.wait_until(lambda: branches(bare) == [], "it is turned down")
+        rig.wait_until(lambda: branches(bare) == [], "the demand is turned down")
     assert len(hub.pulls) == 1
 
 
@@ -125,14 +125,14 @@ def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Person) -> N
     assert [pull["head"] for pull in hub.pulls].count(branch) == 1
 
 
-def test_what_is_taken_back_is_closed(hub: Hub, bare: Path, petra: Person) -> None:
+def test_withdrawing_a_demand_closes_its_pull_request(hub: Hub, bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
         assert generator.withdraw("op-1")
         with pytest.raises(Withdrawn):
             rig.receipt(proposed.ticket)
-        rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "the request is closed")
+        rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "the pull request is closed")
 
 
 def test_a_forge_that_is_away_holds_nothing_up_and_is_asked_again(
@@ -144,7 +144,7 @@ def test_a_forge_that_is_away_holds_nothing_up_and_is_asked_again(
         branch = proposed.branch
         assert "https://" not in proposed.told[-1][1]
         hub.away = False
-        rig.wait_until(lambda: "/pull/1 " in proposed.told[-1][1], "the link is told")
+        rig.wait_until(lambda: "/pull/1 " in proposed.told[-1][1], "the requester has the link")
         petra.merge(branch)
         assert proposed.outcome() == "booked"
     assert f"{branch}: GET http://127.0.0.1" in caplog.text

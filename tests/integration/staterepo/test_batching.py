@@ -1,4 +1,4 @@
-"""Demands that come together are one commit each, but one push; a single one is pushed at once."""
+"""Demands that come together are one push with a commit for each; one alone is pushed at once."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.kit.rig import Gate, goal, leave
 
 @pytest.fixture
 def pushes(bare: Path) -> Path:
-    """A file with a line for each push that the remote has accepted."""
+    """A file that gets a line for each push that the remote accepts."""
     log = bare / "pushes"
     log.touch()
     rig.hook(bare, "post-receive", f"cat >> {log}")
@@ -33,9 +33,11 @@ def test_demands_that_come_while_the_worker_is_busy_are_one_commit_each_and_one_
         rest = [generator.submit(goal(n), f"op-{n}") for n in range(1, 21)]
         gate.open.set()
         receipts = [rig.receipt(ticket) for ticket in (first, *rest)]
-    assert _count(pushes) == 2, "the first alone, all others together"
+    assert _count(pushes) == 2, "the first demand must be one push, all others a second one"
     assert [receipt.commit for receipt in receipts] == [commit.id for commit in rig.commits(bare)]
-    assert rig.operations(bare) == [f"op-{n}" for n in range(21)], "in the order they came"
+    assert rig.operations(bare) == [f"op-{n}" for n in range(21)], (
+        "the commits must be in the order of the demands"
+    )
     assert rig.books(bare) == rig.books_after(map(goal, range(21)))
     rig.assert_sound(bare)
 
@@ -44,7 +46,9 @@ def test_a_lone_demand_is_pushed_at_once(url: str, bare: Path, pushes: Path) -> 
     with rig.running(url) as generator:
         for number in range(3):
             receipt = rig.receipt(generator.submit(goal(number)))
-            assert rig.tip(bare) == receipt.commit, "it is there when its requester is told"
+            assert rig.tip(bare) == receipt.commit, (
+                "the commit must be on main when its requester is told"
+            )
             assert _count(pushes) == number + 1
 
 

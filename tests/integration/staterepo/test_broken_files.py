@@ -1,7 +1,7 @@
 """While a file of people is not valid, the other files that people merge take effect.
 
-A broken file is held back together with the other files of its commit. Other commits are not held
-back. After a restart the same files are in effect, and every commit verifies with its trailers.
+A broken file holds back the other files of its commit, but no file of another commit. After a
+restart the same files are in effect, and every commit verifies by its trailers.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def tag(bare: Path) -> Any:
 
 
 def tagged(bare: Path, new: str) -> str:
-    """Return the text of registry/images.yaml with another tag of the detection's image."""
+    """Return registry/images.yaml with another tag for the detection's image."""
     images = yaml.safe_load(text(bare, IMAGES))
     images["kind"] = "Images"
     images["images"]["object-detection"]["tag"] = new
@@ -70,7 +70,7 @@ def test_a_broken_file_of_a_folder_holds_back_none_of_the_others(
 ) -> None:
     """Two pull requests each add a vehicle in a file of its own.
 
-    The first file is broken at first, and later has the id of the second vehicle.
+    The first file is broken at first; later it repeats the id of the second vehicle.
     """
 
     def joining(id: str, **more: str) -> str:
@@ -114,7 +114,7 @@ def test_what_came_with_a_broken_file_waits_with_it(bare: Path, person: Person) 
 
 
 def test_of_a_file_that_breaks_later_the_version_before_stays(bare: Path, person: Person) -> None:
-    """A valid version that was merged while another file was broken is the one that stays."""
+    """The version that stays was merged while another file was broken."""
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
         person.change({"overrides/broken.yaml": BROKEN})
@@ -193,7 +193,7 @@ def test_half_of_an_application_definition_is_not_taken_in(bare: Path, person: P
 
 
 def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
-    """Return a random change: it is valid, or breaks a file, or removes what demands need."""
+    """Return a random change that is valid, breaks a file, or removes what demands need."""
     start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
     claim = random.choice([path for path in rig.claims(bare) if "applications" in path])
     changes: list[dict[str, str | None]] = [
@@ -226,7 +226,7 @@ def includes(generator: Generator, commit: str) -> bool:
 def test_a_start_at_any_commit_finds_what_the_running_generator_has(
     bare: Path, person: Person, seed: int
 ) -> None:
-    """The history alone decides what is in effect, for any reader at any time."""
+    """The history alone decides which files are in effect, for any reader at any time."""
     random, nodes = Random(seed), text(bare, NODES) + "\n"
     with rig.running(bare) as generator:
         rig.book(generator, *(goal(number) for number in range(6)))
@@ -262,7 +262,7 @@ FOREIGN = [
     '100644 "inventory/\\377/\\377.yaml"',
     "100644 policy/" + "deep/" * 3000 + "evil.yaml",
 ]
-"""Modes and paths of tree entries in the form of ``git fast-import``."""
+"""Modes and paths of tree entries, in the form of ``git fast-import``."""
 
 
 def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_called(

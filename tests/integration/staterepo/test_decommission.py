@@ -15,7 +15,7 @@ from tests.kit.rig import Person, goal, leave
 
 
 def of(generator: Generator, subject: str) -> list[str]:
-    """Return the requesters of each claim on a subject, as one text for each claim."""
+    """Return the requesters of each claim on a subject: one text for each claim."""
     claims = [c for c in generator.snapshot.state.ledger if c.subject.id == subject]
     return sorted(" ".join(claim.requesters) for claim in claims)
 
@@ -23,7 +23,7 @@ def of(generator: Generator, subject: str) -> list[str]:
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     url: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
-    """A generator runs meanwhile, and its polls find both commits."""
+    """A generator runs meanwhile; its polls find both commits."""
     person = Person(bare, tmp_path / "person")
     with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))
@@ -53,7 +53,8 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
         person.fetch()
         assert demandops("check", tmp_path / "person")[0] == 0
         rig.wait_until(
-            lambda: "vehicle01" not in generator.snapshot.state.config.nodes, "it is taken in"
+            lambda: "vehicle01" not in generator.snapshot.state.config.nodes,
+            "the generator has followed the inventory",
         )
         assert generator.snapshot.problems == ()
         assert rig.git(bare, "ls-tree", "main", ".demandops") == ""
@@ -63,7 +64,9 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     rig.assert_sound(bare)
 
 
-def test_applications_at_a_node_go_in_whosever_name(bare: Path, demandops: Run) -> None:
+def test_decommissioning_a_node_releases_its_applications_for_every_requester(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1), goal(2))
     assert demandops("decommission", "edge", "--node", "--state-repo", bare)[0] == 0
@@ -79,7 +82,9 @@ def _by_the_edges_broker(target: str) -> rig.Goal:
     return made
 
 
-def test_of_a_broker_that_was_asked_for_another_takes_the_place(bare: Path, demandops: Run) -> None:
+def test_another_broker_replaces_the_demanded_broker_of_a_decommissioned_node(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, _by_the_edges_broker("cloud"))
     code, out, err = demandops("decommission", "edge", "--state-repo", bare)
@@ -90,7 +95,9 @@ def test_of_a_broker_that_was_asked_for_another_takes_the_place(bare: Path, dema
     rig.assert_sound(bare)
 
 
-def test_where_no_other_broker_would_do_it_is_refused_whole(bare: Path, demandops: Run) -> None:
+def test_a_decommission_that_leaves_a_connection_without_a_broker_changes_nothing(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, _by_the_edges_broker("station00"), goal(2))
     tip = rig.tip(bare)
@@ -134,7 +141,9 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(bare: Path, deman
     rig.assert_sound(bare)
 
 
-def test_as_a_requester_only_a_node_keeps_what_is_at_it(bare: Path, demandops: Run) -> None:
+def test_decommissioning_a_node_as_a_requester_leaves_its_topics_to_others(
+    bare: Path, demandops: Run
+) -> None:
     others = goal(2)
     for subject in (others["apps"][0]["object_detection_fusion_app"], others["connections"][0]):
         subject["requester_ids"] = ["user2"]
@@ -162,7 +171,9 @@ def test_dry_run_shows_the_consequence_and_releases_nothing(bare: Path, demandop
     assert rig.tip(bare) == tip
 
 
-def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Run) -> None:
+def test_a_name_without_claims_changes_nothing_and_an_unknown_name_is_refused(
+    bare: Path, demandops: Run
+) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
     tip = rig.tip(bare)
@@ -187,7 +198,7 @@ def test_what_holds_nothing_is_told_and_a_typo_shows(bare: Path, demandops: Run)
 def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Run
 ) -> None:
-    """Like any demand, a decommission waits in the journal, and the next start carries it out."""
+    """A decommission waits in the journal like any demand, so the next start carries it out."""
     from demandops.demand.demand_request import Decommission
 
     generator = Generator(url)
@@ -200,7 +211,7 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     assert rig.operations(bare)[-1] == "op-leave"
     assert rig.commits(bare)[-1].one("Node") == "vehicle01"
     author = rig.git(bare, "log", "-1", "--format=%an", "main")
-    assert author == "DemandOps generator", "nobody is named who had it done"
+    assert author == "DemandOps generator", "without a person, the generator must be the author"
     rig.assert_sound(bare)
 
 

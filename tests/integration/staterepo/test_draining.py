@@ -1,4 +1,4 @@
-"""After a person drains a node, one commit moves what was placed there, and gives the reason."""
+"""After a person drains a node, one commit moves its placed applications and gives the reason."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _demand(name: str, **where: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_what_was_placed_moves_once_with_its_reason(
+def test_draining_moves_placed_applications_in_one_commit_with_the_reason(
     bare: Path, person: Person, tmp_path: Path
 ) -> None:
     person.change(_nodes(bare, edge="capabilities: [gpu]", cloud="capabilities: [gpu]"), "GPUs")

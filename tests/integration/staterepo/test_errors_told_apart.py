@@ -1,4 +1,4 @@
-"""Errors while a demand is published: who gets which message, and when it is tried again."""
+"""Errors while a demand is published: who gets which message, and what is tried again."""
 
 from __future__ import annotations
 
@@ -73,9 +73,12 @@ def test_a_full_disk_keeps_demands_waiting_until_there_is_room(
         rig.book(generator, goal(1))
         stages = Stages()
         journal = generator._slot.folder / "outbox.jsonl"
-        with files_end_at(journal.stat().st_size + 1500):  # room for an entry, not a pack
+        # room for a journal entry, not for a pack
+        with files_end_at(journal.stat().st_size + 1500):
             ticket = generator.submit(goal(2), listener=stages)
-            rig.wait_until(lambda: ticket.future.done() or "away" in stages.names, "it is told")
+            rig.wait_until(
+                lambda: ticket.future.done() or "away" in stages.names, "the requester is told"
+            )
             told = dict(stages.told).get("away", "")
             assert "its disk has no room (File too large); free some" in told
             assert "no room" in generator.remote_status.unreachable
@@ -153,7 +156,7 @@ def test_a_lock_that_is_no_file_is_told_and_not_waited_for_in_silence(bare: Path
         lock = bare / "refs" / "heads" / "main.lock"
         lock.mkdir()
         generator.submit(goal(1), listener=stages)
-        rig.wait_until(lambda: "away" in stages.names, "it is told", 20)
+        rig.wait_until(lambda: "away" in stages.names, "the requester is told", 20)
         lock.rmdir()
     rig.assert_sound(bare)
 
@@ -168,7 +171,7 @@ def _commit_by_hand(
     more: str = "",
     people: str = "",
 ) -> None:
-    """Write a commit with content that no Git library would write, and set main to it."""
+    """Point main at a commit that no Git library would write."""
     repo, parent = pygit2.Repository(str(bare)), tip(bare)
     people = people or f"Petra <petra@example.org> {time} +0000"
     text = (
@@ -180,7 +183,7 @@ def _commit_by_hand(
 
 
 def _with_entry_in_overrides(bare: Path, name: bytes, blob: pygit2.Oid) -> pygit2.Oid:
-    """Return main's tree with ``overrides/`` replaced by one entry."""
+    """Return main's tree, in which ``overrides/`` has only this entry."""
     repo = pygit2.Repository(str(bare))
     tree = repo.TreeBuilder(repo[tip(bare)].peel(pygit2.Tree))
     made = repo.write(pygit2.enums.ObjectType.TREE, b"100644 %s\0%s" % (name, blob.raw))
@@ -202,7 +205,7 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
         assert caplog.text.count("Traceback") == 1
         pygit2.Repository(str(bare)).references["refs/heads/main"].set_target(good)
         rig.book(generator, goal(3))
-        rig.wait_until(lambda: "writer" not in generator.failures, "it works again")
+        rig.wait_until(lambda: "writer" not in generator.failures, "the writer works again")
     rig.assert_sound(bare)
 
 
@@ -304,13 +307,16 @@ def test_a_damaged_clone_is_made_anew(
 def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    """If the clone's configuration is missing, git reports that ``origin`` is no repository."""
+    """Without the clone's configuration, git reports that ``origin`` is no repository."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         file = generator._slot.folder / "clone.git" / name
         away = file.rename(file.with_name("away"))
         ticket = generator.submit(goal(2))
-        rig.wait_until(lambda: f"its clone {file.parent} cannot be read" in caplog.text, "it says")
+        rig.wait_until(
+            lambda: f"its clone {file.parent} cannot be read" in caplog.text,
+            "the log names the clone",
+        )
         assert not ticket.future.done()
         away.rename(file)
         assert rig.receipt(ticket).outcome == "booked"

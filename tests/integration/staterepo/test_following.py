@@ -104,9 +104,9 @@ CHANGES = {
     "moved-node": ("http", _move_node, lambda text: "garage" in text),
     "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
-"""By name: a kind of address, the change, and a check of the result.
+"""For each change by name: a kind of address, the change, and a check of the result.
 
-One address each is enough, because the result does not depend on it.
+One kind of address for each is enough, because the result does not depend on it.
 """
 
 
@@ -134,7 +134,7 @@ def test_a_change_is_honoured_without_any_demand(
         committer = rig.git(bare, "log", "-1", "--format=%cn", commit.id)
         assert committer == "DemandOps generator"
         rig.book(generator, goal(3))
-        assert holds(_everything(bare)), "still so after a further demand"
+        assert holds(_everything(bare)), "the change must hold after a further demand"
     assert caplog.text.count(f"after commit {made[:12]}") == 1
     rig.assert_sound(bare)
 
@@ -185,17 +185,19 @@ def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
         assert told and all(problem["since"] == made for problem in told)
         assert {problem["author"] for problem in told} == {"Petra Platform <petra@example.org>"}
         assert all(problem["file"].startswith(where) for problem in told), told
-        rig.wait_until(lambda: generator.snapshot.problems, "diagnostics tell it")
+        rig.wait_until(lambda: generator.snapshot.problems, "diagnostics show the change")
         assert rig.git(bare, "rev-parse", "main:clusters") == standing
         report = rig.git(bare, "rev-parse", f"main:{problem_report.PATH}")
         rig.book(generator, goal(3), goal(6), leave(3))
-        assert rig.git(bare, "rev-parse", f"main:{problem_report.PATH}") == report, "demands go on"
+        assert rig.git(bare, "rev-parse", f"main:{problem_report.PATH}") == report, (
+            "a demand must not change the report"
+        )
         assert [c.one("Operation") for c in rig.commits(bare)][-3:] == ["join", "join", "shutdown"]
         logged = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
         assert len(logged) == len(set(logged)) == len(told)
         followed(bare, person.change(mended, "Mend it"))
         assert problems(bare) == []
-        rig.wait_until(lambda: not generator.snapshot.problems, "diagnostics tell it")
+        rig.wait_until(lambda: not generator.snapshot.problems, "diagnostics show the change")
     assert rig.books(bare) == rig.books_after([goal(1), goal(2), goal(6)])
     rig.assert_sound(bare)
 
@@ -209,7 +211,7 @@ def test_a_problem_that_stands_at_a_restart_is_reported_no_second_time(
         rig.book(generator, goal(6))  # for the application of goal 1
     tip = rig.tip(bare)
     with rig.running(url, fetch_interval=SOON_S) as generator:
-        rig.wait_until(lambda: generator.snapshot.problems, "it is seen again")
+        rig.wait_until(lambda: generator.snapshot.problems, "the generator sees the problem again")
         assert rig.tip(bare) == tip
         assert rig.book(generator, leave(6))[0].outcome == "released"
     rig.assert_sound(bare)
@@ -254,7 +256,7 @@ def test_two_generators_follow_a_change_once(
         for generator in (one, two):
             rig.wait_until(
                 lambda generator=generator: str(generator.snapshot.commit) == commit.id,
-                "both have taken it in",
+                "both generators have followed",
             )
     assert newest(bare).id == commit.id
     rig.assert_sound(bare)
@@ -268,25 +270,27 @@ def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> 
         rig.book(off, goal(1))
         known = str(off.snapshot.commit)
         commit = followed(bare, person.change(_move_broker(bare)))
-        rig.wait_until(lambda: str(on.snapshot.commit) == commit.id, "the other follows")
+        rig.wait_until(lambda: str(on.snapshot.commit) == commit.id, "the other generator follows")
         assert str(off.snapshot.commit) == known
         off.fetch_now()  # as after a webhook's call
-        rig.wait_until(lambda: str(off.snapshot.commit) == commit.id, "it follows now")
+        rig.wait_until(lambda: str(off.snapshot.commit) == commit.id, "the generator follows now")
 
 
 # ---- the remote is slow, or away ----
 
 
-def test_a_look_that_hangs_holds_up_no_demand(http: str, server: Server, bare: Path) -> None:
+def test_a_fetch_that_hangs_delays_no_demand(http: str, server: Server, bare: Path) -> None:
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         hang = server.faults.hang = threading.Event()
-        rig.wait_until(lambda: generator._repository._process, "a look is under way and hangs")  # type: ignore[attr-defined]
+        rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
         talking = generator._repository._process  # type: ignore[attr-defined]
         stages = Stages()
         ticket = generator.submit(goal(2), listener=stages)
-        rig.wait_until(lambda: "committed" in stages.names, "it is judged although the look hangs")
-        assert talking.poll() is not None, "the look was ended for it"
+        rig.wait_until(
+            lambda: "committed" in stages.names, "the demand is committed although the fetch hangs"
+        )
+        assert talking.poll() is not None, "the fetch must be ended for the demand"
         assert not generator.remote_status.unreachable
         server.faults.hang = None
         hang.set()
@@ -298,7 +302,7 @@ def test_stopping_does_not_wait_for_a_look_that_hangs(http: str, server: Server)
     generator = Generator(http, fetch_interval=SOON_S)
     hang = server.faults.hang = threading.Event()
     try:
-        rig.wait_until(lambda: generator._repository._process, "a look is under way and hangs")  # type: ignore[attr-defined]
+        rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
         assert generator.stop(timeout=60).result(10) is True
     finally:
         server.faults.hang = None
@@ -312,13 +316,15 @@ def test_a_remote_away_is_logged_once_and_once_when_it_is_back(
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         server.faults.away = True
-        rig.wait_until(lambda: server.refused > 2, "it was looked at again and again")
+        rig.wait_until(lambda: server.refused > 2, "the generator has asked again and again")
         assert "503" in generator.remote_status.unreachable
         made = person.change(_move_broker(bare))
         server.faults.away = False
         generator.fetch_now()
         followed(bare, made)
-        rig.wait_until(lambda: not generator.remote_status.unreachable, "it is known to be back")
+        rig.wait_until(
+            lambda: not generator.remote_status.unreachable, "the remote is known to be back"
+        )
     told = [record.getMessage() for record in caplog.records]
     assert sum("trying again until it is back" in text for text in told) == 1
     assert sum(" is back after " in text for text in told) == 1
@@ -330,11 +336,13 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         server.faults.away = True
-        rig.wait_until(lambda: generator.remote_status.unreachable, "it is known to be away")
+        rig.wait_until(
+            lambda: generator.remote_status.unreachable, "the remote is known to be away"
+        )
         stages = Stages()
         stays = generator.submit(goal(2), "op-2")
         goes = generator.submit(goal(3), "op-3", stages)
-        rig.wait_until(lambda: stages.told, "the requester hears of it")
+        rig.wait_until(lambda: stages.told, "the requester is told")
         ((stage, text),) = stages.told
         assert stage == "away" and text.startswith(f"waiting: {http} cannot be fetched")
         assert "503" in text
@@ -344,7 +352,7 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
         with pytest.raises(NotAnswered):
             stays.future.result(0)
         assert generator.snapshot.state.ledger.claims_of_requester("user1"), (
-            "what is known can be read"
+            "the known state must stay readable"
         )
         server.faults.away = False
         assert rig.receipt(stays).outcome == "booked"
@@ -354,10 +362,12 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
 def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, bare: Path) -> None:
     with rig.running(http, fetch_interval=SOON_S, queue_limit=3) as generator:
         server.faults.away = True
-        rig.wait_until(lambda: generator.remote_status.unreachable, "it is known to be away")
+        rig.wait_until(
+            lambda: generator.remote_status.unreachable, "the remote is known to be away"
+        )
         tickets = [generator.submit(goal(number)) for number in range(500)]
-        # the worker may take some into its batch meanwhile, so the last one may find room
-        rig.wait_until(lambda: any(one.future.done() for one in tickets), "one is refused")
+        # the worker may move some into its batch, so the last demand may find room
+        rig.wait_until(lambda: any(one.future.done() for one in tickets), "a demand is refused")
         refused = next(one for one in tickets if one.future.done())
         with pytest.raises(QueueFull, match=r"waiting already for the state repo: .*503"):
             rig.receipt(refused)
@@ -370,7 +380,7 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, ba
 def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     url: str, bare: Path, drivers: rig.Drivers
 ) -> None:
-    """There are more demands than one push takes; the others are on disk too."""
+    """One push cannot take all these demands; the journal has the others."""
     many = 250
     rig.restart(url)  # creates the clone
     with rig.away(bare):
@@ -379,7 +389,7 @@ def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
         journal = settings.data_home(url) / "slot-0" / "outbox.jsonl"
         watcher = threading.Thread(target=run.listen)
         watcher.start()
-        rig.wait_until(lambda: len(_kept(journal)) == many, "all are in the outbox")
+        rig.wait_until(lambda: len(_kept(journal)) == many, "all demands are in the journal")
         run.kill()
         watcher.join()
     assert rig.restart(url) is True
@@ -408,11 +418,14 @@ def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
         rig.book(generator, short)
         server.faults.away = True
         refused = server.refused
-        rig.wait_until(lambda: server.refused > refused + 3, "the end of the lease is tried")
+        rig.wait_until(
+            lambda: server.refused > refused + 3, "the generator has tried to end the lease"
+        )
         assert generator.snapshot.state.ledger.claims_of_demand("short")
         server.faults.away = False
         rig.wait_until(
-            lambda: not generator.snapshot.state.ledger.claims_of_demand("short"), "it is released"
+            lambda: not generator.snapshot.state.ledger.claims_of_demand("short"),
+            "the demand is released",
         )
     assert newest(bare).one("Operation") == "expire"
     rig.assert_sound(bare)

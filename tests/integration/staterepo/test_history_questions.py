@@ -1,4 +1,4 @@
-"""Questions of the code that reads clusters, with real Git: which commit is later, what differs."""
+"""The code that reads clusters asks of real Git which commit is later, and what differs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 
 @pytest.fixture
 def line(bare: Path, tmp_path: Path) -> list[str]:
-    """Three commits: the first one, a change of a text file, and a change of a chart."""
+    """Three commits: the repo's first one, a change of a text file, and a change of a chart."""
     person = Person(bare, tmp_path / "person")
     first = rig.tip(bare)
     other = person.change({"notes.txt": "one\n"})

@@ -1,4 +1,4 @@
-"""After a kill at any moment and a restart, no acknowledged demand is missing or counts twice."""
+"""After a kill at any time and a restart, each acknowledged demand is there, and counts once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LANES = 4
 
 
 def _client(lane: int) -> list[tuple[str, rig.Goal]]:
-    """Return a client's demands in order: of every three joins, two are followed by a leave."""
+    """Return a client's demands in order; of every three joins, two are followed by a leave."""
     made = []
     for turn in range(60):
         number = lane + turn * LANES
@@ -68,7 +68,9 @@ def test_killed_at_random_moments_loses_and_doubles_nothing(
         f"{commit.one('Request-Id').removeprefix('demand-')}"
         for commit in rig.commits(bare)
     ]
-    assert sorted(in_history) == sorted(acknowledged), "one commit for each acknowledged demand"
+    assert sorted(in_history) == sorted(acknowledged), (
+        "each acknowledged demand must have one commit"
+    )
     for name, commit in acknowledged.items():
         if commit:
             rig.git(bare, "merge-base", "--is-ancestor", commit, "main")
@@ -187,7 +189,7 @@ def test_a_release_in_the_same_batch_as_its_join_stays_when_both_are_replayed(
 def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_replay(
     drivers: Drivers, url: str, bare: Path
 ) -> None:
-    """The repeated join has no commit; the commit of the later release shows it was handled."""
+    """The repeated join has no commit, but a later commit shows that it was handled."""
     opening = demand("join-1", goal(1))
     lanes = [[demand("join-1-again", goal(1))], [demand("leave-1", leave(1))]]
     drivers.start(url, lanes, opening=opening, die_at="published:2").listen()
@@ -195,14 +197,14 @@ def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_repla
     tip = rig.tip(bare)
 
     assert rig.restart(url) is True
-    assert rig.claims(bare) == [], "what was released stands again"
+    assert rig.claims(bare) == [], "a replay must not book a released demand"
     assert rig.tip(bare) == tip
 
 
 def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
     drivers: Drivers, bare: Path
 ) -> None:
-    """After the release nothing contradicts the join any more, but in its order it was refused."""
+    """After the release, nothing contradicts the join; before it, the join was refused."""
     elsewhere = goal(1)
     elsewhere["apps"][0]["header"]["node_id"] = "cloud"
     lanes = [[demand("join-elsewhere", elsewhere)], [demand("leave-1", leave(1))]]
@@ -211,7 +213,7 @@ def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
     assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
 
     assert rig.restart(bare) is True
-    assert rig.claims(bare) == [], "its requester has left since"
+    assert rig.claims(bare) == [], "a replay must not book a demand whose requester has left"
 
 
 @pytest.mark.parametrize("node", ["edge", "cloud"])
@@ -248,7 +250,7 @@ def test_a_branch_lock_left_by_a_killed_generator_does_not_stop_the_next_one(
     drivers: Drivers,
     bare: Path,
 ) -> None:
-    """libgit2 holds main.lock while it syncs the branch; the generator is killed in that moment."""
+    """libgit2 creates main.lock while it syncs the branch; the kill comes at that time."""
     lock = bare / "refs" / "heads" / "main.lock"
     told = drivers.start(bare, [[demand("join-1", goal(1))]], die_at="locked").listen()
     assert told.answers == {}
@@ -311,7 +313,7 @@ def _of_the_first_version(text: bytes) -> bytes:
 def _leave_journal(url: str, bare: Path, data_home: Path, whose: str) -> Path:
     """Leave a journal with the demands 1 and 2 behind; return its path.
 
-    With `whose` "own" it is in the slot that the next process takes, else in another slot.
+    If `whose` is "own", the journal is in the slot that the next process takes, else in another.
     """
     _leave_pending(url, bare, [1, 2])
     journal = next(data_home.glob("*/slot-0/outbox.jsonl"))
@@ -398,7 +400,9 @@ def test_two_processes_have_slots_of_their_own_and_a_dead_ones_outbox_is_adopted
         slots = sorted(path.name for path in next(data_home.iterdir()).iterdir())
         assert slots == ["slot-0", "slot-1"]
         rig.book(first, goal(2))
-        assert len(rig.operations(bare)) == 1, "the first had no reason to look at the other's slot"
+        assert len(rig.operations(bare)) == 1, (
+            "the first generator must not read the other's journal yet"
+        )
     assert rig.restart(url) is True
     assert "op-join-1" in rig.operations(bare)
     assert not list(data_home.glob("*/slot-1/outbox.jsonl"))
@@ -411,7 +415,7 @@ def test_the_outbox_of_one_state_repo_is_never_played_into_another(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Two state repos have the same relative path, each in a folder of its own."""
+    """Two state repos have the same relative path, in different folders."""
     for folder in ("here", "there"):
         (tmp_path / folder).mkdir()
         new_repo(f"{folder}/state.git")

@@ -1,4 +1,4 @@
-"""Leases on a real repository: a commit releases a demand whose lease ends, unless it is renewed.
+"""Leases on a real repository: a commit releases a demand when its lease ends without a renewal.
 
 The leases have no slack. No test measures time: each wait ends with the expected event.
 """
@@ -35,7 +35,6 @@ domains:
 
 
 def _with_policy(repo: Path, more: str = "") -> Path:
-    """Commit a policy as a person would."""
     GitRepo(repo).commit({DOMAINS: POLICY % more}, "Short leases\n")
     return repo
 
@@ -48,7 +47,7 @@ def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 def put(demand: str, lease: Any = 60, who: str = "vehicle00", **more: Any) -> rig.Goal:
-    """Return a demand for an application, from which a connection is derived."""
+    """Return a demand for an application; its connection is derived from the application."""
     return goals.put(demand, who, "station00", **({} if lease is None else {"lease": lease}) | more)
 
 
@@ -73,7 +72,7 @@ def ends(generator: Generator, demand: str) -> datetime:
 
 
 def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
-    """Write a demand into the journal, as a generator that was killed leaves it."""
+    """Write a demand into the journal, as a killed generator would leave it there."""
     slot = Slot(settings.data_home(str(repo)))
     slot.journal.append([JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
     slot.close()
@@ -99,7 +98,7 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
         "\n", 2
     )
     assert author == "station00, vehicle00 <short@demandops.invalid>"
-    assert int(made) >= int(end.timestamp()), "released before its end"
+    assert int(made) >= int(end.timestamp()), "the lease was ended too early"
     told = end.strftime("%Y-%m-%d %H:%M:%S UTC")
     assert "the lease of demand 'short' on 1 application and 1 connection in the name" in body
     assert f"ended at {told} and was not renewed" in body.replace("\n", " ")
@@ -122,7 +121,7 @@ def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
     rig.assert_sound(bare)
 
 
-def test_what_is_renewed_stays_and_makes_commits_of_its_ledger_alone(
+def test_renewing_a_lease_keeps_the_claim_and_changes_no_cluster_file(
     clock: Clock, bare: Path
 ) -> None:
     with rig.running(bare, runtime=clock) as generator:
@@ -144,7 +143,7 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
 ) -> None:
     with rig.running(bare, runtime=clock) as generator:
         rig.book(generator, put("d", 60))
-    # by the record the lease ended 40 s ago; the renewal came before, but no generator ran
+    # by the record, the lease ended 40 s ago; the renewal came before, while no generator ran
     leave_in_outbox(bare, "op-renew", renew("d"), clock.now() + timedelta(seconds=50))
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:
@@ -161,14 +160,16 @@ def test_an_end_that_waits_while_the_clock_is_set_back_does_not_come(
         rig.book(generator, put("d"))
         with rig.away(bare):
             clock.pass_(61)
-            rig.wait_until(lambda: "trying again" in caplog.text, "it tries to end the lease")
+            rig.wait_until(
+                lambda: "trying again" in caplog.text, "the generator tries to end the lease"
+            )
             clock.set_by(-3600)
         rig.book(generator, put("other"))
     assert expiries(bare) == []
     assert re.search(r"is back after \d+ s", caplog.text)
 
 
-def test_what_another_generator_renewed_is_kept(
+def test_a_lease_that_another_generator_renewed_does_not_expire(
     clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, logger="demandops")
@@ -179,7 +180,7 @@ def test_what_another_generator_renewed_is_kept(
         clock.pass_(60)
         rig.wait_until(
             lambda: held(first, "d")[0].lease == held(second, "d")[0].lease,
-            "the first has tried to release it, and learnt better",
+            "the first generator has seen the renewal",
         )
     assert "the state repo has moved" in caplog.text
     assert expiries(bare) == []
@@ -188,7 +189,7 @@ def test_what_another_generator_renewed_is_kept(
 
 
 def test_an_idle_generator_releases_what_another_process_booked(clock: Clock, bare: Path) -> None:
-    """For example, ``demandops request`` has booked it beside ``demandops serve``."""
+    """The other process is, for example, ``demandops request`` beside ``demandops serve``."""
     with rig.running(bare, runtime=clock) as idle:
         with rig.running(bare, runtime=clock) as other:
             rig.book(other, put("d"))

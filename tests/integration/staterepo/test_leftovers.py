@@ -1,4 +1,4 @@
-"""Leftovers of killed processes and failed syncs in state repos, and repos that are refused."""
+"""Leftovers of killed processes and failed syncs in a state repo, and repos that are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Four generators and a person write to one state repo at once, with random cuts of connections.
+"""Four generators and a person write to one state repo at once, while connections are cut.
 
 The load is small in `make test`; `make load` sends 2,000 demands and prints the figures of each
 writer.
@@ -27,12 +27,12 @@ SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
 LANES = 4
 """The number of requesters at each generator; each waits for an answer before it sends again."""
 CUTS = 0.01
-"""The share of HTTP requests that are cut before they are handled; as many are cut afterwards."""
+"""The share of HTTP requests that are cut before the server handles them; as many are cut after."""
 PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
 
 def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
-    """Return one generator's demands by lane: of every three joins, one is followed by a leave."""
+    """Return one generator's demands by lane; of every three joins, one is followed by a leave."""
     lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(LANES)]
     left = DEMANDS // GENERATORS
     turn = 0
@@ -50,7 +50,7 @@ def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
 
 @dataclass
 class _Person:
-    """A person who keeps changing the state repo: fetch, commit, push, again after a refusal."""
+    """A person who keeps changing the state repo: fetch, commit, push, and again if refused."""
 
     person: rig.Person
     pushed: list[str] = field(default_factory=list)

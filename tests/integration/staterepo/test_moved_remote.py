@@ -1,4 +1,4 @@
-"""People push between demands: their commits stay, demands go on top, and history is linear."""
+"""People push between demands: their commits stay, demands go on top, and the history is linear."""
 
 from __future__ import annotations
 
@@ -55,9 +55,10 @@ def _break_claim(bare: Path) -> Callable[[Person], str]:
 EITHER = pytest.mark.parametrize(
     ("address", "running"), [("file-url", True), ("embedded", False)], indirect=["address"]
 )
-"""The generator runs and uses a remote, or it is stopped meanwhile and uses the repo in place.
+"""In one case, the generator runs during the change and uses a remote.
 
-The other two combinations are left out, because address and run do not depend on each other.
+In the other case, it is stopped meanwhile and uses the repo in place. The other two combinations
+are left out, because address and run do not depend on each other.
 """
 
 
@@ -70,7 +71,8 @@ def _around(
 ) -> str:
     """Book demands before and after a person's change; return the person's commit.
 
-    The generator runs during the change, or it is stopped before and started after it.
+    If ``running``, the generator runs during the change. Otherwise it stops before and starts
+    after.
     """
     if running:
         with rig.running(address) as generator:
@@ -87,7 +89,7 @@ def _around(
 
 
 def _kinds(bare: Path) -> list[str]:
-    """Return the kind of each commit, oldest first: its operation, or ``person``."""
+    """Return the operation of each commit, oldest first; a person's commit is ``person``."""
     return [commit.one("Operation") or "person" for commit in rig.commits(bare)]
 
 
@@ -185,10 +187,10 @@ def test_a_node_taken_away_is_gone_for_new_demands_once_it_is_released(
 
 
 @EITHER
-def test_what_an_inventory_changed_is_carried_out_once_nothing_stands_in_its_way(
+def test_an_inventory_change_is_applied_once_a_removed_node_is_released(
     address: str, bare: Path, person: Person, running: bool
 ) -> None:
-    """One push moves a broker and removes a node in use; a later demand releases the node."""
+    """One push moves a broker and removes a node in use; later demands release the node."""
     brokers = rig.git(bare, "show", f"main:{BROKERS}") + "\n"
     moved = brokers.replace("service-mqtt-broker-edge", "broker-of-the-edge")
     both = rig.without_vehicle01(bare) | {BROKERS: moved}
@@ -202,14 +204,14 @@ def test_what_an_inventory_changed_is_carried_out_once_nothing_stands_in_its_way
             rig.book(generator, *released)
     command = ["grep", "-l", "service-mqtt-broker-edge", "main", "--", "clusters"]
     standing = rig.git(bare, *command, check=False).splitlines()
-    assert standing == [], "these are still told the old broker"
+    assert standing == [], "these files still have the old broker"
     rig.assert_sound(bare)
 
 
 def test_a_generated_file_that_a_person_edited_is_put_right_with_the_next_commit(
     url: str, bare: Path, person: Person
 ) -> None:
-    """`demandops check` warns that such an edit is lost; every commit verifies."""
+    """`demandops check` warns of such an edit; every commit verifies nevertheless."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         paths = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/").splitlines()
@@ -242,7 +244,7 @@ def test_the_remote_is_never_force_pushed_and_nothing_is_merged(
 
 
 def test_a_person_who_takes_commits_back_has_the_last_word(address: str, bare: Path) -> None:
-    """A person resets main to an older commit, and the next demand goes on top of that."""
+    """A person resets main to an older commit, and the next demand goes on top of that commit."""
     with rig.running(address) as generator:
         rig.book(generator, goal(1))
         older = rig.tip(bare)
@@ -335,17 +337,19 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
         assert rig.book(generator, leave(1))[0].outcome == "released"
 
 
-def test_a_verdict_on_a_stale_clone_is_not_given_while_the_remote_is_away(
+def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """On the stale clone neither demand would need a push, but the remote has changed since."""
+    """Against the stale clone, neither demand needs a push, but the remote has changed since."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)
         with rig.away(bare):
             again = generator.submit(goal(1))
             late = generator.submit(rig.impossible())
-            rig.wait_until(lambda: "trying again" in caplog.text, "the remote was asked in vain")
+            rig.wait_until(
+                lambda: "trying again" in caplog.text, "the generator has asked the remote in vain"
+            )
             assert not again.future.done()
             assert not late.future.done()
         assert rig.receipt(again).outcome == "booked"

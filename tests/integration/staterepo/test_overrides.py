@@ -1,4 +1,4 @@
-"""A person merges overrides while a generator runs: each takes effect, lasts, and is taken back.
+"""Overrides that a person merges while a generator runs take effect, last, and end again.
 
 The next demand finds what was merged before it. At the end of each test every commit verifies.
 """
@@ -29,7 +29,7 @@ WATCHED: dict[str, Any] = {"services": ["object-detection"], "nodes": ["edge"]}
 
 @pytest.fixture
 def remote_generator(url: str, clock: Clock) -> Iterator[Generator]:
-    """A generator that uses the state repo as a remote."""
+    """A generator that uses the state repo by its URL."""
     with rig.running(url, runtime=clock) as running:
         yield running
 
@@ -60,7 +60,7 @@ def test_nobody_takes_an_overrides_demand_id(generator: Generator) -> None:
         rig.book(generator, goal | {"operation": "release"})
 
 
-def test_what_is_merged_arrives_stays_and_goes(
+def test_a_merged_override_applies_until_it_is_deleted(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     limits = {"resources": {"limits": {"memory": "2Gi"}}}
@@ -143,7 +143,9 @@ def test_the_connections_of_a_demand_follow_a_moved_service_also_through_a_rollb
     who = ("A", "a@example.org")
     rolled = rollback_goal.goal(before, drop_newer=True, reason="x", who=who)
     assert rig.receipt(generator.submit(rolled)).outcome == "restored"
-    assert "derived/edge/cloud" in rig.books(bare)["connections"], "the override is still there"
+    assert "derived/edge/cloud" in rig.books(bare)["connections"], (
+        "the connection must last as long as the override"
+    )
     person.override(away=None)
     next_demand(generator, 2)
     assert "derived/edge/cloud" not in rig.books(bare)["connections"]
@@ -173,17 +175,17 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     others = [n for n in rig.books(bare)["services"] if n.startswith("of-") and n != fusion]
     for other in others:
         first = file(bare, f"{EDGE}/{other}.yaml").splitlines()[0]
-        assert "frozen.yaml: hold" in first, "rendered once, then held"
+        assert "frozen.yaml: hold" in first, "the file must be rendered once before it is held"
     person.override(frozen=None)
     next_demand(generator, 7)
     assert "/vehicles/vehicle02/ego_data" in file(bare, path)
     person.override(frozen=override({"services": ["object-fusion"]}, hold=True))
     rig.book(generator, rig.leave(1), rig.leave(6))
-    assert file(bare, path) == "", "what nobody demands goes, held or not"
+    assert file(bare, path) == "", "a release that nobody demands must go, held or not"
     rig.assert_sound(bare)
 
 
-def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
+def test_a_denied_requester_is_refused_and_its_claims_suspended_until_the_override_goes(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1), rig.goal(2))
@@ -195,7 +197,7 @@ def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
     assert "vehicle01/edge" not in now["connections"]
     assert {entry["id"] for entry in now["suspended"]} == {"edge/fusion-1", "vehicle01/edge"}
     assert {entry["override"] for entry in now["suspended"]} == {"overrides/closed.yaml"}
-    assert len(rig.claims(bare, "user1")) == 2, "they stay in the ledger"
+    assert len(rig.claims(bare, "user1")) == 2, "suspended claims must stay in the ledger"
     assert follow_of(bare, cause).all("Override") == ["overrides/closed.yaml"]
     anew = rig.goal(11, vehicle=3)
     anew["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["user5", "user1"]
@@ -222,7 +224,7 @@ def test_what_is_denied_is_refused_and_suspended_until_the_override_goes(
     rig.assert_sound(bare)
 
 
-def test_what_is_kept_runs_on_until_somebody_asks_again_or_the_override_goes(
+def test_a_kept_application_runs_until_a_demand_takes_over_or_the_override_goes(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1))
@@ -233,7 +235,7 @@ def test_what_is_kept_runs_on_until_somebody_asks_again_or_the_override_goes(
     assert commit.all("Requester") == ["user1", "station00"]
     books = rig.books(bare)
     assert books["services"]["od-edge-station00"]["requesters"] == ["petra"]
-    assert books["connections"] == {}, "it keeps applications, and this connection is none"
+    assert books["connections"] == {}, "it keeps applications, not connections"
     assert len(rig.claims(bare, "override:lasting")) == 1
     assert "override overrides/lasting.yaml: keep;" in file(bare, DETECTION)
     with pytest.raises(Refused):
@@ -241,7 +243,7 @@ def test_what_is_kept_runs_on_until_somebody_asks_again_or_the_override_goes(
     moved = rig.goal(6)
     moved["apps"][0]["header"]["node_id"] = "cloud"
     rig.book(generator, moved)
-    assert rig.claims(bare, "override:lasting") == [], "it gives way, wherever one asks for it"
+    assert rig.claims(bare, "override:lasting") == [], "a new demand takes over from the override"
     rig.book(generator, moved | {"shutdown": True})
     assert len(rig.claims(bare, "override:lasting")) == 1
     cause = person.override(lasting=None)
@@ -266,7 +268,7 @@ def test_a_claim_that_a_person_deletes_is_kept_too(
     rig.assert_sound(bare)
 
 
-def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
+def test_an_expired_override_ends_in_a_commit_and_a_later_date_revives_it(
     clock: Clock, remote_generator: Generator, bare: Path, person: Person
 ) -> None:
     generator = remote_generator
@@ -279,14 +281,16 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
         late=override(WATCHED, replicas=4, priority=1, expires="2020-01-01T00:00:00Z"),
     )
     next_demand(generator)
-    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3, "late never applied"
+    assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3, (
+        "an override that has expired must not apply"
+    )
     assert "; until 20" in file(bare, DETECTION).splitlines()[0]
     marker = "ledger/overrides/brief.yaml"
     assert file(bare, "ledger/overrides/late.yaml")
     assert file(bare, marker) == ""
     clock.pass_(59 * 60)
     next_demand(generator)
-    assert file(bare, marker) == "", "not before its time"
+    assert file(bare, marker) == "", "the override must not end before its time"
     clock.pass_(60)
     rig.wait_until(lambda: file(bare, marker), "the override has ended")
     assert file(bare, DETECTION) == plain
@@ -296,7 +300,9 @@ def test_what_expires_ends_in_a_commit_of_its_own_and_a_later_date_revives_it(
     assert "overrides/brief.yaml by petra (a field test) expired at" in rig.git(
         bare, "log", "-1", "--format=%b", commit.id
     )
-    assert parsed(bare, "overrides/brief.yaml")["expires"] == short, "the person's file stays"
+    assert parsed(bare, "overrides/brief.yaml")["expires"] == short, (
+        "the generator must not change the person's file"
+    )
     next_demand(generator, 2)
     assert file(bare, DETECTION) == plain
     later = (end + timedelta(days=300)).isoformat()
@@ -317,12 +323,12 @@ def test_what_expired_while_no_generator_ran_ends_when_one_does(
         next_demand(generator)
     clock.pass_(3600)
     with rig.running(bare, runtime=clock):
-        rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
+        rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "the override has ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     rig.assert_sound(bare)
 
 
-def test_a_tie_is_reported_and_what_was_in_force_stays(
+def test_a_tie_is_reported_and_the_earlier_override_stays_in_force(
     generator: Generator, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
     told = "overrides/sound.yaml: priority: is 0, as in overrides/broken.yaml"
@@ -350,7 +356,7 @@ def test_an_override_ends_while_people_have_broken_another(
     next_demand(generator)
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 3
     clock.pass_(3600)
-    rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "it is ended")
+    rig.wait_until(lambda: file(bare, "ledger/overrides/brief.yaml"), "the override has ended")
     assert parsed(bare, DETECTION)["spec"]["values"]["replicas"] == 1
     next_demand(generator, 2)
     rig.assert_sound(bare)

@@ -1,6 +1,6 @@
 """A person merges and removes overrides, some of them broken, and deletes claims, at random.
 
-Demands go on meanwhile. In the end no trace of the overrides is left, and every commit verifies.
+Demands come meanwhile. In the end no trace of the overrides is left, and every commit verifies.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def override(select: dict[str, object], **effects: object) -> Write:
 
 
 def soon(chance: random.Random) -> str:
-    """Return a random time, at most a second ago or two seconds ahead."""
+    """Return a random time between one second ago and two seconds ahead."""
     moment = datetime.now(timezone.utc) + timedelta(seconds=chance.uniform(-1, 2))
     return moment.isoformat()
 

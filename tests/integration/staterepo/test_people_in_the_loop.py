@@ -24,7 +24,7 @@ from tests.kit.rig import Person
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "24"))
 INTERVAL_S = 0.5
-"""The generator's fetch interval; no times are checked, but `make load` prints them."""
+"""The generator's fetch interval in seconds; no test checks times, but `make load` prints them."""
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 FUSION = f"{EDGE}/of-edge-fusion-1-118f66a66700.yaml"
@@ -48,7 +48,7 @@ class Engineer:
         self.kept: dict[str, Callable[[], bool]] = {}
 
     def sees(self, what: str, files: dict[str, str | None], honoured: Callable[[], bool]) -> None:
-        """Merge a change and wait, without any demand, until `honoured` returns true."""
+        """Merge a change and wait until `honoured` returns true, although no demand comes."""
         assert not honoured(), f"{what}: it is so already"
         made = self.person.change(files, what)
         began = time.monotonic()
@@ -59,7 +59,7 @@ class Engineer:
 
 
 def story(bare: Path, engineer: Engineer) -> str:
-    """Make all changes; return the text that the manually edited file must have again."""
+    """Make all changes; return the text that the generator must restore in the edited file."""
     engineer.sees(
         "an override",
         {"overrides/two.yaml": OVERRIDE},

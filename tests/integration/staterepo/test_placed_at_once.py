@@ -1,4 +1,4 @@
-"""Four generators place services at once: no node exceeds its capacity, and all agree."""
+"""Four generators place services at the same time: no node exceeds its capacity, and all agree."""
 
 from __future__ import annotations
 

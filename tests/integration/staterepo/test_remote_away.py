@@ -1,4 +1,4 @@
-"""Goals stay open while the remote is away; what a remote denies is reported and dropped."""
+"""Demands wait while the remote is away; if the remote denies a push, its demands are refused."""
 
 from __future__ import annotations
 
@@ -25,13 +25,17 @@ def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_b
             tickets = [generator.submit(goal(1), listener=stages)]
             rig.wait_until(lambda: "committed" in stages.names, "the first demand is committed")
             tickets += [generator.submit(goal(number)) for number in (2, 3)]
-            rig.wait_until(lambda: "trying again" in caplog.text, "the log says so")
+            rig.wait_until(
+                lambda: "trying again" in caplog.text, "the log says that the generator tries again"
+            )
             assert not any(ticket.future.done() for ticket in tickets)
         receipts = [rig.receipt(ticket) for ticket in tickets]
     assert [receipt.commit for receipt in receipts] == [commit.id for commit in rig.commits(bare)][
         1:
     ]
-    assert stages.names == ["admitted", "booked", "committed", "away", "pushed"], "each told once"
+    assert stages.names == ["admitted", "booked", "committed", "away", "pushed"], (
+        "each stage must be told once"
+    )
     assert rig.books(bare) == rig.books_after(map(goal, range(4)))
     rig.assert_sound(bare)
 
@@ -51,7 +55,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
         generator = Generator(url)
         assert "continuing with the commits of the last fetch" in caplog.text
         fresh = generator.submit(goal(2), "op-2")
-        rig.wait_until(lambda: "trying again" in caplog.text, "it goes on trying")
+        rig.wait_until(lambda: "trying again" in caplog.text, "the generator tries again")
         assert not fresh.future.done()
     rig.receipt(fresh)
     assert generator.close(rig.PATIENCE_S) is True
@@ -63,7 +67,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
 def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
     url: str, bare: Path, tmp_path: Path
 ) -> None:
-    """While two joins wait in the journal, another generator books one of them, and a third."""
+    """While two joins wait in the journal, another generator books one of them and a third."""
     generator = Generator(url)
     with rig.away(bare):
         generator.submit(goal(1), "op-1")
@@ -72,7 +76,9 @@ def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
     with rig.running(url, data=tmp_path / "another-machine") as other:
         rig.book(other, goal(1), goal(3))
     assert rig.restart(url) is True
-    assert "op-1" not in rig.operations(bare), "it changed nothing any more"
+    assert "op-1" not in rig.operations(bare), (
+        "a join that another generator booked must make no commit"
+    )
     assert rig.operations(bare)[-1] == "op-2"
     assert rig.books(bare) == rig.books_after(map(goal, (1, 3, 2)))
     rig.assert_sound(bare)
@@ -120,14 +126,14 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
     assert rig.books(bare) == rig.books_after([goal(0), goal(2)])
     tip = rig.tip(bare)
     assert rig.restart(url) is True
-    assert rig.tip(bare) == tip, "nothing of it is left in the outbox either"
+    assert rig.tip(bare) == tip, "the journal must not have the declined demand"
     rig.assert_sound(bare)
 
 
 def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_its_commits(
     url: str, bare: Path
 ) -> None:
-    """The ledger that contradicts ``moved`` is never published, so that is no reason to refuse."""
+    """The ledger that contradicts ``moved`` is never published, so it must not cause a refusal."""
     gate = Gate()
     hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
     moved = goal(7)
@@ -152,7 +158,7 @@ def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_it
 def test_a_remote_that_cannot_take_the_push_is_told_or_warned_of(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The remote refuses the push without a hook, for example if its disk is full."""
+    """The remote refuses the push without a hook, as it may do when its disk is full."""
     with rig.running(url) as generator:
         rig.git(bare, "config", "receive.maxInputSize", "1")
         ticket = generator.submit(goal(1))
@@ -161,7 +167,7 @@ def test_a_remote_that_cannot_take_the_push_is_told_or_warned_of(
                 ticket.future.done()
                 or any(r.levelname in ("WARNING", "ERROR") for r in caplog.records)
             ),
-            "a requester or a reader of the log who knows why nothing happens",
+            "the requester or the log has the reason",
         )
         rig.git(bare, "config", "--unset", "receive.maxInputSize")
         assert rig.book(generator, goal(2))[0].outcome == "booked"
@@ -191,7 +197,7 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
 def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The message leaves out git's last lines, which are the same for every reason."""
+    """The message leaves out git's last lines, which are the same whatever the reason is."""
     ssh = tmp_path / "ssh"
     ssh.write_text("#!/bin/sh\necho 'git@edge: Permission denied (publickey).' >&2\nexit 255\n")
     ssh.chmod(0o755)
@@ -218,14 +224,14 @@ def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
 def test_a_stale_lock_at_the_remote_is_told_in_the_log_and_survived(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The lock is left by a killed receive-pack; a warning reports it, and the demand waits."""
+    """A killed receive-pack left the lock; a warning reports it, and the demand waits."""
     lock = bare / "refs" / "heads" / "main.lock"
     with rig.running(url) as generator:
         lock.touch()
         ticket = generator.submit(goal(1))
         rig.wait_until(
             lambda: any(r.levelname in ("WARNING", "ERROR") for r in caplog.records),
-            "a warning that the push does not get through",
+            "a warning that the push fails",
         )
         lock.unlink()
         assert rig.receipt(ticket).outcome == "booked"

@@ -1,4 +1,4 @@
-"""Replicas are removed later by a commit, on a real repository, by whichever generator runs."""
+"""A commit removes replicas later, on a real repository, whichever generator runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RELEASE = "of-edge-fusion"
 
 @pytest.fixture(scope="session")
 def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bare state repo whose fusion has a replica for each source and loses replicas late."""
+    """A bare state repo whose fusion has a replica for each source and keeps it for a time."""
     folder = tmp_path_factory.mktemp("kept") / "state.git"
     bare = Path(shutil.copytree(bare_template, folder))
     text = skeleton()[APPDEF].replace("prefix: of\n", f"prefix: of\n    scaling: {SCALING}\n")
@@ -67,7 +67,9 @@ def test_one_of_two_generators_scales_down_when_the_time_is_over(
         assert "3 replicas until" in why
         clock.pass_(600)
         wait_until_down(bare)
-        rig.wait_until(lambda: rig.tip(bare) == str(generator.snapshot.commit), "it follows")
+        rig.wait_until(
+            lambda: rig.tip(bare) == str(generator.snapshot.commit), "the generator follows"
+        )
     (commit,) = (c for c in rig.commits(bare) if c.one("Operation") == "scale-down")
     assert commit.summary.startswith(f"Scale down {RELEASE}")
     assert records(bare) == []

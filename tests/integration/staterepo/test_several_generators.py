@@ -18,7 +18,7 @@ EACH = 16
 
 
 def _demands(who: int) -> list[tuple[str, rig.Goal]]:
-    """Return the demands for one generator: of every three joins, one is followed by a leave."""
+    """Return one generator's demands; of every three joins, one is followed by a leave."""
     made = []
     for turn in range(EACH * 3 // 4):
         number = 2 * turn + who
@@ -108,8 +108,8 @@ def test_the_same_demand_at_two_generators_at_once_is_booked_once(
     rig.assert_sound(bare)
 
 
-def test_a_branch_that_another_writer_holds_for_a_moment_is_tried_again(bare: Path) -> None:
-    """For example, `git push` or a second generator holds the branch's lock while it writes."""
+def test_a_push_is_repeated_while_another_writer_locks_the_branch(bare: Path) -> None:
+    """For example, `git push` or a second generator has the branch's lock while it writes."""
     lock = bare / "refs" / "heads" / "main.lock"
     with rig.running(bare) as generator:
         lock.touch()

@@ -1,4 +1,4 @@
-"""The state repo on a real smart-HTTP server: answers are lost, and the server is away."""
+"""The state repo on a real smart-HTTP server, which loses answers or is away."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
 def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """The generator cannot ask whether the push was accepted, and other demands come meanwhile."""
+    """The generator cannot ask whether the server took the push; meanwhile other demands come."""
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
         rig.book(generator, goal(0))
@@ -44,7 +44,7 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
         gate.open.set()
         rig.wait_until(lambda: server.faults.away, "the server has taken the push and is away")
         tickets.append(generator.submit(goal(3), "op-3"))
-        rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
+        rig.wait_until(lambda: server.refused > 3, "the server was asked again in vain")
         clock.pass_(5)  # a repeated commit would get another time and id
         assert not tickets[0].future.done()
         server.faults.away = server.faults.away_after_cut = False
@@ -60,9 +60,9 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
 def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """The server accepts a push with the release; the repeated join before it made no commit.
+    """The server takes a push with a release; the join repeated before it made no commit.
 
-    If both were decided again, the join would be booked.
+    If the generator decided both again, it would book the join.
     """
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
@@ -75,12 +75,14 @@ def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
         opening.future.add_done_callback(lambda _: _cut(server))
         gate.open.set()
         rig.wait_until(lambda: server.taken == taken + 2, "both pushes were taken")
-        rig.wait_until(lambda: server.refused > 3, "it was asked again in vain")
+        rig.wait_until(lambda: server.refused > 3, "the server was asked again in vain")
         clock.pass_(5)  # a repeated commit would get another time and id
         server.faults.away = server.faults.away_after_cut = False
         assert rig.receipt(again).outcome in ("unchanged", "booked")
         assert rig.receipt(released).outcome == "released"
-    assert rig.books(bare) == rig.books_after([goal(0)]), "what was released stands again"
+    assert rig.books(bare) == rig.books_after([goal(0)]), (
+        "the released connection must not be booked again"
+    )
 
 
 def _cut(server: Server) -> None:
@@ -88,7 +90,7 @@ def _cut(server: Server) -> None:
 
 
 def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path) -> None:
-    """An address with the words `403`, `denied` and `rejected` is not taken for a refusal."""
+    """The words `403`, `denied` and `rejected` in the address must not count as a refusal."""
     prefix = "/403/denied-and-rejected"
     with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
         server.faults.no_pushes, server.faults.status = 3, 503

@@ -1,4 +1,4 @@
-"""Text from outside stays a value: it forges no message, and no commit passes as the generator's.
+"""Text from outside stays a value: it forges no message and no commit of the generator.
 
 A claim that a person writes is checked like a demand.
 """
@@ -112,7 +112,7 @@ def with_rules(bare: Path, **quotas: int) -> str:
 def by_hand(
     bare: Path, requester: str, app: str = "edge/d1", demand: str = "by-hand"
 ) -> dict[str, str | None]:
-    """Return the file of a claim like the one of user1, but for another requester."""
+    """Return the file of a claim like that of user1, but for another requester."""
     path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
     data = yaml.safe_load(read(bare, path))
     data |= {"application": app, "demand": demand, "requesters": [requester]}
@@ -121,7 +121,6 @@ def by_hand(
 
 
 def held(bare: Path) -> set[tuple[str, ...]]:
-    """Return the requesters of each claim in effect."""
     with reader.opened(str(bare)) as repo:
         return {claim.requesters for claim in repo.snapshot().state.ledger}
 
@@ -179,4 +178,4 @@ def test_a_claim_by_hand_that_policy_allows_is_followed(bare: Path, person: Pers
         assert len(rig.claims(bare, "user1")) == 3
         person.change({POLICY: with_rules(bare, claimsPerRequester=1)})
         rig.book(generator, released(goals.put("d2", "user2")))
-        assert held(bare) == {("user1",)}, "what is booked stays when policy changes"
+        assert held(bare) == {("user1",)}, "a booked claim must stay when the policy changes"

@@ -37,7 +37,7 @@ def test_a_demand_that_waits_can_be_taken_back_and_leaves_no_trace(
         stages = Stages()
         ticket = generator.submit(goal(2), "op-2", stages)
         assert generator.withdraw("op-2") is True
-        assert generator.withdraw("op-2") is True, "saying it twice does no harm"
+        assert generator.withdraw("op-2") is True, "a second withdrawal must do no harm"
         gate.open.set()
         with pytest.raises(Withdrawn):
             rig.receipt(ticket)
@@ -146,11 +146,11 @@ def test_a_demand_handed_in_while_closing_is_answered_or_not_taken(bare: Path) -
 
         thread = threading.Thread(target=hand_in, daemon=True)
         thread.start()
-        rig.wait_until(tickets.__len__, "the first demand is in")
+        rig.wait_until(tickets.__len__, "the first demand is submitted")
         assert generator.close(rig.PATIENCE_S) is True
         thread.join(rig.PATIENCE_S)
         for ticket in tickets:
-            assert ticket.future.done(), "closed, but never answered"
+            assert ticket.future.done(), "the generator closed without an answer"
 
 
 def _error(ticket: Ticket) -> BaseException | None:
@@ -173,7 +173,7 @@ def test_demands_that_arrive_during_a_sync_share_the_next_one(
     with rig.running(bare) as generator:
         monkeypatch.setattr(os, "fdatasync", sync)
         tickets = [generator.submit(goal(0))]
-        rig.wait_until(lambda: syncs, "the first is being synced")
+        rig.wait_until(lambda: syncs, "the first demand is being synced")
         tickets += [generator.submit(goal(number)) for number in range(1, 40)]
         assert not any(ticket.journaled.done() for ticket in tickets)
         synced.set()
@@ -238,7 +238,7 @@ def test_demands_are_counted_while_others_come_and_go(bare: Path) -> None:
 
 
 def test_a_caller_that_cancels_its_future_stops_nobody_else(bare: Path) -> None:
-    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` cancels it at its time-out."""
+    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` cancels it at a time-out."""
     gate = Gate()
     with rig.running(bare) as generator:
         first = generator.submit(goal(1), listener=gate)
@@ -367,10 +367,10 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
 
 
 @pytest.mark.synced
-def test_what_was_taken_back_stays_so_after_a_crash(
+def test_a_withdrawn_demand_stays_withdrawn_after_a_crash(
     drivers: Drivers, address: str, bare: Path
 ) -> None:
-    """Both demands are in the journal when the second is withdrawn and the process is killed."""
+    """The kill comes when both demands are in the journal and the second is withdrawn."""
     lanes = [[demand("first", goal(1))], [demand("second", goal(2)) | {"withdraw": True}]]
     told = drivers.start(
         address, lanes, opening=demand("opening", goal(0)), die_at="withdrawn"

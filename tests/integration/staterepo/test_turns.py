@@ -1,4 +1,4 @@
-"""A generator whose threads take turns: a seed decides everything that it does."""
+"""A generator whose threads run one at a time: a seed decides everything that it does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.kit.turns import Turns
 
 
 def history(seed: int, template: Path, folder: Path) -> list[str]:
-    """Return the ids of the commits of random demands, sent to a busy or idle generator."""
+    """Return the commits' ids after random demands, sent to a busy or idle generator."""
     bare = Path(shutil.copytree(template, folder / "state.git"))
     turns = Turns(seed)
     threads = threading.active_count()

@@ -1,4 +1,4 @@
-"""`verify` under overrides: going from commit to commit, it finds the same as with `--whole`."""
+"""Under overrides, `verify` goes from commit to commit and gives the verdicts of `--whole`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EDGE = "clusters/c-its/perception/edge"
 
 
 def verdicts(bare: Path) -> dict[str, Verdict]:
-    """Return the verdict on each commit; check that both ways of `verify` give the same."""
+    """Return the verdict on each commit, after a check that `verify` and `verify --whole` agree."""
     with reader.opened(str(bare)) as repo:
         commits = repo.revisions(f"{rig.root(bare)}..")
         found = repo.verify(commits)
@@ -29,7 +29,7 @@ def verdicts(bare: Path) -> dict[str, Verdict]:
 
 
 def forged(bare: Path, person: Person, generator: Generator, change: Callable[[], str]) -> Verdict:
-    """Make a commit that is not the generator's between demands; return the verdict on it."""
+    """Make a commit that is not the generator's, between demands; return the verdict on it."""
     rig.book(generator, rig.goal(2))
     made = change()
     found = verdicts(bare)[made]
@@ -40,7 +40,7 @@ def forged(bare: Path, person: Person, generator: Generator, change: Callable[[]
 HOLD = override({"services": ["object-fusion"]}, hold=True)
 
 
-def test_a_held_file_is_compared_with_the_one_before(
+def test_a_held_file_must_equal_the_file_of_the_commit_before(
     generator: Generator, bare: Path, person: Person
 ) -> None:
     rig.book(generator, rig.goal(1))
@@ -127,14 +127,14 @@ def test_rolling_back_leaves_to_overrides_what_they_keep(
         goal = rollback_goal.goal(to, drop_newer=False, reason="x", who=("A", "a@example.org"))
         return rig.receipt(generator.submit(goal)).outcome
 
-    assert back(asked) == "restored", "what an override keeps is nobody's newer demand"
-    assert rig.claims(bare, "override:lasting") == [], "it gives way to who asks"
+    assert back(asked) == "restored", "a claim that an override keeps must not count as newer"
+    assert rig.claims(bare, "override:lasting") == [], "a demand takes over from the override"
     rig.book(generator, rig.leave(1))
     assert back(kept) == "unchanged"
     person.override(lasting=None)
     rig.book(generator, rig.goal(2), rig.leave(2))
     assert rig.claims(bare, "override:lasting") == []
-    assert back(kept) == "unchanged", "nothing keeps it any more"
+    assert back(kept) == "unchanged", "without the override, the rollback must change nothing"
     person.override(lasting=keep)
     rig.book(generator, rig.goal(2), rig.leave(2))
     rolled = rollback_goal.goal(kept, drop_newer=True, reason="x", who=("A", "a@example.org"))

@@ -41,7 +41,7 @@ Look = Callable[..., Page]
 
 @dataclass(frozen=True)
 class Shown:
-    """A state repo with the first two demands of the paper's experiment, and its site."""
+    """A state repo with the first two demands of the paper's experiment, and its web site."""
 
     bare: Path
     generator: Generator
@@ -49,7 +49,7 @@ class Shown:
     client: TestClient
 
     def look(self, path: str, status: int = 200, **params: str) -> Page:
-        """Wait until the site has the newest commit, and return the page at a path."""
+        """Wait until the site shows the newest commit, then return the page at a path."""
         wait_until(
             lambda: self.follower.newest.commit_state.commit == str(self.generator.snapshot.commit),
             "the page has the newest commit",
@@ -78,7 +78,7 @@ def shown(bare: Path) -> Iterator[Shown]:
 
 @pytest.fixture(scope="session")
 def still(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
-    """One state repo with its site, for all tests that change nothing in it."""
+    """A state repo with its site, shared by all tests that change nothing in it."""
     bare = tmp_path_factory.mktemp("still") / "state.git"
     with showing(Path(shutil.copytree(bare_template, bare))) as made:
         yield made

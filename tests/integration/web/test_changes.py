@@ -1,4 +1,4 @@
-"""What the page shows after changes by demands or people, or if the state repo is away."""
+"""The page after changes by demands and by people, and while the state repo is away."""
 
 from __future__ import annotations
 
@@ -241,7 +241,8 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
         node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
     person.change({path: yaml.safe_dump(nodes)})
     wait_until(
-        lambda: next(iter(follower.newest.commit_state.config.nodes.values())).position, "places"
+        lambda: next(iter(follower.newest.commit_state.config.nodes.values())).position,
+        "the nodes have positions",
     )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
     assert (drawn.layout, drawn.layouts) == ("place", ("cluster", "place"))
@@ -283,14 +284,17 @@ def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) 
     assert (process.returncode, out, err) == (0, "", "stopped\n")
 
 
-def test_what_is_taken_over_is_what_deriving_everything_gives(
+def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     booked: Generator, person: Person, follower: Follower, look: Look
 ) -> None:
     appdef = "appdefs/object-detection-fusion/appdef.yaml"
     scaling = "{max: 4, per: {sources: 1}, dividesWork: true, downAfter: 1s}"
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Keep replicas")
-    wait_until(lambda: follower.newest.commit_state.config.files[appdef] == text, "the page has it")
+    wait_until(
+        lambda: follower.newest.commit_state.config.files[appdef] == text,
+        "the page has the new file",
+    )
     joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
     one_leaves = copy.deepcopy(joins[0]) | {"shutdown": True, "connections": []}
     one_leaves["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station00"]
@@ -318,7 +322,7 @@ def test_a_state_repo_that_is_away_is_told_and_followed_again(
     bare: Path, follower: Follower, look: Look
 ) -> None:
     with away(bare):
-        wait_until(lambda: follower.newest.unread, "the page knows")
+        wait_until(lambda: follower.newest.unread, "the page knows that the state repo is away")
         page = look("/", status=200)
         assert "The state repo cannot be read" in page.text
         assert "may be out of date" in look("/demands").texts("aside")[0]

@@ -1,4 +1,4 @@
-"""The site is read-only: which requests it refuses, and what its pages may never contain."""
+"""The site is read-only, and its answers forbid browsers whatever the page does not need."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.kit.html import Page
 
 @pytest.fixture
 def shown(still: Shown) -> Shown:
-    """These tests change nothing, so they share one site."""
+    """The site that tests share, because these tests change nothing."""
     return still
 
 

@@ -1,4 +1,4 @@
-"""The server with many, silent or slow clients."""
+"""The page's server with many, silent or slow clients."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
 def test_views_of_earlier_moments_keep_no_other_waiting(
     served: WebServer, follower: Follower
 ) -> None:
-    """There are more such requests than threads for views, and all wait for the loading lock."""
+    """More such requests come than there are threads, and all of them wait for the loading lock."""
     with ExitStack() as stack:
         stack.enter_context(follower._loading)
         for _ in range(60):

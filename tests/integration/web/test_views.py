@@ -1,4 +1,4 @@
-"""What the page's views show of a real state repo."""
+"""The page's views of a real state repo."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ IMAGE = "docker.io/rwthika/robotkube-object-detection:2025-04"
 
 @pytest.fixture
 def shown(still: Shown) -> Shown:
-    """These tests change nothing, so they share one site."""
+    """The site that tests share, because these tests change nothing."""
     return still
 
 
@@ -118,7 +118,7 @@ def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:
     assert found("node=edg") == []
 
 
-def test_links_keep_the_filter_and_the_moment(look: Look, state: GitRepo) -> None:
+def test_links_carry_the_filter_and_the_shown_commit(look: Look, state: GitRepo) -> None:
     page = look("/services", q="vehicle00", at=state.tip)
     kept = f"at={state.tip}"
     assert "q=vehicle00" in page.link("Node") and "sort=node" in page.link("Node")
@@ -145,7 +145,7 @@ def test_a_release_is_explained(look: Look, state: GitRepo) -> None:
     assert "started" in page.texts("td")
 
 
-def test_a_moment_shows_the_books_of_then(look: Look, state: GitRepo) -> None:
+def test_the_page_shows_the_claims_at_an_earlier_commit(look: Look, state: GitRepo) -> None:
     assert len(look("/demands").texts("tr")) == 3
     then = look("/demands", at=f"{state.tip}~1")
     assert len(then.texts("tr")) == 2
@@ -182,7 +182,7 @@ def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: F
     assert squares == len(state.config.nodes)
     few = fleet_map.picture(now, Filter("node=far7"), "")
     assert [node.id for node in few.nodes] == ["far7"] and few.only_lit
-    # too many nodes to draw alone are highlighted in the whole picture
+    # too many nodes to draw alone: they are highlighted in the picture of the whole fleet
     many = fleet_map.picture(now, Filter("node:far"), "")
     assert many.is_dimmed and {node.id for node in many.nodes} == {
         f"far{number}" for number in range(1_000)

@@ -49,7 +49,7 @@ def templates(chart: str) -> dict[str, str]:
 
 
 def objects_in(schema: object, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield every subschema that describes an object's properties."""
+    """Yield each subschema that describes an object's properties, with its path."""
     if isinstance(schema, dict):
         if "properties" in schema and "type" in schema:
             yield path, schema
@@ -106,7 +106,7 @@ def test_a_schema_has_what_the_library_has(chart: Path) -> None:
 def undescribed(schema: dict[str, Any], path: str = "") -> Iterator[str]:
     """Yield the path of each property without a description.
 
-    A property that has properties itself needs none, but these do.
+    A property with properties of its own needs none, but its properties do.
     """
     for name, one in schema["properties"].items():
         if "description" not in one and "properties" in one:

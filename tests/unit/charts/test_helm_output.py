@@ -1,4 +1,4 @@
-"""Helm's output becomes faults with file and line. The texts here are those of helm 4."""
+"""Helm's output becomes faults with file and line; the texts here are those of helm 4."""
 
 from __future__ import annotations
 

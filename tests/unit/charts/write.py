@@ -23,7 +23,7 @@ CHARTS = [
 
 
 def schema(chart: Path) -> str:
-    """Return the schema that a chart should have, of its own properties and the library's."""
+    """Return the schema that a chart must have: its own properties and those of the library."""
     known = json.loads((chart / "values.schema.json").read_text())
     library = json.loads((LIBRARY / "values.schema.json").read_text())
     own = chart_schema.own_properties(known, library)
@@ -33,7 +33,7 @@ def schema(chart: Path) -> str:
 
 
 def readme(chart: Path) -> str:
-    """Return the text that a chart's README should have, with a table of its current values."""
+    """Return the text that a chart's README must have, with a table of its current values."""
     text = (chart / "README.md").read_text()
     values = (chart / "values.yaml").read_text()
     root = f"exports.{chart_schema.EXPORT}" if chart == LIBRARY else ""

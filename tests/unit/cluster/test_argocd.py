@@ -1,4 +1,4 @@
-"""The state of releases is read from Argo CD's objects, in the form in which the API gives them."""
+"""The state of releases follows from Argo CD's objects, as the API gives them."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ BAD = condition("Progressing", "False", "timed out")
         (None, None, "reconciled", "does not exist yet", False),
         (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
-        # its health is from before the change
+        # its health dates from before the change
         (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
          "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
@@ -199,7 +199,7 @@ def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
 def test_a_chart_that_changed_in_its_folder_is_waited_for(
     at: str, changing: list[tuple[str, str]], state: str
 ) -> None:
-    """The Application's source stays the same; only its synced commit shows the new chart."""
+    """The Application's source stays the same; only its last synced commit has the new chart."""
     objects = {
         OVER: over(sync="Synced", at="b"),
         CHILD: application(NEW, sync="Synced", at=at),
@@ -227,7 +227,7 @@ def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     )
 
 
-def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
+def test_a_removed_release_is_healthy_once_none_of_its_objects_is_left() -> None:
     child = application(NEW, sync="Synced", at="b")
     left = deployment("x")
     left["metadata"]["annotations"] = {
@@ -247,14 +247,14 @@ def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
     assert health.failing and health.reason.endswith("DeletionError: forbidden")
 
 
-def test_one_that_is_being_removed_is_not_what_is_wanted_anew() -> None:
+def test_an_application_under_deletion_does_not_count_as_the_wanted_one() -> None:
     child = application(NEW, sync="Synced", at="b")
     child["metadata"]["deletionTimestamp"] = AT
     health = ARGOCD.release_health(SERVICE, "b", {CHILD: child}, COMMITS)
     assert health.state == "reconciled" and "created again" in health.reason
 
 
-def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
+def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cluster() -> None:
     objects = {OVER: over(sync="Synced", at="b"), CHILD: application(NEW)}
     assert ARGOCD.applied_commit(PLACE, objects) == "b"
     assert ARGOCD.applied_commit(PLACE, {}) == ""
@@ -265,7 +265,7 @@ def test_seen_and_since_when_are_the_cluster_s_to_say() -> None:
 
 
 def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
-    """An operator may deny the generator access to the other objects."""
+    """The generator may lack the right to read the other objects there."""
     assert ARGOCD.objects_to_watch(PLACE)[0] == ObjectSelector(
         "Application", "argocd", "demandops-perception"
     )

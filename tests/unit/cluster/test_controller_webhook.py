@@ -1,4 +1,4 @@
-"""Signed calls of webhooks over real HTTP; openssl verifies the signatures."""
+"""Real HTTP calls to webhooks are signed; openssl verifies the signatures."""
 
 from __future__ import annotations
 
@@ -110,13 +110,13 @@ def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
 
 
 @pytest.mark.parametrize("status", [302, 307, 400])
-def test_what_is_not_taken_is_told_and_no_redirection_followed(
+def test_a_refused_webhook_is_logged_and_no_redirection_followed(
     hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
     trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
-    assert len(hook.calls) in (1, 2)  # the second, as it is closed
+    assert len(hook.calls) in (1, 2)  # the close may cause a second one
     assert SECRET not in caplog.text and "/hook" not in caplog.text
 
 

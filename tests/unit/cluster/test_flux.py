@@ -1,4 +1,4 @@
-"""The state of releases is read from Flux's objects, in the form in which the API gives them."""
+"""The state of releases follows from Flux's objects, as the API gives them."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_a_connection_end_is_healthy_when_its_deployment_is() -> None:
     )
 
 
-def test_what_is_given_up_is_healthy_when_nothing_of_it_is_left() -> None:
+def test_a_removed_release_is_healthy_once_none_of_its_objects_is_left() -> None:
     helm = {("HelmRelease", "ns", "od-edge"): release(READY)}
     left = {("Deployment", "ns", "x"): deployment("x", of="od-edge")}
     assert FLUX.release_health(GONE, "b", helm, COMMITS).state == "reconciled"

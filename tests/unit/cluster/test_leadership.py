@@ -26,16 +26,19 @@ from tests.kit.turns import Turns
 
 PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
 TAKES_OVER_S = 15 + 2
-"""A Lease that its leader does not renew ends after 15 s; the standbys poll it every 2 s."""
+"""How many seconds after its leader's last renewal a Lease has another leader at the latest.
+
+The Lease ends after 15 s, and the standbys poll it every 2 s.
+"""
 
 
 @dataclass
 class Server:
-    """An API server with one Lease.
+    """A stand-in for an API server with one Lease.
 
-    ``trouble`` returns for a call whether it fails, ``before`` or ``after`` its effect, or not.
-    ``takes`` returns how many seconds the caller then waits. ``ages`` lists the age of the Lease
-    after each call, once for each process that leads then.
+    ``trouble`` decides whether a call fails ``before`` or ``after`` its effect, or not at all.
+    ``takes`` decides how many seconds a call takes. ``ages`` lists the age of the Lease after each
+    call, once for each process that leads at that time.
     """
 
     turns: Turns
@@ -216,7 +219,7 @@ def test_a_lease_that_cannot_be_read_is_told_once(
 def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
     server: Server, first_s: float, next_s: float
 ) -> None:
-    """The answer to the last renewal is slow; after that, reads succeed and writes fail."""
+    """The answer to the last renewal is slow; after it, reads succeed and writes fail."""
     one, calls = Process(server), count()
     server.turns.sleep(0.5)
     server.trouble = lambda: "before" if (number := next(calls)) > 1 and number % 2 else ""
@@ -228,7 +231,7 @@ def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_never_do_two_lead(tmp_path: Path, seed: int) -> None:
-    """Calls fail before or after their effect or take long, and processes are killed, at random."""
+    """At random, calls fail before or after their effect or take long, and processes are killed."""
     chance = random.Random(seed)
     with new_server(tmp_path, seed) as server:
         turns, away_until = server.turns, [0.0]

@@ -1,4 +1,4 @@
-"""A cluster's objects are read over real HTTP: which calls are made, and which faults reported."""
+"""The cache reads a cluster's objects over real HTTP: which calls it makes, and what it reports."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DEPLOYMENTS = ObjectSelector("Deployment", "perception")
 
 @dataclass
 class Api:
-    """An API server with one Application in each namespace; it records the paths of calls."""
+    """An API server with an Application in each namespace; it records the paths of calls."""
 
     reached: ClusterAccess
     asked: list[str] = field(default_factory=list)

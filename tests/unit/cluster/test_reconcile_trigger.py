@@ -1,4 +1,4 @@
-"""The clusters file, and how a trigger calls the API or a webhook of a cluster."""
+"""The clusters file, and the calls of a trigger to a cluster's API or webhook."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 def trigger(
     case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
 ) -> None:
-    """Trigger the cluster of a golden case once; ``changed`` are the paths that have changed."""
+    """Trigger the cluster of a golden case once; ``changed`` lists the paths that have changed."""
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)

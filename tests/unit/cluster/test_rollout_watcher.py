@@ -1,4 +1,4 @@
-"""A rollout is followed on a cluster that cannot be reached, or to which there is no access."""
+"""Rollouts on a cluster that cannot be reached, or to which the generator has no access."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
         status.close()
 
 
-def test_closing_answers_what_is_still_followed(tmp_path: Path) -> None:
+def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) -> None:
     file = kubeconfig(tmp_path, AWAY)
     status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
     target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)

@@ -1,7 +1,7 @@
-"""Mistakes of people in the configuration of a state repo.
+"""Mistakes that people make in the configuration of a state repo.
 
-``tests/unit/messages`` has the message for each case of ``MISTAKES``.
-``test_mistakes_anywhere`` tries every mistake that a JSON schema can find.
+``tests/unit/messages`` has the message for each case of ``MISTAKES``. ``test_mistakes_anywhere``
+tries every mistake that a JSON schema can find.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ TWICE = second_definition(
     ("prefix: of", "prefix: cp"),
     ("object-fusion:\n", "copy-fusion:\n"),
 )
-"""A second application definition, which defines the first one's detection service again."""
+"""A second application definition; it too defines the detection service of the first one."""
 SERVICE = "appdefs/driver/service.yaml"
 
 
@@ -408,7 +408,7 @@ uses:
         },
     ),
 }
-"""Configurations that are refused, each as the files that differ from the skeleton's."""
+"""Configurations that are refused: for each, the files that differ from the skeleton's."""
 
 
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
@@ -420,7 +420,7 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
 
 @pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
 def test_an_id_that_is_no_label_needs_a_selector(id: str) -> None:
-    """Without a selector the release would have ``node_id: <id>``, which the API server refuses."""
+    """Without a selector, a release would select ``node_id: <id>``; the API server refuses that."""
     (found,) = refused(edited(NODES, V1, f'- id: "{id}"\n'))
     assert found.file == NODES
     assert "selector" in str(found)
@@ -448,5 +448,5 @@ def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
         versions("1.0.0", {"1.0.0": {}, "2.0.0-rc.1": {"charts": {"object-fusion": "0.1.0"}}}),
     ],
 )
-def test_what_is_odd_but_works(changed: dict[str, str]) -> None:
+def test_an_odd_but_valid_configuration_loads(changed: dict[str, str]) -> None:
     load(configuration(changed))

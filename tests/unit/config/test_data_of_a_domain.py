@@ -1,4 +1,4 @@
-"""ROS domains and credentials of brokers keep the data of access domains apart."""
+"""ROS domains and the credentials of brokers keep the data of access domains apart."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CONNECTION = {
 
 
 def domains(fleet: str = "", city: str = "") -> dict[str, str]:
-    """Return a policy with the access domains `fleet` and `city`; each text has further fields."""
+    """Return a policy with the access domains `fleet` and `city`; each text adds fields to one."""
     return {
         DOMAINS: f"""
 apiVersion: demandops/v1

@@ -1,4 +1,4 @@
-"""The Role, the AppProject and `check` permit the same kinds for an access domain's charts."""
+"""The Role, the AppProject and `check` permit the same kinds of objects in an access domain."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def test_a_domain_is_told_only_of_applications_that_its_rules_name() -> None:
     assert len(warned({**agent, **domain(rules='[{name: all, applications: ["object-*"]}]')})) == 1
 
 
-def test_only_what_is_rendered_counts() -> None:
+def test_only_templates_that_helm_installs_are_searched_for_kinds() -> None:
     quiet = {
         f"{CHART}/templates/tests/connection.yaml": "kind: Pod\n",
         f"{CHART}/templates/NOTES.txt": "kind: DaemonSet\n",

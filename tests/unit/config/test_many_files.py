@@ -1,4 +1,4 @@
-"""A collection may be one file or many: its entries and their faults are the same.
+"""A collection may be in one file or in many: its entries and their faults are the same.
 
 The examples come from docs/inventory.md.
 """
@@ -44,7 +44,7 @@ def faults(changed: Mapping[str, str | None]) -> str:
 
 
 def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
-    """Move entries of each collection at random to two files in the collection's folder."""
+    """Move entries of each collection at random to other files in the collection's folder."""
     result = dict(files)
     for path in {*COLLECTIONS} & {*files}:
         data, parts = plain_yaml.load(result.pop(path)), dict[str, dict[str, Any]]()
@@ -52,7 +52,7 @@ def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
         head = {name: data.pop(name) for name in heads if name in data}
         for name, entries in data.items():
             for key in entries if isinstance(entries, dict) else range(len(entries)):
-                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type stays whole
+                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type stays in one file
                     place = path.replace(".yaml", random.choice([".yaml", "/a.yaml", "/b.yaml"]))
                 part = parts.setdefault(place, dict(head))
                 if isinstance(entries, dict):
@@ -107,7 +107,7 @@ def test_a_name_that_is_nearly_right_is_a_fault_too(path: str) -> None:
     assert faults({path: "kind: Nodes\n"}).startswith(f"{path}: is not read; ")
 
 
-def test_what_is_no_configuration_may_stay() -> None:
+def test_files_that_are_no_configuration_are_ignored() -> None:
     odd = ("README.md", "nodes/README.md", "nodes/.draft.yaml", ".old/nodes.yaml", "plan.txt")
     load(configuration({f"inventory/{name}": "not: [yaml" for name in odd}))
     load(configuration({"policy/allowed-signers": ""}))
@@ -127,7 +127,7 @@ def test_the_folder_alone_is_enough_and_messages_name_it() -> None:
     )
 
 
-def test_a_fault_keeps_file_and_place() -> None:
+def test_a_fault_in_one_of_many_files_names_the_file_and_the_field() -> None:
     bad = FILES[VEHICLE].replace("cluster: c-its", "cluster: c-it").replace("  ego_", "  eggo_")
     assert faults(FILES | {VEHICLE: bad}) == (
         f"{VEHICLE}: nodes[0].cluster: 'c-it' is not in clusters.yaml; did you mean 'c-its'?\n"

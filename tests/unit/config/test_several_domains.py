@@ -1,4 +1,4 @@
-"""A node in several access domains, each with a policy, a namespace and a ROS domain of its own."""
+"""A node in several access domains has a policy, a namespace and a ROS domain in each."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_all_of_a_service_follows_the_domain() -> None:
         made = fusion(f"d{number}", "city1")
         made["applications"][0]["id"] = f"edge/d{number}"
         taken = repo.take(made)
-    assert "servicesPerNode" in str(taken), "the quota of the city"
+    assert "servicesPerNode" in str(taken), "the city's quota must refuse it"
     assert repo.send(fusion("of-the-fleet", "vehicle00")).outcome == "booked"
     rule = [d for d in yaml.safe_load_all(repo.files["bootstrap/c-its.yaml"]) if d]
     (policy,) = (
@@ -152,7 +152,7 @@ def test_the_reference_names_it_or_gets_it_by_a_rule() -> None:
     assert repo.send(named).outcome == "booked"
 
 
-def test_what_is_booked_stays_in_its_domain() -> None:
+def test_a_booked_application_stays_in_its_domain() -> None:
     repo = MemoryRepo(SEVERAL)
     repo.send(fusion("d", "both", node="edge@city"))
     assert repo.send(fusion("d", "both")).outcome == "unchanged"

@@ -1,4 +1,4 @@
-"""Mistakes in an appdef's values template: the message names the template and the line."""
+"""For a mistake in an appdef's values template, the message names the template and the line."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
 TOPIC = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 LAST = skeleton()[TEMPLATE].count("\n") + 1
-"""The number of the line that a text appended to the template gets."""
+"""The line number of a text that is appended to the template."""
 
 
 def faults(template: str) -> list[str]:
-    """Send a demand that needs this template; return the faults of its refusal."""
+    """Send a demand that needs this template; return the faults of the refusal."""
     books = MemoryRepo({TEMPLATE: template})
     before = dict(books.files)
     with pytest.raises(InvalidInput) as invalid:
@@ -33,7 +33,7 @@ def faults(template: str) -> list[str]:
 
 
 def appended(text: str) -> list[str]:
-    """Return the faults of the template with a line appended."""
+    """Return the faults of the skeleton's template with this text at its end."""
     return faults(skeleton()[TEMPLATE] + text)
 
 
@@ -74,7 +74,7 @@ APPENDED: dict[str, tuple[str, str]] = {
         "a template may write text, numbers, lists and mappings, not <class 'builtin_function",
     ),
 }
-"""By mistake: a line of a template, and a word of Jinja's message."""
+"""Lines of a template with a mistake, each with a word of Jinja's message."""
 TOO_LARGE = [
     *("'a' * 1000000000", "[1] * 1000000000", "10 ** 1000", "'%1000000000d' % 1"),
     *("'%*d' % (1000000000, 1)", "'%1000000000d' | format(1)", "'{:>1000000000}'.format(1)"),
@@ -190,7 +190,9 @@ def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
         (found,) = appended("{% include '" + name + "' %}\n")
         assert found.startswith(f"{TEMPLATE}:{LAST}: ")
         assert "root:" not in found
-        assert not found.startswith(f"{TEMPLATE}:{LAST}: {name}; "), "says not what is wrong"
+        assert not found.startswith(f"{TEMPLATE}:{LAST}: {name}; "), (
+            "the message does not say what is wrong"
+        )
 
 
 class TestValues:
@@ -214,7 +216,7 @@ class TestValues:
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
-        """A value is rendered in quotes, as JSON. Behind other text, they would be part of it."""
+        """A value is written as JSON, in quotes, which become a part of it after other text."""
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(
@@ -321,5 +323,5 @@ class TestBeforeTheFirstDemand:
         change = {path: skeleton()[path] + "x: {{ nope }}\n" for path in (TEMPLATE, other)}
         assert [found.split(":")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
 
-    def test_what_is_laid_down_passes(self) -> None:
+    def test_the_configuration_of_init_passes(self) -> None:
         try_configuration(State.of(load(configuration()), Ledger()))

@@ -1,7 +1,7 @@
-"""A fourth connection type: one module, its templates, and one more entry in the list of types.
+"""A fourth connection type needs one module, its templates, and an entry in the list of types.
 
 This test module is that module. Its client is a relay, which runs at the target and fetches the
-topics of all sources. Nothing else in the program knows the type, but a demand for it is booked,
+topics of all sources. Nothing else in the program knows the type, but demands for it are booked,
 planned, rendered and explained.
 """
 
@@ -73,7 +73,7 @@ spec:
 
 
 class RelayType(ConnectionType):
-    """A connection type with one client at the target, which fetches all connections' topics."""
+    """A connection type with one client at the target, for the topics of all its connections."""
 
     name = "RELAY"
     number = 7

@@ -28,7 +28,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class World(MemoryRepo):
-    """A state repo in memory; demands to it may have options for routes."""
+    """A state repo in memory, which takes demands in short form, with options for routes."""
 
     def __init__(self, before: State) -> None:
         super().__init__(state=before)
@@ -40,11 +40,11 @@ class World(MemoryRepo):
         return decision
 
     def clients(self) -> dict[str, Any]:
-        """Return the configuration of each client by its name."""
+        """Return the configuration of each client by the client's name."""
         return {name: documents[0]["data"] for name, documents in self._pods().items()}
 
     def checksums(self) -> dict[str, str]:
-        """Return each client's checksum by name; a new checksum restarts the client."""
+        """Return each client's checksum by its name; a new checksum restarts the client."""
         return {
             name: pod["spec"]["template"]["metadata"]["annotations"]["demandops/config-checksum"]
             for name, (_, pod) in self._pods().items()
@@ -68,7 +68,7 @@ def zenoh_world() -> World:
 
 
 class TestZenoh:
-    """One Zenoh bridge runs on a node, for all topics that the node sends and receives."""
+    """A node has one Zenoh bridge, for all topics that the node sends and receives."""
 
     def test_both_nodes_of_a_connection_are_affected_and_no_other(self) -> None:
         world = zenoh_world()
@@ -190,7 +190,7 @@ class TestRos:
 
 
 class TestMqtt:
-    """Which end of a connection gets which setting; tests/golden has the options."""
+    """Each setting is at the right end of a connection; tests/golden has the options."""
 
     def test_a_connection_that_only_brings_back_has_its_ends_turned(self) -> None:
         world = World(state())
@@ -227,7 +227,7 @@ BRIDGED: dict[str, Any] = {"bridged": {"edge": ["/a"]}}
 
 
 class TestBridgedAlready:
-    """A topic that the inventory lists as bridged is not carried again; no client has no topic."""
+    """Clients carry no topic that the inventory lists as bridged; each client has a topic."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_no_client_without_a_topic(self, kind: str) -> None:
@@ -253,12 +253,12 @@ class TestBridgedAlready:
 
 
 class TestWhatPeopleDidInGit:
-    """A person edits a claim so that its type cannot carry it, or removes what a claim needs."""
+    """A person's edit of a claim or the inventory may leave a type unable to carry a connection."""
 
     NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
 
     def after(self, kind: str, route: Route, **nodes: Any) -> list[str]:
-        """Return the faults of rendering with this route in a claim and these nodes."""
+        """Return the faults of rendering a claim with this route on these nodes."""
         world = World(state(**self.NODES))
         world.send(demand(kind))
         (claim,) = world.state.ledger.connection_claims("c")

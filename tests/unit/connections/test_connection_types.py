@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[State, dict[str, Any]]] = {
 
 
 class TestAutomaticChoice:
-    """Zenoh if both nodes speak it, else MQTT if there is a broker, else ROS, else a refusal."""
+    """The type is Zenoh if both nodes speak it, else MQTT with a broker, else ROS, else none."""
 
     @pytest.mark.parametrize(
         ("before", "asked", "chosen"),
@@ -127,13 +127,13 @@ class TestAutomaticChoice:
     ) -> None:
         assert carried(before, asked) is chosen
 
-    def test_what_stands_keeps_its_type(self) -> None:
+    def test_a_demand_without_a_type_keeps_the_type_of_the_connection(self) -> None:
         after = decided(BRIDGES, demand("mqtt"))
         again = demand(requesters=["vehicle01"])
         after = decided(after, again)
         assert {claim.connection.type for claim in after.ledger.connection_claims("c")} == {MQTT}
 
-    def test_a_shutdown_without_a_type_means_what_stands(self) -> None:
+    def test_a_shutdown_without_a_type_releases_a_connection_of_any_type(self) -> None:
         after = decided(BRIDGES, demand("mqtt"))
         after = decided(after, demand() | {"shutdown": True})
         assert after.ledger == Ledger()
@@ -159,7 +159,7 @@ class TestThroughTheWire:
         (found,) = repo.faults(goal([], [connection(topics=["/x"], broker="", type=0)]))
         assert found.startswith("connections[0].source_topics[0]: the message type of '/x'")
 
-    def test_what_is_bridged_already_is_a_warning(self) -> None:
+    def test_a_topic_that_is_bridged_already_gives_a_warning(self) -> None:
         books = MemoryRepo(state=state(vehicle00={"bridged": {"edge": ["/a"]}}))
         decision = books.send(goal([], [connection("c", topics=["/a", "/b"])]))
         assert decision.warnings == (

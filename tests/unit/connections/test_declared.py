@@ -59,7 +59,7 @@ def with_all_options(kind: str) -> State:
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and the type's name of each value in nested mappings and lists."""
+    """Yield the path and the name of the type of each value in nested mappings and lists."""
     if isinstance(value, dict):
         for key, item in value.items():
             name = "{}" if "/" in key else key

@@ -14,7 +14,7 @@ LISTS = {"ros2mqtt": "ros_topics", "mqtt2ros": "mqtt_topics"}
 
 
 def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
-    """Return the parameters of each client by its client id."""
+    """Return the parameters of each client by the client's id."""
     found = {}
     for name, config in books.objects("ConfigMap").items():
         whole = yaml.safe_load(config["data"]["params.yaml"])
@@ -27,7 +27,7 @@ def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
 def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
     """Follow each topic through both clients of its connection.
 
-    Return by connection the ROS topic at the target by the ROS topic at the source and the
+    Return, for each connection, the ROS topic at the target by the ROS topic at the source and the
     MQTT topic.
     """
     deployments = books.objects("Deployment")
@@ -89,7 +89,7 @@ def test_no_mqtt_topic_holds_a_wildcard_or_a_dollar() -> None:
             assert re.fullmatch(r"[a-z0-9-]+(/[A-Za-z0-9_]+)+", mqtt), mqtt
 
 
-def test_every_end_has_a_client_id_of_its_own_and_that_of_its_deployment() -> None:
+def test_the_client_id_of_each_end_is_unique_and_the_name_of_its_deployment() -> None:
     books = MemoryRepo()
     for id in ("c", "c-source", "c/source", "C"):
         books.send(goal([], [connection(id)], id=id))

@@ -32,7 +32,7 @@ def told(found: Any) -> list[str]:
     return [f"{one.field}: {one.message}" for one in found]
 
 
-def test_every_option_is_kept_and_only_what_is_said() -> None:
+def test_a_route_carries_exactly_the_options_that_are_given() -> None:
     assert RouteOptions().route("/a", "/b") == Route("/a", "/b")
     assert Route("/a", "/b").options() == {}
     route = parse(RouteOptions, OPTIONS).route("/a", "/b")

@@ -1,4 +1,4 @@
-"""Any value sent as a goal is either decided or refused with faults; nothing else is raised."""
+"""Any value that is sent as a goal is decided, or refused with faults; it raises nothing else."""
 
 from __future__ import annotations
 
@@ -51,24 +51,24 @@ def outcome(goal: object) -> Decision | tuple[Fault, ...]:
     except Refused as refused:
         return refused.faults
     finally:
-        assert repr(goal) == before, "the goal itself was changed"
+        assert repr(goal) == before, "the decision changed the goal"
 
 
 def assert_told(faults: tuple[Fault, ...]) -> None:
-    assert faults, "a refusal gives a reason"
-    assert len(set(faults)) == len(faults), "a reason is given once"
+    assert faults, "a refusal must give a reason"
+    assert len(set(faults)) == len(faults), "no reason may be given twice"
     for found in faults:
         assert found.message
         assert found.code
         assert not UNSEEN & set(map(category, str(found))), repr(found)
-        assert not found.field.startswith("applications["), "the wire says apps"
+        assert not found.field.startswith("applications["), "a message calls this field apps"
 
 
 @examples(70)
 @given(ANYTHING)
 def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
     found = outcome(data)
-    assert isinstance(found, tuple), "what is made up here demands nothing"
+    assert isinstance(found, tuple), "no value made up here can be a demand"
     assert_told(found)
 
 
@@ -83,7 +83,7 @@ def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
 
 
 def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    """Return a strategy of goals that have the right form, with texts of the strategy `text`."""
+    """Return a strategy for goals of the right form, whose texts come from the strategy `text`."""
     topics = st.lists(st.tuples(text, text), max_size=2)
     apps = st.lists(
         st.builds(

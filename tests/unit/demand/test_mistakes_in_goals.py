@@ -1,4 +1,4 @@
-"""One mistake at any place of a valid goal gives a fault at that place, and changes nothing."""
+"""A mistake at any place of a valid goal gives a fault at that place, and changes nothing."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ ELSEWHERE = {
     "connections[0].source_topics": "connections[0].target_topics",  # lengths then differ
     "shutdown": "apps[0].header.id",  # the shutdown finds no claim
     "connections[0].type": "connections[0].",  # another type has other rules
-    "applications[0].parameters.rate": "parameters.rate",  # found in the merge
+    "applications[0].parameters.rate": "parameters.rate",  # the merge finds it
     "applications[1].place": "applications[1].node",  # then both are missing
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
-"""By the field of a mistake, another field at which the fault may be reported."""
+"""For a mistake in some fields: another field at which its fault may be reported."""
 
 
 @pytest.mark.parametrize(

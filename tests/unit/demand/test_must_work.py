@@ -1,4 +1,4 @@
-"""Demands that omit much, or whose requesters have similar names, are booked."""
+"""Demands that leave out much, or whose requesters have similar names, are booked."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class TestOpenBroker:
-    """The only broker is chosen, else the requested one, else the target's, else the source's."""
+    """The broker is the only one, else the requested one, else the target's, else the source's."""
 
     @staticmethod
     def hosts(books: MemoryRepo) -> set[str]:
@@ -67,7 +67,7 @@ class TestOpenBroker:
         decision = books.send(goal([], [connection(broker=requested)]))
         assert decision.warnings == (f"connection 'vehicle00/edge' uses the broker on {note}",)
         again = books.send(goal([], [connection(broker=there[-1])], id="2"))
-        assert again.outcome == "booked", "both name one broker"
+        assert again.outcome == "booked", "both goals must get the same broker"
 
     def test_a_broker_left_open_and_one_named_for_one_connection_agree(self) -> None:
         books = MemoryRepo()

@@ -140,7 +140,7 @@ CONTRADICTING: dict[str, Goal] = {
     "a shutdown by another requester": goal([application(who=OTHER)], shutdown=True),
     "a shutdown with a misspelt id": goal([application("edge/fusion")], shutdown=True),
 }
-"""Goals that are refused once ``perception()`` is booked."""
+"""Goals that are refused after ``perception()`` is booked."""
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_a_node_in_no_access_domain_is_refused() -> None:
     ]
 
 
-def test_what_was_not_held_is_named_and_the_rest_released() -> None:
+def test_a_shutdown_lists_unclaimed_subjects_and_releases_the_rest() -> None:
     books = MemoryRepo()
     books.send(perception())
     asked = goal(
@@ -204,7 +204,7 @@ def test_what_was_not_held_is_named_and_the_rest_released() -> None:
     assert books.books() == {"services": {}, "connections": {}}
 
 
-def test_the_oldest_claim_gives_first_and_only_the_hold_of_the_one_that_leaves() -> None:
+def test_a_shutdown_releases_its_requester_from_the_oldest_claim_only() -> None:
     books = MemoryRepo()
     books.take_all(goal([application(who=["vehicle00", id])], id=id) for id in ("one", "two"))
     assert books.send(goal([application()], id="three", shutdown=True)).outcome == "released"
@@ -224,7 +224,7 @@ def test_a_shutdown_sent_again_changes_nothing_and_says_so() -> None:
 
 
 def limited(**limits: int) -> MemoryRepo:
-    """Return a state repo with these ``limits`` in demandops.yaml."""
+    """Return a state repo with these ``limits`` in its demandops.yaml."""
     settings = yaml.safe_load(skeleton()["demandops.yaml"])
     return MemoryRepo({"demandops.yaml": yaml.safe_dump(settings | {"limits": limits})})
 
@@ -238,7 +238,7 @@ def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
     ]
 
 
-def test_what_is_listed_is_counted_up_to_the_limit() -> None:
+def test_every_item_of_a_demand_counts_towards_the_limit() -> None:
     item = goal([], [connection(topics=["/a", "/b"])])
     assert limited(demandItems=4).send(item).outcome == "booked"
     assert len(limited(demandItems=3).faults(item)) == 1

@@ -1,4 +1,4 @@
-"""With ``versions: separate`` each version but the default runs in an instance of its own."""
+"""With ``versions: separate``, each version except the default runs in an instance of its own."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def empty() -> MemoryRepo:
 
 
 def own(version: str) -> str:
-    """Return the version of the instance for a demanded version; empty for the default."""
+    """Return the version of the instance for a demanded version; empty for the default version."""
     version = CHANNELS.get(version, version or DEFAULT)
     return "" if version == DEFAULT else version
 
@@ -125,7 +125,7 @@ def test_outputs_of_both_are_delivered_by_topics_of_their_own() -> None:
 
 
 def test_one_topic_for_both_is_refused() -> None:
-    """If a delivery names its topic, only one instance can publish on that topic."""
+    """Both deliveries name the same topic, and only one of the two instances can publish on it."""
     repo = MemoryRepo(SEPARATE)
     delivery = {"output": "object-fusion.fused_objects", "node": "vehicle01", "topic": "/it"}
     for name, version in (("a", ""), ("b", "1.1.0")):
@@ -177,7 +177,7 @@ def test_what_several_definitions_share_runs_once_so_another_version_of_it_is_re
 
 
 def shared(policy: str) -> dict[str, str]:
-    """Return a configuration whose versions 1.0.1 and 1.1.0 pin another recorder and driver."""
+    """Return a configuration: version 1.0.1 pins another recorder, 1.1.0 another driver."""
     appdef = yaml.safe_load(ADDITIONS["appdefs/recorder/appdef.yaml"])
     versions = {
         "1.0.0": {},
@@ -199,7 +199,7 @@ def record(demand: str, version: str) -> dict[str, Any]:
     return made
 
 
-def test_a_shared_service_for_each_topic_of_an_own_one_is_a_fault() -> None:
+def test_a_shared_topic_service_must_not_use_the_output_of_a_separate_service() -> None:
     follower = """
 apiVersion: demandops/v1
 kind: ServiceDefinition

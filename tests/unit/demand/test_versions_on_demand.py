@@ -1,4 +1,4 @@
-"""The newest demanded version runs; some updates need approval."""
+"""The newest of the demanded versions runs; some updates need approval."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NODES = ("edge", "cloud")
 
 
 def config(policy: str, **more: Any) -> dict[str, str]:
-    """Return a configuration in which each version pins the images of the two services."""
+    """Return a configuration in which each version pins the images of both services."""
     pins = {
         version: {
             "images": {name: {"tag": version} for name in ("object-detection", "object-fusion")}
@@ -66,7 +66,7 @@ def release(demand: str) -> dict[str, Any]:
 
 
 def running(repo: MemoryRepo) -> dict[str, str]:
-    """Return the version that each service runs."""
+    """Return the version of each running service."""
     return {name: entry["application_version"] for name, entry in repo.books()["services"].items()}
 
 
@@ -104,13 +104,13 @@ def test_what_follows_from_another_version(
     policy: str, first: str, then: str, approval: str, warning: str
 ) -> None:
     repo = MemoryRepo(config(policy))
-    assert repo.send(put("a", first)).approval == (), "who comes first contradicts nobody"
+    assert repo.send(put("a", first)).approval == (), "the first demand contradicts nobody"
     decision = repo.send(put("b", then))
     assert decision.outcome == "booked"
     assert decision.approval == ((approval,) if approval else ())
     assert decision.warnings == ((warning,) if warning else ())
     again = repo.send(put("b", then, cloud="/more"))
-    assert again.approval == (), "what is booked already asks nobody again"
+    assert again.approval == (), "a booked demand needs no second approval"
     assert repo.send(release("b")).approval == ()
 
 
@@ -207,7 +207,7 @@ def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
 
 
 class Walk:
-    """Demands join and leave at random; checks compare the running versions with the rule."""
+    """Random joins and leaves; checks compare the running versions with the rule."""
 
     def __init__(self, random: Random, policy: str) -> None:
         self.random = random
@@ -236,7 +236,7 @@ class Walk:
     def assert_as_the_rule_says(self) -> None:
         """Check that each service runs the newest version of the applications that use it.
 
-        An application's version is the newest one that is demanded for it.
+        The version of an application is the newest one that is demanded for it.
         """
         newest: dict[str, str] = {}
         for version, app, _ in self.asked.values():

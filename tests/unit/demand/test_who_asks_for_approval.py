@@ -1,4 +1,4 @@
-"""Access domains, their rules and application definitions require approval of demands."""
+"""Access domains, their rules and application definitions can require approval of demands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 
 
 def policy(**changed: Any) -> dict[str, str]:
-    """Return the skeleton's policy, with fields of its only domain changed."""
+    """Return the skeleton's policy, with some fields of its only domain changed."""
     data = yaml.safe_load(skeleton()[POLICY])
     data["domains"][0].update(changed)
     return {POLICY: yaml.safe_dump(data)}
@@ -62,7 +62,7 @@ VEHICLES = {"name": "vehicles", "requesters": ["vehicle*"], "approval": "none"}
 def test_who_asks_for_approval(config: dict[str, str], asks: tuple[str, ...]) -> None:
     decision = MemoryRepo(config).send(perception())
     assert decision.approval == asks
-    assert decision.outcome == "booked", "what would come of it is decided all the same"
+    assert decision.outcome == "booked", "the outcome is decided although approval is needed"
 
 
 def test_each_requester_needs_a_rule_that_lets_it_through() -> None:
@@ -87,7 +87,7 @@ def test_an_appdef_asks_for_its_applications_and_not_for_connections() -> None:
     assert books.send(goal([], [connection()])).approval == ()
 
 
-def test_more_than_what_stands_needs_approval() -> None:
+def test_only_a_demand_that_adds_something_needs_approval() -> None:
     books = MemoryRepo(policy(approval="required"))
     assert books.send(perception()).approval == (DOMAIN,)
     assert books.send(perception()).approval == ()
@@ -96,7 +96,7 @@ def test_more_than_what_stands_needs_approval() -> None:
 
 
 def put(**changed: Any) -> dict[str, Any]:
-    """Return a `Demand` for one application, with further or other fields."""
+    """Return a `Demand` for one application; ``changed`` adds or replaces fields."""
     inputs = {"point_cloud": [{"topic": "/stations/station00/pointcloud", "source": "station00"}]}
     app = {"id": APP, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
     head = {"apiVersion": "demandops/v1", "kind": "Demand", "demand": "d", "requesters": ["v"]}
@@ -108,8 +108,8 @@ def test_dropping_renewing_and_releasing_need_none() -> None:
     app = put()["applications"][0]
     two = [app, app | {"id": "edge/second"}]
     assert books.send(put(applications=two, lease=60)).approval == (DOMAIN,)
-    assert books.send(put(lease=60)).approval == (), "less than before"
-    assert books.send(put(lease=600)).approval == (), "only longer"
+    assert books.send(put(lease=60)).approval == (), "a put of less must need no approval"
+    assert books.send(put(lease=600)).approval == (), "a longer lease must need no approval"
     head = {key: value for key, value in put().items() if key != "applications"}
     assert books.send(head | {"operation": "renew"}).approval == ()
     assert books.send(head | {"operation": "release"}).approval == ()

@@ -17,7 +17,7 @@ WRONG: dict[str, object] = {
     "text": "id: x",
     "an unknown field, misspelt": perception(shutdwon=True),
     "an unknown field, like none": perception(qos=1),
-    # it could be a shutdown, so an empty list of topics is no fault
+    # a shutdown may have an empty list of topics, so that list is no fault
     "a shutdown that is no truth": goal([application(clouds=[])], [connection(topics=[])])
     | {"shutdown": "yes"},
     "faults of form and of content": goal(

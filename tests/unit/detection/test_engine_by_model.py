@@ -29,7 +29,7 @@ RULES = [
 
 
 class Model:
-    """A model of the engine that compares all entities with each other at each message."""
+    """A model of the engine; at each message it compares all entities with each other."""
 
     def __init__(self) -> None:
         self.at: dict[tuple[str, str], tuple[float, float]] = {}
@@ -71,7 +71,7 @@ class Model:
                     self.events.append((now, *key, True))
 
     def levels(self) -> Iterator[tuple[Any, bool, bool]]:
-        """Yield the key of each possible event, whether it starts, and whether it stops."""
+        """Yield the key of each possible event, whether it starts now, and whether it stops now."""
         inside = 0
         for (source, entity), (x, y) in self.at.items():
             away = hypot(x, y)

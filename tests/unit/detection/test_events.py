@@ -1,4 +1,4 @@
-"""The events of each kind of rule."""
+"""The events that each kind of rule gives."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_dwell_time_goes_on_between_start_and_stop_and_ends_beyond() -> None:
     assert run.told(1, at(1, "a", 80), at(1, "b", 80)) == []
     assert run.told(2.5, at(2, "a", 89), at(2.5, "b", 95)) == []
     assert run.told(4, at(4, "b", 80)) == [("stays", "a", "start", 3)]
-    assert run.told(5) == [("stays", "a", "stop", 5)], "silent since 2 s; b waits again"
+    assert run.told(5) == [("stays", "a", "stop", 5)], "a is silent since 2 s; b must wait again"
     assert run.told(6) == [("stays", "b", "start", 6)]
 
 
@@ -85,7 +85,7 @@ def test_events_from_before_a_start_go_on_if_their_entities_come_back_in_time() 
     keys = [("near", ("a",)), ("near", ("b",)), ("pair", ("a", "b")), ("full", ())]
     run.state = run.engine.start(0, [*keys, ("gone", ("a",)), ("full", ("a",))], settle_s=5)
     assert run.state.lasting == {*keys}
-    assert run.told(1, at(1, "a", 89)) == [], "b may still come"
+    assert run.told(1, at(1, "a", 89)) == [], "the event must last while b may still come"
     assert run.told(4.9, at(3.5, "a", 89), at(4.5, "c", 200)) == []
     assert run.told(5) == [
         ("full", "", "stop", 5),

@@ -13,7 +13,7 @@ JOIN = Goal("deployment_request", {"id": "r", "apps": []})
 
 
 class Sent:
-    """Sends the goals of one event one by one."""
+    """The goals that are wanted for one event, sent one at a time."""
 
     def __init__(self) -> None:
         self.wanted = WantedDemands()
@@ -27,7 +27,7 @@ class Sent:
         return sending
 
     def done(self, now: float, lease_s: float = 0.0, code: str = "", message: str = "") -> str:
-        """Send the next goal and answer it; return its purpose, or after a fault the report."""
+        """Send and answer the next goal; return its purpose, or what is reported of a fault."""
         sending = self.next(now)
         told = self.wanted.answered(sending, Outcome(code, message, lease_s), now)
         assert code or not told
@@ -50,7 +50,7 @@ def test_a_demand_is_sent_renewed_after_a_third_of_its_lease_and_ended() -> None
     assert len(sent.wanted) == 1
 
 
-def test_what_is_over_before_it_was_sent_is_never_sent() -> None:
+def test_a_demand_that_ends_before_it_is_sent_is_never_sent() -> None:
     sent = Sent()
     sent.want(PUT)
     sent.want(None)
@@ -58,12 +58,12 @@ def test_what_is_over_before_it_was_sent_is_never_sent() -> None:
     assert len(sent.wanted) == 0
 
 
-def test_what_is_over_while_it_is_under_way_is_ended_after_the_answer() -> None:
+def test_a_demand_that_ends_while_its_put_is_under_way_is_ended_after_the_answer() -> None:
     sent = Sent()
     sent.want(PUT)
     under_way = sent.next(0)
     sent.want(None)
-    assert sent.wanted.next(0) is None, "one goal at a time"
+    assert sent.wanted.next(0) is None, "only one goal may be under way"
     sent.wanted.answered(under_way, Outcome(), 1)
     assert sent.done(1) == "end"
     assert len(sent.wanted) == 0
@@ -87,7 +87,7 @@ def test_a_demand_without_an_answer_is_sent_again_or_ended() -> None:
     sent.done(0, code="timeout", message="late")
     assert sent.wanted.unanswered() == 1
     sent.want(None)
-    assert sent.next(0).purpose == "end", "it may be booked"
+    assert sent.next(0).purpose == "end", "a demand that may be booked must be ended"
 
 
 def test_a_demand_that_ended_meanwhile_is_put_again() -> None:
@@ -120,7 +120,7 @@ def test_a_request_is_sent_again_as_often_as_its_rule_says() -> None:
     assert sent.next(60).goal == JOIN
 
 
-def test_what_is_booked_from_before_is_renewed_at_once_and_not_put() -> None:
+def test_a_demand_booked_before_the_start_is_renewed_at_once_and_not_put_again() -> None:
     sent = Sent()
     sent.wanted.hold(KEY, PUT)
     sent.want(PUT)

@@ -1,8 +1,7 @@
 """A forge on the loopback that replays recorded exchanges, and refuses all other requests.
 
-An exchange is a request as the forge's API documents it, and its answer.
-``exchanges/<name>.yaml`` lists the exchanges in order. The replay checks the token, which is not
-recorded.
+An exchange is a request as the forge's API documents it, and its answer. ``exchanges/<name>.yaml``
+lists the exchanges in order. The replay also checks the token, which is not in the recording.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any
 from tests.kit import plain_yaml
 from tests.kit.http import Answer, Call, serving
 
-TOKEN = "t0ken-of-nobody"  # noqa: S105 - it opens nothing
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 _EXCHANGES = Path(__file__).with_name("exchanges")
 _IGNORED = {"host", "connection", "accept-encoding", "user-agent", "content-length"}
 
@@ -52,7 +51,7 @@ class Replay:
 
 @contextmanager
 def replaying(*names: str, variables: dict[str, str] | None = None) -> Iterator[Replay]:
-    """Replay recorded exchanges in order; ``variables`` replace ``{name}`` in them by values."""
+    """Replay recorded exchanges in order; each variable's value replaces its ``{name}`` in them."""
     replay = Replay()
     for name in names:
         text = (_EXCHANGES / f"{name}.yaml").read_text()

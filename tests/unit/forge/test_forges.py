@@ -1,4 +1,4 @@
-"""Each call of the forges' adapters has the method, path, headers and body that were recorded."""
+"""Each call of the forges' adapters has the recorded method, path, headers and body."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Demands are put, renewed, released or expire, in any order and with restarts.
 
-The results are compared with ``tests/model/leases.py``, a model of the promises that leases make.
+Each result must be possible in ``tests/model/leases.py``, a model of the promises that leases make.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 
 def restart(world: running.World, random: Random) -> None:
-    """Restart the generator with a ledger that is read from the files in any order."""
+    """Restart the generator with a ledger that is read from the files in random order."""
     files = random.sample(sorted(world.files.items()), len(world.files))
     ledger = ledger_in(dict(files))
     assert ledger == world.state.ledger
@@ -46,7 +46,7 @@ def restart(world: running.World, random: Random) -> None:
 
 
 def assert_released(world: running.World, promises: Promises, now: int) -> None:
-    """Release what has expired, and compare it with what must and may be released now."""
+    """Release the expired demands; check that this was due, and that no due demand is left."""
     before = set(claims_of(world.state.ledger))
     demands = world.look()
     assert len(demands) == len(set(demands))
@@ -68,7 +68,7 @@ def assert_outcome(taken: Any, expected: str, promises: Promises) -> None:
 
 
 def assert_recorded(world: running.World, promises: Promises) -> None:
-    """Check that each recorded end is at most the slack earlier than promised, and never later."""
+    """Check that each recorded end is not later than promised, and at most the slack earlier."""
     for claim in world.state.ledger:
         demand, subject = name_of(claim)
         promised = promises.held[demand][subject].promised
@@ -80,7 +80,7 @@ def assert_recorded(world: running.World, promises: Promises) -> None:
 
 @examples(30)
 @given(chances, st.integers(1, 16))
-def test_what_was_promised_is_kept(random: Random, length: int) -> None:
+def test_every_result_agrees_with_the_model_of_lease_promises(random: Random, length: int) -> None:
     world, promises, maker = running.World(EMPTY, FILES), Promises(SLACK_S), Maker(random)
     now = 0
     for _ in range(length):

@@ -26,7 +26,7 @@ ROS_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 LONGEST_NAME, LONGEST_TOPIC = 53, 247
 
 Subject = tuple[str, ...]
-"""A prefix, and the ids that a name is made of."""
+"""The subject of a name: a prefix, and the ids from which the name is made."""
 
 close = st.text("ab0-_/.A", min_size=1, max_size=5)
 words = st.sampled_from(["edge", "vehicle00", "vehicle_00", "vehicle/00", "Vehicle00", "a", "b"])
@@ -118,7 +118,7 @@ def topic_instance(subject: Subject) -> str:
 
 
 def as_the_reference(id: str) -> str:
-    """Return an id in the form that the reference (application_manager/utils.py) uses in topics."""
+    """Return an id in the form that the reference uses in topics (application_manager/utils.py)."""
     return id.replace("-", "_").replace("/", "_")
 
 
@@ -174,7 +174,7 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
     ]
     assert len(manifests) == releases
     lowered = [path.lower() for path in taken.files]
-    assert len(set(lowered)) == len(lowered), "a file system without case would mix them up"
+    assert len(set(lowered)) == len(lowered), "a file system that ignores case would confuse them"
     assert all(len(part) <= 100 for path in taken.files for part in path.split("/"))
     for node in set(places):
         produced = [
@@ -207,7 +207,7 @@ def usual_cloud(nodes: list[str], node: str) -> str:
 
 
 def with_nodes(nodes: list[str]) -> MemoryRepo:
-    """Return a new repo whose inventory has further nodes with these ids, which may be invalid."""
+    """Return a new repo whose inventory also has nodes with these ids, be they valid or not."""
     repo = MemoryRepo()
     config = repo.state.config
     (domain,) = config.domains.values()
@@ -231,5 +231,5 @@ def with_nodes(nodes: list[str]) -> MemoryRepo:
 
 
 def quoted(text: str) -> str:
-    """Return a text in the quotes that the templates write."""
+    """Return a text in quotes, as the templates write it."""
     return json.dumps(text, ensure_ascii=False)

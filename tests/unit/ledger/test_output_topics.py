@@ -30,7 +30,7 @@ def join(*clouds: Topic, who: str = "vehicle01", id: str = APP, shutdown: bool =
 
 
 def published(repo: MemoryRepo) -> dict[str, str]:
-    """Return the topic of each detection's object list by the topic of its point cloud."""
+    """Return the topic of each detection's object list, by the topic of its point cloud."""
     values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
     detections = [one["detection"] for one in values if "detection" in one]
     return {one["pointCloudTopic"]: one["objectListTopic"] for one in detections}
@@ -42,7 +42,7 @@ def fused(repo: MemoryRepo) -> set[str]:
 
 
 def with_nodes(*nodes: dict[str, Any]) -> MemoryRepo:
-    """Return a repo whose inventory has these nodes added, or these fields of known nodes."""
+    """Return a repo whose inventory has these further nodes, or these fields of known nodes."""
     inventory = yaml.safe_load(skeleton()[NODES])
     known = {node["id"]: node for node in inventory["nodes"]}
     for node in nodes:
@@ -195,7 +195,7 @@ def test_a_connection_that_brings_what_a_service_publishes_is_refused(
 
 
 def claims_after(*goals: Any) -> list[Claim]:
-    """Return the claims of goals, each decided in an empty repo of its own."""
+    """Return the claims of all goals, each decided in a new repo."""
     repos = [MemoryRepo() for _ in goals]
     for repo, one in zip(repos, goals, strict=True):
         repo.send(one)

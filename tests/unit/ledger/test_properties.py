@@ -1,4 +1,4 @@
-"""Properties of the ledger and of the rendered files that hold after any requests in any order.
+"""Properties of the ledger and of the rendered files after any requests in any order.
 
 The model in ``tests/model`` follows the design and uses no code of the program. Program and model
 take the same requests.
@@ -25,24 +25,24 @@ from tests.model.books import Books, Demand, Goal, Result
 from tests.model.goals import SKELETON, Maker, ego, shutdown_of
 
 PAUSES = (1, 1, 1, 60, 400, 899, 900, 901)
-"""Seconds between two requests; a shutdown is remembered for 900."""
+"""Seconds between two requests; the ledger remembers a shutdown for 900 seconds."""
 
 Key = tuple[tuple[str, str], str]
-"""A subject and a demand id."""
+"""A claim's key: its subject and its demand id."""
 
 
 def key_of(subject: tuple[str, str], demand: Demand) -> Key:
-    """Return the key of the program's claim for a claim of the model."""
+    """Return the key of the program's claim that corresponds to a claim of the model."""
     return subject, demand_id(*demand)
 
 
 def key_in(key: ClaimKey) -> Key:
-    """Return the key of a claim of the program in the same form as `key_of`."""
+    """Return the key of a program's claim in the form that `key_of` gives."""
     return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
 
 
 class Walk:
-    """A repo and the model take the same requests, and are compared after each."""
+    """A repo and the model, which take the same requests and are compared after each."""
 
     def __init__(self, random: Random) -> None:
         self.maker = Maker(random)
@@ -85,7 +85,7 @@ class Walk:
 
 
 def assert_changes(taken: Decision, expected: Result) -> None:
-    """Check that exactly the changed claims are written, and that what was not held is named."""
+    """Check that exactly the touched claims are written, and that each hold not found is named."""
     changed = {key_in(change.key) for change in taken.changes.claims}
     assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
@@ -99,7 +99,7 @@ def assert_changes(taken: Decision, expected: Result) -> None:
 
 
 def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
-    """Return whether a text names a subject and a requester, with this topic or with no topic."""
+    """Return whether a text names a subject and a requester, with this topic or with none."""
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
     named = ": " not in text or f": {words} " in text
     return named and f"'{subject}'" in text and text.endswith(f" for {who}")

@@ -36,12 +36,11 @@ Books = dict[str, list[str]]
 
 
 def resource(kind: str, *ids: str) -> str:
-    """Return the name of a custom resource of the reference."""
     return "-".join((kind, *ids)).replace("_", "-").replace("/", "-")
 
 
 def counted(ledger: Ledger) -> Books:
-    """Return the requesters of each resource, each as often as it holds the resource.
+    """Return the requesters of each resource, each as often as it has a hold there.
 
     The form is that of :attr:`Reference.books`.
     """
@@ -61,7 +60,7 @@ def counted(ledger: Ledger) -> Books:
 
 
 def running(repo: MemoryRepo) -> Books:
-    """Return the topics of each service and connection by the name of the reference's resource.
+    """Return the topics of each service and connection, by the name of the reference's resource.
 
     The reference has one detection for all clouds of a source, so their topics are together.
     """
@@ -79,7 +78,7 @@ def running(repo: MemoryRepo) -> Books:
 
 
 class Recorded:
-    """The recorded books, or what runs, after each step: in the reference and in DemandOps.
+    """A recorded table (the books, or what runs) after each step: in the reference, and here.
 
     A recorded step has only the changes.
     """

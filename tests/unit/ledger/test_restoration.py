@@ -65,7 +65,7 @@ def test_books_and_files_are_what_they_were(seed: int) -> None:
     assert decision.outcome == ("restored" if decision.files else "unchanged")
 
 
-def test_what_was_booked_since_is_refused_and_listed() -> None:
+def test_a_rollback_past_newer_claims_is_refused_and_lists_them() -> None:
     repo = filled(0)
     kept = list(repo.state.ledger)
     newer = kept.pop()

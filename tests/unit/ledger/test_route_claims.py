@@ -1,4 +1,4 @@
-"""Routes in claims: the form in claim files, contradictions between them, and the linked nodes."""
+"""Routes in claims: their form in files, contradictions between claims, and the linked nodes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def refusal(ledger: Ledger, *routes: Route, who: str = "w") -> list[str]:
 
 
 class TestFiles:
-    """In a claim file a route without options is one line; another one lists only its options."""
+    """In a claim's file, a route without options is one line; any other lists only its options."""
 
     def test_topics_stay_readable(self) -> None:
         held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
@@ -113,7 +113,7 @@ class TestContradictions:
         (found,) = refusal(ledger, Route("/a", "/b", type="std_msgs/msg/Bool"))
         assert found.startswith("connections[0].topics[0].type: type 'std_msgs/msg/Bool' of '/a'")
 
-    def test_the_same_holds_for_ones_own_claim(self) -> None:
+    def test_a_requester_cannot_contradict_its_own_claim(self) -> None:
         ledger = joined(Ledger(), Route("/a", "/b", qos=1))
         assert len(refusal(ledger, Route("/a", "/b", qos=2), who="v")) == 1
 
@@ -126,7 +126,7 @@ class TestContradictions:
         assert joined(ledger, Route("/b", "/x"), who="w")
 
 
-def test_a_type_that_is_said_later_is_filled_in_and_kept() -> None:
+def test_a_message_type_that_is_given_later_is_added_and_kept() -> None:
     ledger = joined(Ledger(), Route("/a", "/b"))
     ledger = joined(ledger, Route("/a", "/b", type=STRING))
     assert joined(ledger, Route("/a", "/b")) == ledger
@@ -134,7 +134,7 @@ def test_a_type_that_is_said_later_is_filled_in_and_kept() -> None:
     assert held.connection.topics == (Route("/a", "/b", type=STRING),)
 
 
-def test_what_is_carried_back_arrives_at_the_source() -> None:
+def test_a_reverse_route_delivers_to_the_source() -> None:
     ledger = joined(Ledger(), Route("/a", "/b"), Route("/c", "/d", reverse=True))
     assert ledger.is_carried_to("t", "/b")
     assert ledger.is_carried_to("s", "/c")

@@ -1,4 +1,4 @@
-"""A traced plan, updated by changes, equals a new plan, whatever is booked in whatever order."""
+"""A traced plan follows the changes of the ledger and always equals a plan that is made anew."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def afresh(world: World) -> dict[ReleaseKey, Release]:
 
 
 class Following:
-    """The releases that a traced plan gives to somebody who gets only the changes."""
+    """The releases as somebody knows them who gets only the changes from a traced plan."""
 
     def __init__(self, config: Config) -> None:
         self._plan = TracedPlan(config)
@@ -45,8 +45,8 @@ class Following:
 
 @examples(20)
 @given(chances, st.integers(1, 20))
-def test_what_is_brought_forward_is_what_is_made_afresh(random: Random, length: int) -> None:
-    """The traced plan gets changes one at a time or several at once."""
+def test_a_plan_traced_through_changes_equals_a_fresh_plan(random: Random, length: int) -> None:
+    """The traced plan gets the changes one at a time, or several at once."""
     repo = MemoryRepo()
     following = Following(repo.state.config)
     changes: list[ClaimChange] = []

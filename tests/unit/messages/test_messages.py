@@ -1,4 +1,4 @@
-"""``messages.txt`` has all messages and fields, so each change of one is a diff of that file."""
+"""``messages.txt`` has all messages and fields, so each change of one shows in the file's diff."""
 
 from tests.unit.messages.text import FILE, text
 

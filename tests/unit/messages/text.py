@@ -65,7 +65,7 @@ def _messages(cases: Iterable[tuple[str, Iterable[Fault]]]) -> Iterator[str]:
 
 
 def _fields() -> Iterator[str]:
-    """Yield each field of each file and goal with its JSON schema."""
+    """Yield each field of each file and goal with the field's JSON schema."""
     for model in (*CONFIG_MODELS.values(), *GOAL_MODELS):
         schema = model.model_json_schema()
         for part in (schema, *schema.get("$defs", {}).values()):

@@ -74,7 +74,7 @@ def test_the_versioning_files_tell_who_joined_together() -> None:
     assert warnings == []
 
 
-def test_without_them_the_counts_are_kept() -> None:
+def test_an_import_without_the_remaining_joins_keeps_the_counts() -> None:
     joins, _ = imported_goals.remaining_joins(read(experiment(6), "bookkeeping"))
     assert who(joins[CONNECTION]) == [("vehicle03", "station00", "vehicle02"), ("station00",)]
 
@@ -130,7 +130,7 @@ def test_the_versioning_of_a_fusion_is_enough() -> None:
 def test_the_versioning_of_a_connection_is_not() -> None:
     """A connection's versioning file alone does not show who holds the connection.
 
-    Its first request lists all later requesters too.
+    The first request in it lists all later requesters too.
     """
     files = read(experiment(3), "mqtt_versioning")
     first, *_ = files.versions[CONNECTION].values()
@@ -145,7 +145,7 @@ def test_the_versioning_of_a_connection_is_not() -> None:
     )
 
 
-def test_what_was_deleted_is_forgotten_although_its_versions_are_kept() -> None:
+def test_a_deleted_application_is_not_imported_although_its_versions_remain() -> None:
     reference = experiment(8)
     files = read(reference, "")
     assert FUSION in files.versions

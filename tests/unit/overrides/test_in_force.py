@@ -1,7 +1,8 @@
-"""Under overrides, what demands commit is what the ledger alone would render.
+"""Under overrides, demands write the files that the ledger alone would render.
 
 Random demands join and leave. After each one, the files rendered from the ledger equal the files
-that the demands have written one by one, and the claims alone tell which are suspended or kept.
+that the demands have written one by one, and the claims alone tell which demands are suspended or
+kept.
 """
 
 from __future__ import annotations
@@ -99,7 +100,9 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
             assert ((claim.subject.id, claim.demand) in told) is suspended
             if claim.demand.startswith(OVERRIDE_PREFIX):
                 assert claim.requesters == ("petra",)
-                assert ledger.claims_on(claim.subject) == (claim,), "it gives way to any other"
+                assert ledger.claims_on(claim.subject) == (claim,), (
+                    "a kept claim must be the only one"
+                )
         for entry in entries.services.values():
             assert (entry.service, entry.node) != ("object-detection", "cloud")
         assert "v2/edge" not in entries.connections
@@ -132,7 +135,7 @@ def test_the_higher_priority_wins_and_patches_of_both_apply() -> None:
     assert fusion[name]["spec"]["values"]["replicas"] == 7
 
 
-def test_what_is_higher_than_a_hold_changes_what_it_holds() -> None:
+def test_an_override_of_higher_priority_than_a_hold_changes_the_held_release() -> None:
     def body(text: str) -> str:
         return "".join(line for line in text.splitlines(True) if not line.startswith("#"))
 
@@ -177,7 +180,7 @@ def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
 
 
 def test_a_demand_that_an_override_breaks_is_told_which() -> None:
-    """A patch may fit the demand that `check` invents, but not a real one."""
+    """A patch may fit the demand that `check` invents, but not a real demand."""
     fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
     books = MemoryRepo(files(tested=fields))
     with pytest.raises(InvalidInput) as refusal:
@@ -189,7 +192,7 @@ def test_a_demand_that_an_override_breaks_is_told_which() -> None:
     )
 
 
-def test_a_kept_claim_is_the_owners_and_holds_what_the_last_one_did() -> None:
+def test_a_kept_claim_belongs_to_the_owner_with_the_inputs_of_the_last_claim() -> None:
     books = _one(select=[{"applications": ["edge/*"]}], keep=True)
     one = goal([application(ego=[EGO])], id="one")
     two = goal([application(who=["bob"])], id="two")
@@ -230,7 +233,7 @@ def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
         assert ("object-detection-1.0.0" in release) is kept
 
 
-def test_what_a_lease_ends_is_kept_too_and_a_put_that_drops_it_as_well() -> None:
+def test_an_override_keeps_claims_that_end_by_lease_or_by_a_reduced_put() -> None:
     demand = {
         "kind": "Demand",
         "demand": "leased",

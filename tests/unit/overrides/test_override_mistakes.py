@@ -1,4 +1,4 @@
-"""Mistakes of people in overrides; ``tests/unit/messages`` has the messages."""
+"""Mistakes that people make in overrides; ``tests/unit/messages`` has the messages."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Se
         assert not all(hit), traits
 
 
-def test_selectors_apart_in_what_a_release_has_one_of_do_not_meet() -> None:
+def test_selectors_that_differ_in_a_single_valued_trait_never_meet() -> None:
     apart: list[tuple[dict[str, Any], dict[str, Any]]] = [
         ({"nodes": ["edge"]}, {"nodes": ["cloud", "v*"]}),
         ({"services": [SHARED]}, {"services": [OWN]}),
@@ -110,7 +110,7 @@ def test_selectors_apart_in_what_a_release_has_one_of_do_not_meet() -> None:
         ({"connections": ["a"]}, {"connections": ["b"]}),
     ]
     together: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"applications": ["a"]}, {"applications": ["b"]}),  # a shared service may be of both
+        ({"applications": ["a"]}, {"applications": ["b"]}),  # one shared service may serve both
         ({"requesters": ["a"]}, {"requesters": ["b"]}),
         ({"nodes": ["edge"]}, {"services": [OWN]}),
     ]
@@ -185,7 +185,7 @@ def _release() -> ServiceRelease:
 
 @given(effects, effects)
 @examples(60)
-def test_what_is_not_contested_is_the_same_in_either_order(
+def test_uncontested_overrides_give_the_same_result_in_either_order(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:
     both = [_override(name, fields) for name, fields in (("one", one), ("other", other))]

@@ -25,7 +25,7 @@ from tests.scenarios.running import configuration
 
 VEHICLES = ("vehicle00", "vehicle01")
 CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
-"""The cpu capacity by node; other nodes have no limit."""
+"""The cpu capacity of some nodes; other nodes have no limit."""
 
 
 @cache
@@ -51,7 +51,7 @@ def recorders() -> State:
 
 
 def recorder(random: Random) -> dict[str, Any]:
-    """Return a random recorder application, which has one replica for every two topics."""
+    """Return a random recorder application; it has one replica for every two topics."""
     known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
     topics = random.sample(known, random.randint(1, 5))
     where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))
@@ -156,7 +156,7 @@ def test_memory_is_shown_in_the_largest_unit_that_is_exact() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "-1", "1e3", "1 Gi", "0.5m", "1.2345", "many", "1GB"])
-def test_what_is_no_quantity_is_a_fault(text: str) -> None:
+def test_an_invalid_quantity_is_a_fault(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a quantity|is finer than a thousandth"):
         amount_of(text)
 

@@ -1,4 +1,4 @@
-"""The list of demands has those with claims and those that wait, the oldest first."""
+"""The list of demands has the booked and the waiting ones, oldest first."""
 
 from __future__ import annotations
 

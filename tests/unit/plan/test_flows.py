@@ -30,15 +30,16 @@ TYPES = ("one", "two")
 SOURCES = ("vehicle00", "vehicle01", "edge")
 NODES = ("edge", "cloud", "vehicle01")
 CLUSTER_NODE = "cloud"
-"""The node of the services that run once for a cluster."""
+"""The node of the services that run once for the cluster."""
 
 
 class Origin(NamedTuple):
-    """Something that a service can read: a role of the application's inputs, or a service's output.
+    """An input that a service can read: a role of the application, or a service's output.
 
-    ``kind`` is ``source`` if it is made at the source of a topic, ``topic`` if it is made for each
-    topic at the node of an application, and ``once`` if an application, a node or a cluster has
-    one. ``roots`` are the roles that it is made from; it is empty if ``kind`` is ``once``.
+    ``kind`` is ``source`` if the topic is made at the source of another topic, ``topic`` if it is
+    made for each topic at the node of an application, and ``once`` if an application, a node or a
+    cluster has only one. ``roots`` are the roles from which the topic is made; it is empty if
+    ``kind`` is ``once``.
     """
 
     name: str
@@ -52,7 +53,7 @@ class Graphs:
     def __init__(
         self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
     ) -> None:
-        """Make the definitions; the fields of ``place`` go into the definitions of some services.
+        """Make the definitions; some services get the fields of ``place``.
 
         Only services for an application get them; with ``each`` also services for each topic.
         """
@@ -108,7 +109,7 @@ class Graphs:
         return Origin(f"{name}.out", frozenset(roots if kind != "once" else ()), kind)
 
     def _add(self, type: str, name: str, scope: str, at_source: bool, read: list[Origin]) -> Origin:
-        """Add a service to a type and return its output as an origin.
+        """Add a service to a type; return its output as an origin.
 
         A service for each topic has instances for the topics of the first origin that it reads.
         """
@@ -204,7 +205,7 @@ class Demands:
         return head | {"applications": self.held[demand]}
 
     def others(self, goal: dict[str, Any]) -> set[str]:
-        """Return the ids of the applications that other demands than the goal's hold."""
+        """Return the ids of all applications that are held by other demands."""
         others = (apps for demand, apps in self.held.items() if demand != goal["demand"])
         return {app["id"] for apps in others for app in apps}
 
@@ -218,7 +219,7 @@ class Demands:
         return app | {"deliver": self._deliveries(self.types[id])}
 
     def _deliveries(self, type: str) -> list[dict[str, Any]]:
-        """Return at most one delivery of an output that only one node makes with its name."""
+        """Return no delivery, or one of an output that no other node makes under the same name."""
         services = self.graphs.services[type].items()
         names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
         chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
@@ -252,7 +253,7 @@ def instances(
 def delivered(
     repo: MemoryRepo, demands: Demands, services: list[ServiceRelease]
 ) -> Iterator[tuple[str, str]]:
-    """Yield topic and node of each delivery that demands hold.
+    """Yield topic and node of each delivery that the demands hold.
 
     A delivery has only outputs that are made from the inputs of its own demand.
     """
@@ -293,7 +294,9 @@ def assert_every_topic_comes_in_one_way(repo: MemoryRepo, demands: Demands) -> N
         ways = [source for source, name, target in brought if (name, target) == (topic, node)]
         ways += [node] if (node, topic) in made else []
         assert len(ways) == 1, f"{topic} comes to {node} from {ways}"
-    assert {(topic, target) for _, topic, target in brought} <= read, "carries what nobody reads"
+    assert {(topic, target) for _, topic, target in brought} <= read, (
+        "a connection carries a topic that nobody reads"
+    )
 
 
 def in_clusters(files: Mapping[str, str]) -> dict[str, str]:

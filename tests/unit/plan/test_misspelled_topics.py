@@ -1,4 +1,4 @@
-"""Only a topic that is a probable misspelling of a known topic gives a warning."""
+"""Only a topic that is probably a misspelling of a known topic gives a warning."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ USUAL = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 
 
 def told(topic: str, *known: str) -> list[str]:
-    """Return the spelling warnings of a demand for a topic, after demands for ``known``."""
+    """Return the spelling warnings of a demand for a topic, after demands for ``known`` topics."""
     books = MemoryRepo()
     for number, one in enumerate(known):
         books.send(_demand(f"known-{number}", one))

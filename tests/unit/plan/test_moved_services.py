@@ -1,4 +1,4 @@
-"""If an override moves a service, its inputs and deliveries follow it, and return at the end."""
+"""When an override moves a service, its inputs and deliveries follow, and return at the end."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.unit.plan.test_flows import (
 
 
 def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
-    """Yield random overrides that each move a service, or all services of an application."""
+    """Yield random overrides; each moves a service, or all services of an application."""
     names = sorted({name for services in graphs.services.values() for name in services})
     for number in range(random.randint(0, 2)):
         by_service = Selector(services=(random.choice(names),))
@@ -59,7 +59,7 @@ def wanted(
 ) -> dict[str, str | None]:
     """Return the nodes to which overrides move services of an application, by service.
 
-    ``active`` is in the order of priority, so that the override with the highest one wins.
+    ``active`` is in the order of priority, so the last override wins.
     """
     return {
         name: override.node

@@ -54,7 +54,7 @@ class Naming(Demands):
 
 
 def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
-    """Return the configuration with GPUs and a capacity on some nodes, in random order."""
+    """Return the configuration with GPUs and a capacity on some nodes; their order is random."""
     nodes = [
         node.model_copy(
             update={
@@ -117,7 +117,7 @@ def test_services_that_are_placed_fit_stay_and_leave_drained_nodes(
         twin = repo.copy()
         configure(twin, with_gpus(plain, random))
         taken, same = repo.take(goal), twin.take(goal)
-        assert twin.files == repo.files, "another generator decides alike"
+        assert twin.files == repo.files, "another generator must decide the same"
         if isinstance(taken, Refused):
             assert isinstance(same, Refused) and str(same) == str(taken)
             assert {fault.code for fault in taken.faults} <= {"no-room", "capacity", "conflict"}
@@ -125,7 +125,9 @@ def test_services_that_are_placed_fit_stay_and_leave_drained_nodes(
         alone = {app["id"] for app in goal.get("applications", ())} - demands.others(goal)
         for id, nodes in services(repo).items():
             named = id in alone and isinstance(demands, Naming)
-            assert named or nodes == before.get(id, nodes), "what runs is not moved by a demand"
+            assert named or nodes == before.get(id, nodes), (
+                "a demand must not move a running service"
+            )
         assert_sound(repo, demands)
         node = random.choice(NODES)
         configure(repo, with_gpus(plain, random, node))
@@ -165,7 +167,7 @@ class Extreme(Random):
 
 @pytest.mark.parametrize(("seed", "length"), [(62, 3), (87, 4)])
 def test_a_drain_brings_no_topic_to_a_node_from_two(seed: int, length: int) -> None:
-    """In these cases, services at several sources have outputs of the same name."""
+    """In these cases, services at several sources have outputs with the same name."""
     test_services_that_are_placed_fit_stay_and_leave_drained_nodes.hypothesis.inner_test(  # type: ignore[attr-defined]
         Extreme(seed), length
     )

@@ -164,7 +164,7 @@ def inventory(**more: dict[str, Any]) -> dict[str, str]:
 
 
 def asking(*items: dict[str, Any], demand: str = "d", **more: Any) -> dict[str, Any]:
-    """Return a demand with one application for each ``place``."""
+    """Return a demand with an application for each ``place`` in ``items``."""
     apps = [
         {
             "id": f"{demand}{index}",

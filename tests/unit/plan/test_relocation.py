@@ -1,4 +1,4 @@
-"""The applications of a drained node move, and their inputs and deliveries follow them."""
+"""The applications of a drained node move, and their inputs and deliveries move with them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Placed(Demands):
 
 
 def with_nodes(config: Config, drained: str | None = None) -> Config:
-    """Return the configuration with a GPU on some nodes, and the node ``drained`` drained."""
+    """Return the configuration with a GPU on some nodes, and with one node drained."""
     nodes = {
         id: node.model_copy(
             update={"capabilities": ("gpu",) * (id in NODES), "drained": id == drained}

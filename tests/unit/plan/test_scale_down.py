@@ -1,4 +1,4 @@
-"""Replicas are removed after the time that the definition names; the ledger alone decides when."""
+"""Replicas are removed after the time in the definition; the ledger alone decides when."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SCALING = "{max: 9, per: {topics: 1}, downAfter: 10m}"
 STEPS = st.lists(
     st.tuples(st.integers(0, 400), st.one_of(st.none(), st.integers(0, 9))), max_size=25
 )
-"""Steps: the seconds that pass, and the number of topics that are demanded then.
+"""Steps: the seconds that pass, and the number of topics that are demanded after them.
 
 With 0 the demand is released; with None only the time passes.
 """
@@ -49,7 +49,7 @@ def test_a_service_has_the_most_that_it_needed_in_the_time(
 ) -> None:
     repo, now = empty().copy(), NOW
     needs: list[tuple[datetime, int]] = []
-    """The replicas that the service has needed since a time, as long as it runs."""
+    """Since when the service has needed how many replicas, as long as it runs."""
     for seconds, topics in [(0, 1), *steps]:
         now += timedelta(seconds=seconds)
         repo.scale_down(now)
@@ -88,7 +88,7 @@ def test_it_goes_up_at_once_and_says_until_when_it_stays_up() -> None:
 
 
 def test_a_person_decides_at_once() -> None:
-    """An override, a lower maximum or a definition without ``downAfter`` applies at once."""
+    """An override, a lower maximum or a definition without ``downAfter`` takes effect at once."""
     repo = books(SCALING, **replicas_by_overrides(1))
     repo.send(demand(topics=4))
     repo.send(demand(topics=2))

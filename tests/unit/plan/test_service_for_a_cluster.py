@@ -91,7 +91,7 @@ def test_one_runs_while_any_application_of_the_cluster_uses_it(random: Random) -
             if isinstance(key, ServiceKey) and key.for_cluster
             for topic in one.inputs["objects"]
         ]
-        assert len(topics) == len(held), "it reads what each of them makes"
+        assert len(topics) == len(held), "the service must read a topic of each application"
         for application in wanted:
             node = application.partition("/")[0]
             carried = repo.books()["connections"].get(f"derived/{node}/cloud", {"topics": {}})

@@ -1,4 +1,4 @@
-"""The shortcuts that write simple values and read long lists give the same result as PyYAML."""
+"""Our shortcuts that write simple values and read long lists give the same result as PyYAML."""
 
 from __future__ import annotations
 

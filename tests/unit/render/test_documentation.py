@@ -1,4 +1,4 @@
-"""The example of docs/connections.md gives what the page shows."""
+"""The example of docs/connections.md gives the result that the page shows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def blocks(language: str) -> list[str]:
 
 
 def titled() -> dict[str, str]:
-    """Return the YAML blocks that start with a comment by that comment, which is a path."""
+    """Return the YAML blocks whose first line is a comment with a path, by that path."""
     found = {}
     for block in blocks("yaml"):
         title, _, text = block.partition("\n")

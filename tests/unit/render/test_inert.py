@@ -47,7 +47,7 @@ UNSEEN = [
 
 
 class Core(FAST):  # type: ignore[misc]
-    """Loads YAML by the core schema of YAML 1.2.2, section 10.3.2."""
+    """Reads YAML by the core schema of YAML 1.2.2, section 10.3.2."""
 
 
 Core.yaml_implicit_resolvers = {}
@@ -70,7 +70,7 @@ SOMEWHERE_NO_TEXT = re.compile(
 
 
 def both(text: str) -> list[Any]:
-    """Return the documents of a text; check that YAML 1.1 and 1.2 give the same."""
+    """Return the documents in a text, after a check that YAML 1.1 and 1.2 read them alike."""
     old = list(yaml.load_all(text, Loader=FAST))
     new = list(yaml.load_all(text, Loader=Core))
     assert old == new
@@ -95,12 +95,12 @@ def assert_unmistakable(text: str) -> None:
 
 
 def quoted(text: str) -> str:
-    """Return any text as a YAML scalar that has only escapes in ASCII characters."""
+    """Return a text as a YAML scalar that has only escapes in ASCII characters."""
     return '"' + "".join(f"\\U{ord(char):08X}" for char in text) + '"'
 
 
 def inventory(lines: Iterable[str]) -> MemoryRepo:
-    """Return a state repo with further vehicles, each given by the lines of its other fields."""
+    """Return a state repo with further vehicles; each of ``lines`` has the other fields of one."""
     entries = "".join(f"  - type: vehicle\n    cluster: c-its\n{line}" for line in lines)
     return MemoryRepo({NODES: skeleton()[NODES] + entries})
 
@@ -141,7 +141,7 @@ LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true
 
 
 def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
-    """A toleration may have any text, and every parser reads a selector as text."""
+    """A toleration may have any text; a selector must be text to every parser."""
     tolerations = [{"key": text, "value": text} for text in ANY_TEXT]
     selector = {label: label for label in LABELS} | {"a": ""}
     texts = ", ".join(f"{{key: {quoted(text)}, value: {quoted(text)}}}" for text in ANY_TEXT)
@@ -163,7 +163,7 @@ def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
 
 @pytest.mark.parametrize("name", ["null", "y", "1e3", "12", "0x1f", "010", "true", "on"])
 def test_names_that_kubernetes_takes_and_yaml_misreads(name: str) -> None:
-    """Each name is used for a namespace, an account, a secret and a cluster."""
+    """Each name is that of a namespace, an account, a secret and a cluster."""
     domains = (
         "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
         f'  - {{name: "{name}", namespace: "{name}", serviceAccount: "{name}", nodes: ["*"]}}\n'

@@ -1,4 +1,4 @@
-"""The rules in bootstrap files for the pods of an access domain.
+"""The bootstrap files' rules for the pods of an access domain.
 
 `tests/e2e` shows what a cluster refuses by these rules. These tests translate the rule for node
 selectors from CEL to Python and evaluate it.
@@ -44,7 +44,7 @@ FILES = {DOMAINS: POLICY, "inventory/nodes/own.yaml": OWN}
 
 
 def taken(rule: str, selector: Mapping[str, str]) -> bool:
-    """Return whether a node rule accepts a pod's node selector."""
+    """Return whether a rule for node selectors accepts a pod's node selector."""
     python = rule.replace("&&", "and").replace("||", "or").replace("variables.selector", "selector")
     python = re.sub(r'(selector\["\w+"\])\.matches\(', r"search(\1, ", python)
     scope = {
@@ -103,7 +103,7 @@ def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> N
 
 
 def test_a_chart_in_a_new_folder_changes_nothing_that_someone_applied() -> None:
-    """Else Flux would read the new chart only after someone applied the bootstrap file again."""
+    """Otherwise Flux would read the chart only after somebody applied the bootstrap file again."""
     folder = "appdefs/new/charts/new"
     charts = skeleton()["registry/charts.yaml"]
     added = {

@@ -1,4 +1,4 @@
-"""Waits between tries grow to a bound; fewer demands go into one push while pushes fail."""
+"""Pauses between tries grow to a bound; fewer demands go into one push while pushes fail."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
     assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
 
 
-def test_a_line_is_as_long_as_can_be_judged_while_it_is_pushed() -> None:
+def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> None:
     pace = Backoff(200, REAL)
     assert pace.max_demands == 200
     pace.overtaken(100, evaluating_s=0.1, pushing_s=0.2)

@@ -1,4 +1,4 @@
-"""The order in which the waiting demands of many requesters are taken."""
+"""The order in which the generator takes the waiting demands of many requesters."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> 
         {"apps": [{"object_detection_fusion_app": {"requester_ids": [7]}}], "demand": ["x"]},
     ],
 )
-def test_a_goal_that_is_no_goal_has_a_place_too(goal: Any) -> None:
+def test_an_invalid_goal_is_queued_too(goal: Any) -> None:
     assert requester_of(goal) == ""
     assert not subjects_of(goal)
     assert order(Ticket("one", goal, NOW), Ticket("two", goal, NOW)) == ["one", "two"]

@@ -1,4 +1,4 @@
-"""The lease clock decides which leases have ended, also if the machine's clock is set."""
+"""The lease clock decides which leases have ended, even after the machine's clock was set."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.kit.memory import rebuilt
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
-    """Return a ledger with a claim, booked at `START`, for each (demand, lease seconds, slack)."""
+    """Return a ledger with a claim for each (demand, lease seconds, slack), booked at `START`."""
     return rebuilt(
         Claim(
             Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),)),
@@ -81,7 +81,7 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: Lea
     assert ended(clock, ledger) == ["a"]
 
 
-def test_a_clock_that_is_drawn_on_slowly_is_no_step(
+def test_small_adjustments_of_the_clock_count_as_no_step(
     clocks: Clock, clock: LeaseExpiry, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
@@ -101,7 +101,7 @@ def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseExp
     assert clock.seconds_until_due(ledger, 60.0) == 1.0
     clocks.pass_(100)
     assert clock.seconds_until_due(ledger, 60.0) == 1.0, (
-        "what cannot be released does not keep it busy"
+        "a claim that cannot be released must not keep the clock busy"
     )
     assert clock.seconds_until_due(Ledger(), 60.0) == 60.0
     assert clock.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0

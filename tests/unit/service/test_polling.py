@@ -1,4 +1,4 @@
-"""When the state repo is polled, with a clock that the test moves and no randomness."""
+"""The times at which the state repo is polled; the test moves the clock, and nothing is random."""
 
 from __future__ import annotations
 
@@ -44,16 +44,16 @@ def test_an_interval_above_the_bound_is_kept(clock: Clock) -> None:
     assert made.seconds_until_due() == 600
 
 
-def test_what_is_asked_for_many_times_is_one_look_and_one_after_it(clock: Clock) -> None:
+def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None:
     made = PollTimer(0, clock)
     assert made.seconds_until_due() is None and not made.start_if_due()
     for _ in range(3):
         made.request()
     assert made.start_if_due()
     assert not made.start_if_due()
-    made.request()  # during the poll, which may have missed the cause of this request
+    made.request()  # this comes during the poll, which may have missed the cause of the request
     made.finished(reached=True)
-    assert made.seconds_until_due() == 0.5, "bursts are not followed one by one"
+    assert made.seconds_until_due() == 0.5, "a burst of requests must not give one poll each"
     clock.pass_(0.5)
     assert made.start_if_due()
     made.finished(reached=True)

@@ -26,7 +26,7 @@ def request(requester: str) -> Join:
 
 
 class Sending:
-    """Sends demands to a throttle that allows two a minute."""
+    """Sends demands to a rate limit of two a minute."""
 
     def __init__(self) -> None:
         self.throttle = RateLimit()
@@ -34,7 +34,7 @@ class Sending:
         self._count = 0
 
     def send(self, requester: str, at_s: float, operation: str = "") -> bool:
-        """Send a demand and return whether the limit allowed it."""
+        """Send a demand; return whether the limit allowed it."""
         self._count += 1
         moment = START + timedelta(seconds=at_s)
         faults = self.throttle.faults(

@@ -1,4 +1,4 @@
-"""The objects of Flux or Argo CD that the generator watches to see how far a demand got."""
+"""The objects of Flux or Argo CD by which the generator sees how far a demand has got."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.kit.memory import NOW, MemoryRepo
     ("case", "application"),
     [("experiment", None), ("argocd-experiment", ObjectName("argocd", "demandops-perception"))],
 )
-def test_a_place_knows_by_which_controller_it_is_kept(
+def test_a_rollout_target_names_its_argo_cd_application_or_none_for_flux(
     case: str, application: ObjectName | None
 ) -> None:
     state, files = start(case)
@@ -42,5 +42,5 @@ def test_a_demand_waits_for_no_release_that_only_others_need() -> None:
     repo.send(vehicle)
     own = {fusion: True, "od-edge-station00": True}
     assert followed(station) == own
-    assert followed(station) == own, "it repeats"
+    assert followed(station) == own, "the demand was booked before"
     assert followed(vehicle | {"shutdown": True}) == {fusion: True, "od-edge-vehicle00": False}

@@ -17,7 +17,7 @@ NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
 
 class Desk(MemoryRepo):
-    """A repo in memory, with short calls to join and leave an application."""
+    """A repo in memory, with short calls for joins to an application and leaves from it."""
 
     def join(
         self,
@@ -41,10 +41,9 @@ def desk() -> Desk:
 
 @pytest.fixture
 def repo(tmp_path: Path) -> pygit2.Repository:
-    """An empty bare repository."""
     return pygit2.init_repository(str(tmp_path / "repo.git"), bare=True, initial_head="main")
 
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """Make Petra the author of the commits in every test."""
+    """In every test, the author of the commits is a person named Petra."""

@@ -18,7 +18,8 @@ def test_a_clock_that_was_set_back_hides_no_commit_and_shows_no_known_one(tmp_pa
         return repo.create_commit(None, who, who, f"at {seconds}", tree, list(parents))
 
     first = until = commit(1000)
-    for second in (*range(1001, 1031), *range(10, 40)):  # after 1030 the clock is set back to 10
+    # after second 1030 the clock is set back to 10
+    for second in (*range(1001, 1031), *range(10, 40)):
         until = commit(second, until)
     branch = commit(5000, first)
     merge = commit(5001, until, branch)

@@ -112,7 +112,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
     )
 
 
-def test_following_people_says_what_changed_and_what_was_not_taken_in() -> None:
+def test_a_follow_commit_lists_the_changes_and_the_faults_that_were_not_applied() -> None:
     releases = [ReleaseChange("of-edge", "object-fusion on edge", "", "change", ("- replicas 1",))]
     problems = [fault("nodes[0].id", "appears twice; remove one").within("inventory/nodes.yaml")]
     assert commit_message.of_follow(releases, "c" * 40, "b" * 40, problems) == (

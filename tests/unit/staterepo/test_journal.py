@@ -1,4 +1,4 @@
-"""The journal's file after a crash, on a full disk or a damaged disk, and its size."""
+"""The journal's file after a crash, on a full or damaged disk, and its size."""
 
 from __future__ import annotations
 
@@ -48,13 +48,15 @@ def text(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_what_was_written_is_read(path: Path, text: bytes) -> None:
+def test_the_journal_reads_back_the_entries_that_are_not_done(path: Path, text: bytes) -> None:
     found = pending(text)
     assert list(found) == ["op-a", "op-c"]
     assert found["op-a"] == entry("a")
     assert found["op-c"].proposal == PROPOSAL
     assert Journal(path).pending == found
-    assert len(path.read_bytes().splitlines()) == 2, "what is done is left out at a start"
+    assert len(path.read_bytes().splitlines()) == 2, (
+        "a start must leave out the demands that are done"
+    )
 
 
 def test_only_its_owner_reads_a_journal(tmp_path: Path) -> None:
@@ -74,7 +76,7 @@ def test_a_torn_last_entry_is_dropped(path: Path, text: bytes) -> None:
         assert pending(b"".join(lines) + last[:length]) == before
     whole = pending(text)
     assert pending(text[:-1]) == whole
-    assert pending(text + b"\0" * 100) == whole, "pages that were never written"
+    assert pending(text + b"\0" * 100) == whole, "a crash may leave pages of zeros"
 
 
 def test_a_torn_entry_is_gone_before_the_next_is_written(path: Path, text: bytes) -> None:
@@ -108,7 +110,7 @@ def test_no_missing_doubled_or_moved_entry_is_overlooked(path: Path, text: bytes
             assert str(error.value).startswith("outbox.jsonl: line ")
 
 
-def test_a_damage_names_its_place_and_the_remedy(path: Path, text: bytes) -> None:
+def test_a_damaged_journal_is_refused_with_the_line_and_the_remedy(path: Path, text: bytes) -> None:
     path.write_bytes(text.replace(b"wish", b"wash", 2))
     with pytest.raises(DamagedJournal) as error:
         Journal(path)
@@ -117,12 +119,12 @@ def test_a_damage_names_its_place_and_the_remedy(path: Path, text: bytes) -> Non
         " for this state repo, which moves the file away and lists its demands, then send again "
         "what is still needed"
     )
-    assert path.read_bytes() != text, "nothing was written"
+    assert path.read_bytes() != text, "the damaged file must stay as it is"
 
 
 @pytest.mark.parametrize("waiting", [0, 1000])
 def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int) -> None:
-    """The file stays small even if many demands wait for approval all the time."""
+    """The file must also stay small while many demands wait for approval."""
     journal = Journal(path)
     journal.append(entry(f"waiting-{number}") for number in range(waiting))
     largest = 0
@@ -147,7 +149,7 @@ def test_without_room_nothing_is_accepted_and_nothing_lost(path: Path) -> None:
         for _ in range(2):
             with pytest.raises(StateRepoError, match=r"outbox\.jsonl cannot be written: File too"):
                 journal.append([entry("b")])
-            assert path.read_bytes() == before, "no half of an entry"
+            assert path.read_bytes() == before, "the file has a part of an entry"
             assert list(journal.pending) == ["op-a"]
     journal.append([entry("c")])
     assert list(read(path)) == ["op-a", "op-c"]

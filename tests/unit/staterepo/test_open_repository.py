@@ -1,4 +1,4 @@
-"""Which addresses of a state repo are URLs, which are refused; no message shows a secret."""
+"""Which addresses of a state repo are URLs, and which are refused; no message shows a secret."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ SCHEME = "a state repo's address cannot start with '{}'; use https, ssh, git or 
         ("ssh:///x", f"{NO_HOST} 'ssh://'; write ssh://HOST/PATH, or"),
         ("ssh://git@/x", f"{NO_HOST} 'ssh://'; write ssh://HOST/PATH, or"),
         ("http://:80/x", f"{NO_HOST} 'http://'; write http://HOST/PATH, or"),
-        # addresses that look like an option, or are mistyped
+        # addresses that look like an option or are mistyped
         ("-oProxyCommand=touch@x:y", ""),
         ("--upload-pack=touch@x:y", ""),
         ("-x:y", ""),

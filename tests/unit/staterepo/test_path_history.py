@@ -23,7 +23,7 @@ class History:
         self.made: list[pygit2.Oid] = []
 
     def commit(self, text: str | None, *parents: int) -> pygit2.Oid:
-        """Commit a tree with ``text`` at `PATH`, or without a file there if it is None.
+        """Commit a tree with ``text`` at `PATH`, or without a file there if ``text`` is None.
 
         ``parents`` are the numbers of earlier commits.
         """

@@ -1,4 +1,4 @@
-"""Times as people write them, and the commit that was the newest on main at a time."""
+"""Times as people write them, and the newest commit on main at a time."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_time_begins_and_ends(text: str, begins: str, ends: str) -> None:
         *("T14:03", "0001-01-01T00:00+05:00", "2026-01-30T14:03:20 UTC"),
     ),
 )
-def test_what_is_no_time(text: str) -> None:
+def test_a_text_that_is_no_time_gives_none(text: str) -> None:
     assert revisions.parse_time(text, NOW) is None
 
 

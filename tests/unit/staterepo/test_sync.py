@@ -48,6 +48,6 @@ def test_libgit2_git_and_the_journal_force_their_writes(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path / "state.git"), json.dumps(perception())]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     options, setting, last_call = json.loads(said)
-    assert options == [[1]], "switched on once, and never off"
+    assert options == [[1]], "libgit2's forced writes must be switched on once, and never off"
     assert setting == "committed"
-    assert last_call == "fdatasync", "the journal is on the disk before a demand is admitted"
+    assert last_call == "fdatasync", "the journal must be on the disk before a demand is admitted"

@@ -95,11 +95,11 @@ def test_operations_that_arrived_after_a_commit_are_found_and_no_others(
     assert found(third, str(first)) == {"op-2": str(second), "op-3": str(third)}
     assert found(third, str(third)) == {}
     everything = {"op-1": str(first), "op-2": str(second), "op-3": str(third)}
-    assert found(third, "") == everything, "where it is not known, all is read"
+    assert found(third, "") == everything, "without a base, all operations must be found"
     assert found(third, "0" * 40) == everything
     assert found(third, "no commit") == everything
     beside = _commit(repo, "op-9", first)
-    assert found(third, str(beside)) == everything, "not on this line"
+    assert found(third, str(beside)) == everything, "a base on another branch must count as none"
 
 
 def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(
@@ -109,5 +109,7 @@ def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(
     person = _commit(repo, "", first)
     assert commit_log.last_generator_commit(repo, _commit(repo, "", person)) == first
     merge = _commit(repo, "", person, _commit(repo, "op-2", first))
-    assert commit_log.last_generator_commit(repo, merge) == first, "along the first parents"
+    assert commit_log.last_generator_commit(repo, merge) == first, (
+        "the search must follow the first parents"
+    )
     assert commit_log.last_generator_commit(repo, _commit(repo, "")) is None

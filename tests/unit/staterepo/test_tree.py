@@ -1,4 +1,4 @@
-"""`trees.write` and `trees.differences`, compared with a dict as a model of a file tree."""
+"""`trees.write` and `trees.differences` agree with a model of a file tree: a dict by path."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TEXTS = st.sampled_from(["", "x", "x\n", "ü{{ y }}\n"])
 
 
 def _without_conflict(paths: set[str], path: str) -> bool:
-    """Return whether ``path`` can be a file in a tree that has the files ``paths``."""
+    """Return whether a tree with the files ``paths`` can also have a file ``path``."""
     return not any(o.startswith(f"{path}/") or path.startswith(f"{o}/") for o in paths - {path})
 
 
@@ -114,7 +114,7 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
         new = NewObjects(repo)
         made = trees.write(new, lay(repo, files) if files else None, change)
         assert read(repo, made) == wanted
-        assert made == lay(repo, wanted).id, "same files, other tree: an empty folder or a mode"
+        assert made == lay(repo, wanted).id, "the tree has an empty folder or a wrong mode"
         for further in (more, {}):  # each starts from a tree that `new` has
             again = trees.write(new, repo[made].peel(pygit2.Tree), further)
             assert again == lay(repo, changed(wanted, further)).id
@@ -122,7 +122,7 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
 
 @given(before=file_trees(), after=file_trees())
 @examples(50)
-def test_differences_tell_just_what_differs_and_rebuild_the_one_from_the_other(
+def test_differences_between_trees_list_exactly_the_changed_files(
     before: Files, after: Files
 ) -> None:
     with scratch() as repo:
