@@ -43,13 +43,14 @@ class KubeApi:
         """Record a patch, and annotate the object as the patch says, if it exists."""
         *_, namespace, plural, name = path.split("/")
         with self._changed:
-            self.patches.append((path, body))
             item = self._items.get((plural, namespace, name))
-        if item is not None:
-            more = {key: value for key, value in item.items() if key not in ("metadata", "status")}
-            annotations = item["metadata"].get("annotations", {}) | body["metadata"]["annotations"]
-            metadata = item["metadata"] | {"annotations": annotations}
-            self.put(plural, namespace, name, item["status"], metadata=metadata, **more)
+            if item is not None:
+                more = {key: item[key] for key in item.keys() - {"metadata", "status"}}
+                annotations = item["metadata"].get("annotations", {})
+                annotations = annotations | body["metadata"]["annotations"]
+                metadata = item["metadata"] | {"annotations": annotations}
+                self.put(plural, namespace, name, item["status"], metadata=metadata, **more)
+            self.patches.append((path, body))
 
     def listed(self, plural: str, namespace: str) -> Item:
         with self._changed:
