@@ -6,6 +6,7 @@ failures.
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import os
