@@ -281,6 +281,7 @@ class History:
 
     def crash(self) -> None:
         machine = self.chance.choice(self.world.machines)
+        self.oracle.counts["faults"] += machine.is_up
         if machine.is_up and self.chance.randrange(3):
             machine.crashes_in = self.chance.randrange(1, 15)
         elif machine.is_up:
@@ -289,6 +290,7 @@ class History:
     def spoil_network(self) -> None:
         machine = self.chance.choice(self.world.machines)
         kind = self.chance.randrange(7)
+        self.oracle.counts["faults"] += kind < 5
         if kind < 2:
             machine.losses += self.chance.randrange(1, 4)
         elif kind == 2:
@@ -307,6 +309,7 @@ class History:
         machine recorded between the two steps.
         """
         self.oracle.check()
+        self.oracle.counts["faults"] += 1
         sign = self.chance.choice([-1, 1]) if self.turns.offset == self._latest else -1
         self.world.set_clocks(sign * self.chance.choice([60, 600, 4000]))
         self._latest = max(self._latest, self.turns.offset)
