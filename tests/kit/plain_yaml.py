@@ -1,4 +1,4 @@
-"""Read YAML as plain data, with the fast libyaml if it is installed."""
+"""Read and write YAML as plain data, with the fast libyaml if it is installed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ from typing import Any
 import yaml
 
 FAST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 def load(text: str) -> Any:
     return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader
+
+
+def dump(data: Any) -> str:
+    """Return plain data as the text of one YAML document."""
+    return str(yaml.dump(data, Dumper=_DUMPER))

@@ -64,9 +64,10 @@ class Instances(Places):
         """Return an application with its instance's id and its node; None if it is refused."""
         asked = app["version"]
         version = self.testing if asked == "testing" else asked or DEFAULT
+        asked = asked and version  # a claim records the version, not the channel
         id = app["id"].removesuffix(f"@{NEXT}")
         if version == NEXT:
-            id, asked = f"{id}@{NEXT}", NEXT
+            id = f"{id}@{NEXT}"
         elif app["id"] != id:
             return None
         node = HALL if app["node"] == FIRST else app["node"]

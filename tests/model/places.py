@@ -28,10 +28,6 @@ class Waiting:
     who: frozenset[str]
     goal: Goal
 
-    def __deepcopy__(self, memo: object) -> Waiting:
-        """Return itself, because nobody changes a goal."""
-        return self
-
     def turn(self, demand: str) -> tuple[int, str, str]:
         """Return the sort key for the order in which waiting demands get room."""
         return -self.priority, self.since, demand

@@ -9,11 +9,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 
 import pygit2
-import yaml
 from demandops.service.timing.expiry import LONGEST_WAIT_S
 from demandops.staterepo.git.repository import MAIN
 
-from tests.kit import repo
+from tests.kit import plain_yaml, repo
 from tests.kit.promises import Maker, name_of
 from tests.kit.repo import POLICY, GitRepo
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, MAY, NEXT, TALLY
@@ -76,7 +75,7 @@ def template() -> Path:
     """
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
     files = GitRepo(path).files()
-    policy, nodes, appdef = (yaml.safe_load(files[name]) for name in (POLICY, NODES, APPDEF))
+    policy, nodes, appdef = (plain_yaml.load(files[name]) for name in (POLICY, NODES, APPDEF))
     policy["domains"][0] |= {
         "rules": _RULES,
         "leases": {"slack": f"{SLACK_S}s"},
@@ -103,7 +102,7 @@ def template() -> Path:
         {"id": HALL, "type": "hall", "cluster": "c-its", "accessDomains": further}
     )
     changed = {POLICY: policy, NODES: nodes, APPDEF: appdef}
-    texts = {name: yaml.safe_dump(data) for name, data in changed.items()}
+    texts = {name: plain_yaml.dump(data) for name, data in changed.items()}
     folder = f"appdefs/{TALLY}"
     texts |= {f"{folder}/appdef.yaml": _TALLY, f"{folder}/values/counter.yaml.j2": _COUNTER}
     GitRepo(path).commit(texts | {VERSIONS: _versions(NEXT)})
@@ -118,7 +117,7 @@ def _versions(testing: str) -> str:
         "versions": {DEFAULT: {}, NEXT: {"images": {"object-fusion": {"tag": NEXT}}}},
     }
     head = {"apiVersion": "demandops/v1", "kind": "Versions"}
-    return yaml.safe_dump(head | {"applications": {TALLY: entry}})
+    return plain_yaml.dump(head | {"applications": {TALLY: entry}})
 
 
 class History:
@@ -282,6 +281,7 @@ class History:
 
     def crash(self) -> None:
         machine = self.chance.choice(self.world.machines)
+        self.oracle.counts["faults"] += machine.is_up
         if machine.is_up and self.chance.randrange(3):
             machine.crashes_in = self.chance.randrange(1, 15)
         elif machine.is_up:
@@ -290,6 +290,7 @@ class History:
     def spoil_network(self) -> None:
         machine = self.chance.choice(self.world.machines)
         kind = self.chance.randrange(7)
+        self.oracle.counts["faults"] += kind < 5
         if kind < 2:
             machine.losses += self.chance.randrange(1, 4)
         elif kind == 2:
@@ -308,6 +309,7 @@ class History:
         another machine recorded between the steps.
         """
         self.oracle.check()
+        self.oracle.counts["faults"] += 1
         sign = self.chance.choice([-1, 1]) if self.turns.offset == self._latest else -1
         self.world.set_clocks(sign * self.chance.choice([60, 600, 4000]))
         self._latest = max(self._latest, self.turns.offset)
@@ -339,20 +341,20 @@ class History:
         self._commit({path: None if path in self._files("overrides/") else _OVERRIDE})
 
     def _inventory(self) -> None:
-        data = yaml.safe_load(self._files(NODES)[NODES])
+        data = plain_yaml.load(self._files(NODES)[NODES])
         added = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
         data["nodes"].append(added)
-        self._commit({NODES: yaml.safe_dump(data)})
+        self._commit({NODES: plain_yaml.dump(data)})
 
     def _drain(self) -> None:
         """Drain a node, mostly one in use, or end its draining."""
         self.oracle.check()
-        data, books = yaml.safe_load(self._files(NODES)[NODES]), self.oracle.books
+        data, books = plain_yaml.load(self._files(NODES)[NODES]), self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
         name = self.chance.choice(used or sorted(PLACES))
         (node,) = (one for one in data["nodes"] if one["id"] == name)
         drained = node["drained"] = not node.get("drained", False)
-        commit = self._commit({NODES: yaml.safe_dump(data)})
+        commit = self._commit({NODES: plain_yaml.dump(data)})
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
     def _stop_waiting(self) -> None:
@@ -360,7 +362,7 @@ class History:
         self.oracle.check()
         if found := sorted(self._files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
-            demand = yaml.safe_load(text)["demand"]
+            demand = plain_yaml.load(text)["demand"]
             commit = self._commit({path: None})
             self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
 
@@ -369,7 +371,7 @@ class History:
         self.oracle.check()
         if found := sorted(self._files(KEPT_REPLICAS).items()):
             path, text = self.chance.choice(found)
-            record = yaml.safe_load(text)
+            record = plain_yaml.load(text)
             instance = record["application"], record["node"]
             commit = self._commit({path: None})
             self.oracle.edits[commit] = lambda books: books.kept.pop(instance)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from collections import Counter
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from functools import lru_cache
@@ -76,7 +76,8 @@ class Oracle:
         self.books = Instances(SLACK_S, nodes=PLACES)
         self._pushed_at = world.turns.monotonic()
         """The time at which the oracle last found a new tip of main."""
-        self._models = [deepcopy(self.books)]
+        self._models = [pickle.dumps(self.books)]
+        """The model after each commit of main. Bytes are copied ten times as fast as the model."""
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
@@ -163,7 +164,7 @@ class Oracle:
         self._compare_instances(commit, records)
         self.books.told = {}
         self._claims, self._records = claims, records
-        self._models.append(deepcopy(self.books))
+        self._models.append(pickle.dumps(self.books))
 
     def _compare_instances(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
@@ -300,7 +301,7 @@ class Oracle:
         outcome = asked.ticket.future.result().outcome
         if outcome == "unchanged":
             self._assert_possible(asked, "unchanged")
-            if self._take(deepcopy(self.books), asked, asked.time) == "unchanged":
+            if self._take_in_copy(pickle.dumps(self.books), asked) == "unchanged":
                 self._take(self.books, asked, asked.time)
         elif outcome == "waiting" and place is None:
             self._assert_possible(asked, "waits")
@@ -322,8 +323,12 @@ class Oracle:
         assert outcome in said, f"{told}, but the model says {said}"
 
     def _possible(self, asked: Asked) -> set[str]:
-        states = [*self._models[asked.place :], self.books]
-        return {self._take(deepcopy(state), asked, asked.time) for state in states}
+        states = [*self._models[asked.place :], pickle.dumps(self.books)]
+        return {self._take_in_copy(state, asked) for state in states}
+
+    def _take_in_copy(self, model: bytes, asked: Asked) -> str:
+        books: Instances = pickle.loads(model)  # noqa: S301 - bytes of this oracle
+        return self._take(books, asked, asked.time)
 
     # ---- machines ----
 
@@ -396,9 +401,9 @@ def _record(text: str) -> tuple[Instance, dict[int, datetime]]:
 
 def _counters(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
     """Yield namespace, version, topics and replicas of each rendered instance."""
-    for path, text in trees.texts(commit.tree, ["clusters"]).items():
+    for path, blob in trees.blobs(commit.tree, ["clusters"]):
         if Path(path).name.startswith("ta-"):
-            yield _counter(text)
+            yield _counter(trees.text_of(blob))
 
 
 @lru_cache(maxsize=1024)

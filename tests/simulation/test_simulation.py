@@ -223,6 +223,16 @@ def move_instances_with_the_channel(patch: Patch) -> None:
     patch(separate_instance, "_separated", by_name)
 
 
+def keep_the_channel_of_the_default_version(patch: Patch) -> None:
+    separated = separate_instance._separated
+
+    def by_name(app: Any, config: Any) -> Any:
+        made = separated(app, config)
+        return made if made.separate else app
+
+    patch(separate_instance, "_separated", by_name)
+
+
 def take_the_first_domain(patch: Patch) -> None:
     patch(Config, "nodes_of", lambda config, node: (node,))
 
@@ -260,6 +270,7 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     never_come_down: 1,
     share_one_instance: 1,
     move_instances_with_the_channel: 4,
+    keep_the_channel_of_the_default_version: 4,
     take_the_first_domain: 1,
     forget_what_is_booked_in_a_domain: 26,
 }

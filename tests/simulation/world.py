@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime, timedelta
 from itertools import count
 from pathlib import Path
@@ -222,10 +222,12 @@ class Clone(RemoteRepository):
     def _fetch_there(self, repo: git.Repo, *arguments: str) -> str:
         source, target = arguments[-1].removeprefix("+").split(":")
         file = Path(repo.git_dir, target)
-        tip = f"{self._machine.world.remote.references[source].target}\n"
-        if not file.exists() or file.read_text() != tip:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_text(tip)
+        tip = b"%s\n" % str(self._machine.world.remote.references[source].target).encode()
+        with suppress(FileNotFoundError):
+            if file.read_bytes() == tip:
+                return ""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(tip)
         return ""
 
     def _ls_remote_there(self, repo: git.Repo, *arguments: str) -> str:
@@ -293,8 +295,10 @@ class World:
 
         def sync(handle: int) -> None:
             path = Path(f"/proc/self/fd/{handle}").readlink()
+            if "clone.git" in path.parts:
+                return
             for machine in self.machines:
-                if path.is_relative_to(machine.folder / "slot-0") and "clone.git" not in path.parts:
+                if path.is_relative_to(machine.folder / "slot-0"):
                     machine.disk.sync(path)
 
         before = generator.connect, os.fsync, os.fdatasync

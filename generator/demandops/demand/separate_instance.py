@@ -4,6 +4,9 @@ With ``versions: separate`` a demand for a version other than the default gets a
 own. This application has the version in its id (``edge/fusion@1.1.0``), so its services, topics and
 connections have names of their own. It is removed with its last claim. Services that several
 definitions share run once for all versions.
+
+A claim records the version, not the channel that the demand named, also for the default version.
+Otherwise a channel that moves would change the version of an application that others share.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ def _separated(app: Application, config: Config) -> Application:
     if appdef is None or appdef.versions != "separate" or version is None:
         return app
     if version.rank == known[""].rank:
-        return app
+        return replace(app, version=version.name)
     suffix = f"@{version.name}"
     id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
     return replace(app, id=id, version=version.name, separate=True)

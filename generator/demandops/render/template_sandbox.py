@@ -21,7 +21,7 @@ from collections.abc import (
 )
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import lru_cache, wraps
 from itertools import islice
 from typing import Any, cast
 
@@ -185,6 +185,7 @@ def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
         raise SecurityError("'sum' adds numbers only")
 
 
+@lru_cache(maxsize=256)  # each configuration has a sandbox, but all have the same filters
 def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``function`` as a filter that takes steps and refuses to make too large a result."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
@@ -205,6 +206,7 @@ def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     return counted
 
 
+@lru_cache(maxsize=256)
 def _test(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``function`` as a test that takes steps for the size of its arguments."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import rendered_files
+from demandops.decision import State, rendered_files
 from demandops.errors import InvalidInput
 from demandops.plan.release import ServiceRelease
 from hypothesis import given
@@ -105,6 +105,20 @@ def test_the_receipt_says_so_and_a_put_moves_it() -> None:
     moved = repo.send(put("b", "stable"))
     assert {change.change for change in moved.releases} == {"stop"}
     assert {id for one in planned(repo) for id in one.applications} == {"edge/a"}
+
+
+def test_a_channel_that_leaves_the_default_version_changes_nothing_that_runs() -> None:
+    """Others ask for the default version, and share the application with the channel's demand."""
+    repo = MemoryRepo(SEPARATE)
+    repo.send(put("a"))
+    repo.send(put("b", "stable"))
+    moved = config("separate", channels=CHANNELS | {"stable": "2.0.0"})
+    state = State.of(MemoryRepo(moved).config, repo.state.ledger)
+    assert rendered_files(state) == rendered_files(repo.state)
+    again = MemoryRepo(moved)
+    again.send(put("a"))
+    again.send(put("b", "stable"))
+    assert {id for one in planned(again) for id in one.applications} == {"edge/a", "edge/a@2.0.0"}
 
 
 def test_outputs_of_both_are_delivered_by_topics_of_their_own() -> None:
