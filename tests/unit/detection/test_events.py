@@ -95,6 +95,15 @@ def test_events_from_before_a_start_go_on_if_their_entities_come_back_in_time() 
     assert run.told(6, at(6, "a", 91)) == [("near", "a", "stop", 6)]
 
 
+def test_an_entity_that_a_rule_on_pairs_is_not_for_may_fall_silent() -> None:
+    run = Run(
+        rule("pair", together={"source": "cars", "start": 5, "stop": 8}, entities=["car*"]),
+        rule("near", near=NEAR),
+    )
+    assert run.told(1, at(1, "car1", 0), at(1, "tram", 1))[1:] == [("near", "tram", "start", 1)]
+    assert run.told(4)[1:] == [("near", "tram", "stop", 4)]
+
+
 def test_a_clock_that_is_set_ends_nothing() -> None:
     for seconds in (-3600, 3600):
         run = Run(rule("near", near=NEAR))

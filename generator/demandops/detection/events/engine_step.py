@@ -126,7 +126,8 @@ class EngineStep:
         for name in sorted(self._counted.pop(who, _NO_RULES)):
             self._count(name, -1)
         for pair in self._engine.pairs[who[0]]:
-            pair.move(self._cells, who[1], last, None)
+            if pair.takes(who):
+                pair.move(self._cells, who[1], last, None)
 
     # ---- observations ----
 
