@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 
 from demandops.detection.events.detection_state import Observation
 
-from tests.kit.detection import Run, at, rule
+from tests.kit.detection import POSE, SOURCES, Run, at, rule
 
 POINT = {"x": 0, "y": 0}
 NEAR = {"source": "cars", "point": POINT, "start": 84, "stop": 90}
@@ -74,6 +74,25 @@ def test_a_schedule_follows_the_clock_of_its_zone_and_may_end_on_the_next_day() 
     # the clocks go forward at 01:00 UTC
     assert run.told(on(29, 12)) == [("night", "", "stop", on(29, 2, 30))]
     assert run.told(on(30, 23)) == []
+
+
+def test_changes_that_a_long_silence_brings_are_told_in_their_order() -> None:
+    """One step passes over them, as in a replay of a bag with a gap."""
+    sources = {**SOURCES, "slow": {"topic": "/slow/{entity}", "type": POSE, "timeout": "10m"}}
+    rules = (
+        rule("hour", schedule={"start": "00:01", "stop": "00:02"}),
+        rule("late", schedule={"start": "00:03", "stop": "00:04"}, dwell="5s"),
+        rule("near", near={**NEAR, "source": "slow"}),
+    )
+    run = Run(*rules, sources=sources)
+    assert run.told(1, at(1, "a", 0, source="slow")) == [("near", "a", "start", 1)]
+    assert run.told(1000) == [
+        ("hour", "", "start", 60),
+        ("hour", "", "stop", 120),
+        ("late", "", "start", 185),
+        ("late", "", "stop", 240),
+        ("near", "a", "stop", 601),
+    ]
 
 
 def test_events_from_before_a_start_go_on_if_their_entities_come_back_in_time() -> None:

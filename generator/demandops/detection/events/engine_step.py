@@ -71,8 +71,9 @@ class EngineStep:
         These are the ends of dwell times, entities that are silent for too long, and schedules.
         """
         while until >= self._due:
+            self._due = inf
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
-                if at > until:
+                if at > min(until, self._due):  # a change before may have an earlier consequence
                     break
                 self._now = max(self._now, at)
                 act()
@@ -104,6 +105,7 @@ class EngineStep:
             is_on = rule.schedule.is_on(self._now)
             self._latch((rule.name, ()), rule, is_on, not is_on)
         self._hours_due = min(rule.schedule.next_check(self._now) for rule in self._engine.hours)
+        self._due = min(self._due, self._hours_due)
 
     def _look_at_counts(self) -> None:
         for rule in self._engine.rules.values():
