@@ -29,7 +29,8 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     ),
     "settling_time": (
         10.0,
-        "Seconds after the start in which entities of booked demands must be seen.",
+        "Seconds after the start in which entities of booked demands must be seen, or the timeout "
+        "of their source if that is longer.",
         (0.1, 3_600.0),
     ),
     "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),

@@ -114,6 +114,26 @@ def test_events_from_before_a_start_go_on_if_their_entities_come_back_in_time() 
     assert run.told(6, at(6, "a", 91)) == [("near", "a", "stop", 6)]
 
 
+def test_an_entity_that_reports_seldom_is_awaited_after_a_start_for_its_timeout() -> None:
+    slow = {"topic": "/slow/{entity}", "type": POSE, "timeout": "60s"}
+    counted = {"source": "slow", "point": POINT, "radius": 84, "start": 1, "stop": 0}
+    run = Run(
+        rule("near", near={**NEAR, "source": "slow"}),
+        rule("quick", near=NEAR),
+        rule("some", count=counted),
+        sources={**SOURCES, "slow": slow},
+    )
+    held = [("near", ("a",)), ("near", ("b",)), ("quick", ("c",)), ("some", ())]
+    run.state = run.engine.start(0, held, settle_s=10)
+    assert run.told(59) == [("quick", "c", "stop", 10)]
+    assert run.told(59.5, at(59.5, "a", 89, source="slow")) == []
+    assert run.told(70, at(70, "a", 80, source="slow")) == [
+        ("some", "", "stop", 60),
+        ("near", "b", "stop", 60),
+        ("some", "", "start", 70),
+    ]
+
+
 def test_an_entity_that_a_rule_on_pairs_is_not_for_may_fall_silent() -> None:
     run = Run(
         rule("pair", together={"source": "cars", "start": 5, "stop": 8}, entities=["car*"]),

@@ -50,9 +50,10 @@ class EngineStep:
             cells=self._cells,
         )
 
-    def resume(self, key: Key) -> None:
+    def resume(self, key: Key, settle_s: float) -> None:
         """Continue an event that started before a restart, and wait for its entities.
 
+        The wait is ``settle_s`` seconds, or the timeout of an entity's source if that is longer.
         An event for which there is no rule is ignored.
         """
         rule = self._engine.rules.get(key[0])
@@ -61,7 +62,9 @@ class EngineStep:
         entities = rule.entities_of(key[1])
         if all(map(rule.takes, entities)):
             self._enter(key, rule, Phase(self._now, lasts=True))
-            self._awaited |= dict.fromkeys(entities, self._before.settled)
+            for who in entities:
+                wait_s = max(settle_s, self._engine.timeouts[who[0]])
+                self._awaited[who] = self._before.now + wait_s
 
     # ---- time ----
 
