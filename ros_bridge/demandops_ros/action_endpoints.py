@@ -75,7 +75,9 @@ class GoalSender:
         self._action_name = action_name
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain_id)
-        self._node = rclpy.create_node(node_name, context=self._context)
+        # a launch file renames every node of the process; a rule of the node's own comes first
+        own_name = ["--ros-args", "-r", f"__node:={node_name}"]
+        self._node = rclpy.create_node(node_name, context=self._context, cli_args=own_name)
         self._client = ActionClient(
             self._node,
             action,

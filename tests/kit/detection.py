@@ -37,8 +37,8 @@ def text_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> str:
     return strict_yaml.dump({**head, "sources": sources, "rules": [*rules]})
 
 
-def file_of(*rules: dict[str, Any]) -> RuleFile:
-    return rule_file.read(text_of(*rules), "rules.yaml")
+def file_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> RuleFile:
+    return rule_file.read(text_of(*rules, sources=sources), "rules.yaml")
 
 
 def at(time: float, entity: str, x: float, y: float = 0.0, source: str = "cars") -> Observation:
@@ -48,8 +48,10 @@ def at(time: float, entity: str, x: float, y: float = 0.0, source: str = "cars")
 class Run:
     """An event engine and its newest state."""
 
-    def __init__(self, *rules: dict[str, Any], now: float = 0.0) -> None:
-        self.engine = EventEngine(file_of(*rules))
+    def __init__(
+        self, *rules: dict[str, Any], now: float = 0.0, sources: dict[str, Any] = SOURCES
+    ) -> None:
+        self.engine = EventEngine(file_of(*rules, sources=sources))
         self.state: State = self.engine.start(now)
 
     def step(self, now: float, *observations: Observation) -> list[Event]:

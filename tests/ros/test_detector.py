@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
@@ -220,7 +221,8 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     served = servers.start(str(bare))
     rules = tmp_path / "rules.yaml"
     rules.write_text(rules_of().replace("node: edge", "node: egde"))
-    detecting = servers.run(served.state_repo, "detect", str(rules))
+    renamed = ("--ros-args", "-r", "__node:=watcher")  # as the launch file does
+    detecting = servers.run(served.state_repo, "detect", str(rules), *renamed)
 
     def status(part: str) -> Any:
         return fleet.statuses.get(f"demandops_detector: {part}")
@@ -229,6 +231,8 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     fleet.until(lambda: "unknown-node" in detecting.log.read_text(), "the demand is refused")
     fleet.until(lambda: served.log.read_text().count("unknown-node") > 2, "it is tried again")
     assert detecting.log.read_text().count("unknown-node") == 1, "the refusal must be logged once"
+    names = Counter(fleet.node.get_node_names())
+    assert names["watcher"] == names["demandops_detector_client"] == 1, names
     fleet.until(
         lambda: "failed and are tried again" in status("demands").message, "it is on /diagnostics"
     )

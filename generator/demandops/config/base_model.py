@@ -129,7 +129,14 @@ def faults_of(
     return [
         fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
+        if not _counts_faulty_items(dict(item))
     ]
+
+
+def _counts_faulty_items(item: dict[str, Any]) -> bool:
+    """Return whether a list is only too short without its faulty items, which have own faults."""
+    is_short = item["type"] == "too_short" and isinstance(item.get("input"), list)
+    return is_short and len(item["input"]) >= item["ctx"]["min_length"]
 
 
 _EXPECTED = {
@@ -165,6 +172,8 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
         return str(item["ctx"]["error"])
     if kind in ("string_too_short", "too_short") and not value:
         return "is empty; fill it in"
+    if kind == "too_short" and isinstance(value, list):
+        return f"needs at least {item['ctx']['min_length']} entries, not {len(value)}"
     expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
     return f"{expected}, not {strict_yaml.short_repr(value)}"
 

@@ -54,7 +54,7 @@ class Detector:
             booked: a goal for each event. An event ends if there is no longer a rule for it.
             now: the time.
             settle_s: how many seconds the events' entities may stay unseen until they count as
-                gone.
+                gone. If their source's timeout is longer, it counts instead.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting

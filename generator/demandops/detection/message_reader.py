@@ -56,7 +56,7 @@ class MessageReader:
         if self._position:
             x, y = (_number(get(message)) for get in self._position)
             if abs(x) > _FARTHEST_M or abs(y) > _FARTHEST_M:
-                raise Unreadable(f"the position {x:g}, {y:g} is not on the map")
+                raise Unreadable(f"its position is more than {_FARTHEST_M:g} m from the origin")
             position = x, y
         values = {field: _number(get(message)) for field, get in self._fields.items()}
         return Observation(self._source, entity, at, position, values)

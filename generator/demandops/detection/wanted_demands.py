@@ -2,7 +2,8 @@
 
 This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
 outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
-nothing is sent for it.
+nothing is sent for it. If two events want demands with the same id, as after a rule got another
+name, the second one waits until the first one has ended its demand.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ Purpose = Literal["start", "renew", "end"]
 _RENEW_AFTER = 1 / 3
 """The part of a lease after which to renew it; two more attempts fit before its end."""
 _RETRY_S = 5.0
+_OTHER_S = 0.2
+"""How long to wait for another event that holds a demand with the same id."""
 _NOT_SENT = frozenset({"no-server", "rejected"})
 """The codes of goals that the node did not accept."""
 _UNKNOWN = "timeout"
@@ -101,6 +104,7 @@ class WantedDemands:
 
     def __init__(self) -> None:
         self._entries: dict[Key, _Entry] = {}
+        self._owners: dict[str, Key] = {}  # which event holds the demand with an id
         self._queue: list[tuple[float, int, Key]] = []
         self._number = 0
 
@@ -119,6 +123,7 @@ class WantedDemands:
         """
         entry = self._entries.setdefault(key, _Entry())
         entry.held, entry.renew_at = goal, -inf
+        self._owns(key, goal)
         self._enqueue(key, entry)
 
     def next(self, now: float) -> Sending | None:
@@ -130,9 +135,16 @@ class WantedDemands:
             _, _, key = heappop(self._queue)
             entry = self._entries.get(key)
             if entry is not None and (found := entry.next(now)):
-                entry.is_under_way = True
-                return Sending(key, *found)
+                if self._owns(key, found[1]):
+                    entry.is_under_way = True
+                    return Sending(key, *found)
+                entry.not_before = now + _OTHER_S
+                self._enqueue(key, entry)
         return None
+
+    def _owns(self, key: Key, goal: Goal) -> bool:
+        """Return whether no other event holds the goal's demand; if so, this event holds it now."""
+        return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
     def next_at(self) -> float:
         """Return the time at which to call :meth:`next` again; infinite if nothing is to be sent.
@@ -151,6 +163,8 @@ class WantedDemands:
         entry = self._entries[sending.key]
         entry.is_under_way = False
         text = self._record(entry, sending, outcome, now)
+        if entry.held is None and self._owners.get(sending.goal.id) == sending.key:
+            del self._owners[sending.goal.id]
         self._enqueue(sending.key, entry)
         return text
 

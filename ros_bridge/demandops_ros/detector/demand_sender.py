@@ -87,7 +87,9 @@ class DemandSender:
                 told = self._wanted.answered(sending, outcome, REAL.monotonic())
                 self._changed.notify_all()
             rule, subjects = sending.key
-            what = f"{sending.purpose} of {quoted(sending.goal.id)} for {', '.join(subjects)}"
+            what = f"{sending.purpose} of {quoted(sending.goal.id)}"
+            if subjects:
+                what += f" for {', '.join(subjects)}"
             if told:
                 self._log("warning", f"rule {rule}: {what} failed, and is tried again: {told}")
             elif not outcome.code and sending.purpose != "renew":

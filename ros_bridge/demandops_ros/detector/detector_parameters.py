@@ -29,7 +29,8 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     ),
     "settling_time": (
         10.0,
-        "Seconds after the start after which an unseen entity of a booked demand counts as gone.",
+        "Seconds after the start after which an unseen entity of a booked demand counts as gone; "
+        "the timeout of its source, if that is longer.",
         (0.1, 3_600.0),
     ),
     "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),

@@ -24,6 +24,10 @@ RULES = [
     rule("some", near={"source": "bikes", "point": POINT, "start": 9, "stop": 30}, entities=["e"]),
     rule("pair", together={"source": "cars", "start": 5, "stop": 8}),
     rule("both", together={"source": "cars", "other": "bikes", "start": 6, "stop": 7}, dwell="2s"),
+    rule("duo", together={"source": "cars", "start": 6, "stop": 9}, entities=["a", "b"]),
+    rule(
+        "mix", together={"source": "cars", "other": "bikes", "start": 4, "stop": 9}, entities=["b"]
+    ),
     rule("full", count={"source": "cars", "point": POINT, "radius": 20, "start": 3, "stop": 1}),
 ]
 
@@ -87,9 +91,13 @@ class Model:
         for one, other in combinations(cars, 2):
             away = self.between(("cars", one), ("cars", other))
             yield ("pair", (one, other)), away <= 5, away > 8
+            if (one, other) == ("a", "b"):
+                yield ("duo", (one, other)), away <= 6, away > 9
         for one, other in product(cars, bikes):
             away = self.between(("cars", one), ("bikes", other))
             yield ("both", (one, other)), away <= 6, away > 7
+            if one == "b":
+                yield ("mix", (one, other)), away <= 4, away > 9
         yield ("full", ()), inside >= 3, inside <= 1
 
     def between(self, one: tuple[str, str], other: tuple[str, str]) -> float:

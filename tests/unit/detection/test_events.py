@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 
 from demandops.detection.events.detection_state import Observation
 
-from tests.kit.detection import Run, at, rule
+from tests.kit.detection import POSE, SOURCES, Run, at, rule
 
 POINT = {"x": 0, "y": 0}
 NEAR = {"source": "cars", "point": POINT, "start": 84, "stop": 90}
@@ -76,6 +76,25 @@ def test_a_schedule_follows_the_clock_of_its_zone_and_may_end_on_the_next_day() 
     assert run.told(on(30, 23)) == []
 
 
+def test_changes_that_a_long_silence_brings_are_told_in_their_order() -> None:
+    """One step passes over them, as in a replay of a bag with a gap."""
+    sources = {**SOURCES, "slow": {"topic": "/slow/{entity}", "type": POSE, "timeout": "10m"}}
+    rules = (
+        rule("hour", schedule={"start": "00:01", "stop": "00:02"}),
+        rule("late", schedule={"start": "00:03", "stop": "00:04"}, dwell="5s"),
+        rule("near", near={**NEAR, "source": "slow"}),
+    )
+    run = Run(*rules, sources=sources)
+    assert run.told(1, at(1, "a", 0, source="slow")) == [("near", "a", "start", 1)]
+    assert run.told(1000) == [
+        ("hour", "", "start", 60),
+        ("hour", "", "stop", 120),
+        ("late", "", "start", 185),
+        ("late", "", "stop", 240),
+        ("near", "a", "stop", 601),
+    ]
+
+
 def test_events_from_before_a_start_go_on_if_their_entities_come_back_in_time() -> None:
     run = Run(
         rule("near", near=NEAR),
@@ -93,6 +112,35 @@ def test_events_from_before_a_start_go_on_if_their_entities_come_back_in_time() 
         ("pair", "a b", "stop", 5),
     ]
     assert run.told(6, at(6, "a", 91)) == [("near", "a", "stop", 6)]
+
+
+def test_an_entity_that_reports_seldom_is_awaited_after_a_start_for_its_timeout() -> None:
+    slow = {"topic": "/slow/{entity}", "type": POSE, "timeout": "60s"}
+    counted = {"source": "slow", "point": POINT, "radius": 84, "start": 1, "stop": 0}
+    run = Run(
+        rule("near", near={**NEAR, "source": "slow"}),
+        rule("quick", near=NEAR),
+        rule("some", count=counted),
+        sources={**SOURCES, "slow": slow},
+    )
+    held = [("near", ("a",)), ("near", ("b",)), ("quick", ("c",)), ("some", ())]
+    run.state = run.engine.start(0, held, settle_s=10)
+    assert run.told(59) == [("quick", "c", "stop", 10)]
+    assert run.told(59.5, at(59.5, "a", 89, source="slow")) == []
+    assert run.told(70, at(70, "a", 80, source="slow")) == [
+        ("some", "", "stop", 60),
+        ("near", "b", "stop", 60),
+        ("some", "", "start", 70),
+    ]
+
+
+def test_an_entity_that_a_rule_on_pairs_is_not_for_may_fall_silent() -> None:
+    run = Run(
+        rule("pair", together={"source": "cars", "start": 5, "stop": 8}, entities=["car*"]),
+        rule("near", near=NEAR),
+    )
+    assert run.told(1, at(1, "car1", 0), at(1, "tram", 1))[1:] == [("near", "tram", "start", 1)]
+    assert run.told(4)[1:] == [("near", "tram", "stop", 4)]
 
 
 def test_a_clock_that_is_set_ends_nothing() -> None:

@@ -60,6 +60,20 @@ def faults(text: str) -> list[str]:
             "mean 'entity'?",
         ),
         (
+            rule("a", near=NEAR, demand=demand(demand="{}")),
+            "rules.yaml:18: rules[0].demand.demand: '{}' has no value in this rule; known: "
+            "distance, entity, rule, x, y",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(request="{distance}")),
+            "rules.yaml:21: rules[0].demand.request: '{distance}' alone becomes a number, which is "
+            "not possible here; add a word to it",
+        ),
+        (
+            rule("a", near={"source": "cars", "polygon": [{"x": 0, "y": 0}, {"x": 1, "y": 1}]}),
+            "rules.yaml:23: rules[0].near.polygon: needs at least 3 entries, not 2",
+        ),
+        (
             rule("a", near=NEAR, demand=demand(demand="{entity", lease="1 day")),
             "rules.yaml:18: rules[0].demand.demand: has a single '{'; write '{{' for one brace",
         ),
@@ -117,6 +131,26 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "std_msgs/msg/String",
         "rules.yaml:11: sources.c.topic: has {entity} twice; name the entity once",
         "rules.yaml:14: sources.d: timeout must be one second or more",
+    ]
+
+
+def test_two_rules_for_the_same_entities_have_demands_of_their_own() -> None:
+    far = {**NEAR, "point": {"x": 500, "y": 0}}
+    same, other = demand(demand="b/{entity}"), demand()
+    told = faults(text_of(rule("a", near=NEAR, demand=same), rule("b", near=far, demand=other)))
+    assert told == [
+        "rules.yaml:30: rules[1].demand.demand: is the id of a demand of rule 'a' too: the event "
+        "that ends first would end the demand of both; add {rule} to one of them"
+    ]
+    cars = rule("a", near=NEAR, demand=same, entities=["car*"])
+    rule_file.read(text_of(cars, rule("b", near=far, entities=["bus*"])), "rules.yaml")
+
+
+def test_a_list_with_one_faulty_item_has_one_fault() -> None:
+    hours = {"days": ["monday"], "start": "06:30", "stop": "07:30"}
+    assert faults(text_of(rule("a", schedule=hours))) == [
+        "rules.yaml:23: rules[0].schedule.days[0]: is 'monday', but must be 'mon', 'tue', 'wed', "
+        "'thu', 'fri', 'sat' or 'sun'"
     ]
 
 

@@ -127,3 +127,18 @@ def test_a_demand_booked_before_the_start_is_renewed_at_once_and_not_put_again()
     assert sent.done(0, lease_s=30) == "renew"
     assert sent.wanted.next(9.9) is None
     assert sent.wanted.next_at() == 10
+
+
+def test_an_event_waits_until_another_one_has_ended_the_demand_with_the_same_id() -> None:
+    """So the release of a rule that got another name cannot end the demand of the new name."""
+    sent = Sent()
+    sent.want(PUT)
+    assert sent.done(0) == "start"
+    sent.want(None)
+    sent.wanted.want(Want(("new", ("a",)), OTHER))
+    ending = sent.next(1)
+    assert ending.purpose == "end"
+    assert sent.wanted.next(1) is None
+    assert 1 < sent.wanted.next_at() < 2
+    assert sent.wanted.answered(ending, Outcome(), 1) == ""
+    assert sent.next(2) == Sending(("new", ("a",)), "start", OTHER)

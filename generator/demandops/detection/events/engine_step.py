@@ -50,9 +50,10 @@ class EngineStep:
             cells=self._cells,
         )
 
-    def resume(self, key: Key) -> None:
+    def resume(self, key: Key, settle_s: float) -> None:
         """Continue an event that started before a restart, and wait for its entities.
 
+        The wait is ``settle_s`` seconds, or the timeout of an entity's source if that is longer.
         An event for which there is no rule is ignored.
         """
         rule = self._engine.rules.get(key[0])
@@ -61,7 +62,9 @@ class EngineStep:
         entities = rule.entities_of(key[1])
         if all(map(rule.takes, entities)):
             self._enter(key, rule, Phase(self._now, lasts=True))
-            self._awaited |= dict.fromkeys(entities, self._before.settled)
+            for who in entities:
+                wait_s = max(settle_s, self._engine.timeouts[who[0]])
+                self._awaited[who] = self._before.now + wait_s
 
     # ---- time ----
 
@@ -71,8 +74,9 @@ class EngineStep:
         These are the ends of dwell times, entities that are silent for too long, and schedules.
         """
         while until >= self._due:
+            self._due = inf
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
-                if at > until:
+                if at > min(until, self._due):  # a change before may have an earlier consequence
                     break
                 self._now = max(self._now, at)
                 act()
@@ -104,6 +108,7 @@ class EngineStep:
             is_on = rule.schedule.is_on(self._now)
             self._latch((rule.name, ()), rule, is_on, not is_on)
         self._hours_due = min(rule.schedule.next_check(self._now) for rule in self._engine.hours)
+        self._due = min(self._due, self._hours_due)
 
     def _look_at_counts(self) -> None:
         for rule in self._engine.rules.values():
@@ -126,7 +131,8 @@ class EngineStep:
         for name in sorted(self._counted.pop(who, _NO_RULES)):
             self._count(name, -1)
         for pair in self._engine.pairs[who[0]]:
-            pair.move(self._cells, who[1], last, None)
+            if pair.takes(who):
+                pair.move(self._cells, who[1], last, None)
 
     # ---- observations ----
 

@@ -58,13 +58,20 @@ class EventEngine:
             now: the time.
             held: the events whose demands are already booked. Events without a rule are left out.
             settle_s: how many seconds the entities of these events may stay unseen until they count
-                as gone.
+                as gone. If their source's timeout is longer, it counts instead.
         """
-        state = State(now, due=-inf, settled=now + settle_s, hours_due=now)
-        step = EngineStep(self, state)
-        for key in held:
-            step.resume(key)
+        keys = tuple(held)
+        settled = now + max((settle_s, *map(self._timeout_of_count, keys)))
+        step = EngineStep(self, State(now, due=-inf, settled=settled, hours_due=now))
+        for key in keys:
+            step.resume(key, settle_s)
         return step.result()
+
+    def _timeout_of_count(self, key: Key) -> float:
+        """Return the timeout of the source that the event's rule counts; 0 for other rules."""
+        rule = self.rules.get(key[0])
+        is_count = isinstance(rule, AreaRule) and rule.count is not None
+        return self.timeouts[rule.sources[0]] if rule and is_count else 0.0
 
     def step(
         self, state: State, observations: Iterable[Observation], now: float

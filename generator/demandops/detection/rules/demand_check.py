@@ -10,6 +10,7 @@ from demandops.detection.rules import rule_template
 from demandops.detection.rules.rule_demand import RuleDemand
 from demandops.detection.rules.rule_template import Values, filled, names
 from demandops.errors import Fault, fault
+from demandops.quoting import quoted
 from demandops.settings import API_VERSION
 
 _HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
@@ -49,9 +50,20 @@ def faults_of_demand(
         fixed = ["shutdown"] if "shutdown" in data else []
         formed = deployment_request_goal.form_faults(data)
     found = [fault(f"{field}.{name}", "is set by the detector; remove it") for name in fixed]
+    written = dict(rule_template.texts(template.data, field))
     for one in formed:
-        found.append(fault(f"{field}.{one.field}" if one.field else field, one.message))
+        path = f"{field}.{one.field}" if one.field else field
+        found.append(fault(path, _number_for_text(written.get(path, "")) or one.message))
     return found or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
+
+
+def _number_for_text(text: str) -> str:
+    """Return the fault of a text that is a number alone in braces; empty for other texts."""
+    if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
+        return (
+            f"{quoted(text)} alone becomes a number, which is not possible here; add a word to it"
+        )
+    return ""
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:

@@ -177,6 +177,7 @@ def read(text: str, file: str) -> RuleFile:
 
 def _faults(rules: RuleFile) -> Iterator[Fault]:
     seen: set[str] = set()
+    ids: list[tuple[str, Rule]] = []
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in seen:
@@ -195,3 +196,20 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
         yield from faults_of_demand(
             rule.template, f"{where}.{field}", rule.subjects, rule.momentary
         )
+        if rule.demand is not None:
+            id = str(rule.demand.get("demand", "")).replace("{rule}", rule.name)
+            for other_id, other in ids:
+                if id == other_id and _may_meet(rule, other):
+                    message = (
+                        f"is the id of a demand of rule '{other.name}' too: the event that ends "
+                        "first would end the demand of both; add {rule} to one of them"
+                    )
+                    yield fault(f"{where}.demand.demand", message)
+                    break
+            ids.append((id, rule))
+
+
+def _may_meet(one: Rule, other: Rule) -> bool:
+    """Return whether two rules may be for the same entities, as far as their patterns tell."""
+    patterns = {*one.entities}, {*other.entities}
+    return "*" in patterns[0] | patterns[1] or not patterns[0].isdisjoint(patterns[1])

@@ -79,7 +79,7 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
     found = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):
-            if token[0] in "{}":
+            if token[0] in ("{", "}"):
                 message = f"has a single '{token[0]}'; write '{token[0] * 2}' for one brace"
                 found.append(fault(path, message))
             elif token[1] is not None and token[1] not in known:
