@@ -162,7 +162,10 @@ GOALS: dict[str, Callable[..., list[dict[str, Any]]]] = {"reference": reference,
 
 
 def measure(folder: Path, releases: int, rounds: int) -> list[dict[str, Any]]:
-    """Return a row for each kind of demand: the medians of its joins, and their ratios."""
+    """Return a row for each kind of demand.
+
+    A row has the median times of a join in both repos, and the ratio of the second to the first.
+    """
     plain = fleet.lay_down(folder / "plain.git", releases)
     full = fleet.lay_down(folder / "configured.git", releases, configure=configure)
     with ExitStack() as stack:

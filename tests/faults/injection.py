@@ -79,11 +79,11 @@ class Site:
     creates: bool = False
     which: int = 0
     place: int = 0
-    """How many calls of the same class came before this one."""
+    """How many calls of the same class (:attr:`of_class`) came before this one."""
 
     @property
     def of_class(self) -> tuple[str, str, str, bool]:
-        """Role, kind, class of file, and whether it makes one; calls that share these are alike."""
+        """What calls of one class share: role, kind, class of file, and whether they create it."""
         return self.role, self.kind, self.file, self.creates
 
     @property

@@ -113,7 +113,7 @@ class Places(Promises):
         }
         return self.nodes - self.drained - taken
 
-    def has_room(self, demand: str, now: int) -> None:
+    def book_waiting(self, demand: str, now: int) -> None:
         """Book the waiting demand that is first in turn; fail if ``demand`` is another one.
 
         ``now`` is the earliest time at which the generator can have booked it.

@@ -227,7 +227,7 @@ class Oracle:
         let_in = {demand for demand, _ in claims.keys() - both}
         self.counts.update(let_in=len(let_in), moved=len(moved))
         for demand in let_in:
-            self.books.has_room(demand, self._pushed_at)  # type: ignore[arg-type]
+            self.books.book_waiting(demand, self._pushed_at)  # type: ignore[arg-type]
         for demand, subject in moved:
             self.books.moved(demand, subject)
         if gone := self._claims.keys() - both:

@@ -76,10 +76,10 @@ class Client(ABC):
         """Return a configuration as the text that the client's program reads."""
         return strict_yaml.dump(configuration)
 
-    def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return the part of a configuration whose changes need a restart of the client.
+    def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
+        """Return the part of a configuration that the client's program reads only at its start.
 
-        The client's program reads this part only at its start.
+        If this part changes, the client restarts.
         """
         return configuration
 

@@ -183,10 +183,10 @@ class RosEnd(End):
             ],
         }
 
-    def needs_restart(self, configuration: dict[str, Any]) -> dict[str, Any]:
+    def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """Return the configuration without the list of topics.
 
-        A running router reads a changed list of topics again.
+        A running router reads that list again when it changes, so it needs no restart.
         """
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 

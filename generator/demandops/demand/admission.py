@@ -214,7 +214,7 @@ def _instance(
     id, _, named = app.id.rpartition("@")
     if app.separate and (not id or named != app.version):
         message = f"{quoted(app.id)} of a separate instance does not end in '@{app.version}'"
-        yield fault("id", f"{message}; book it by a demand")
+        yield fault("id", f"{message}; remove the claim, and demand the version instead")
     elif not app.separate and appdef.versions == "separate" and id and named in versions:
         yield fault(
             "id",

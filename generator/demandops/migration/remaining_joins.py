@@ -60,8 +60,8 @@ def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join
 def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
     """Remove a shutdown's holds from the joins.
 
-    A hold is removed from a join of exactly the shutdown's requesters, if one has this hold. Else
-    it is removed from the oldest join that has it.
+    Each hold is removed from one join that has it. Joins whose requesters are exactly those of the
+    shutdown come first, then all others, and older joins before newer ones.
     """
     named = set(shutdown.requester)
     same_first = sorted(joins, key=lambda join: {who for _, who in join[1]} != named)

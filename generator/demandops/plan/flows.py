@@ -22,8 +22,9 @@ from demandops.subject import TopicKey
 class PublishedTopic(NamedTuple):
     """A topic that a service reads, and the node that publishes the topic.
 
-    ``root`` is the key of the demanded topic: the key of ``topic`` itself, or of the topic that
-    ``topic`` is made from. It is empty if ``topic`` is not made from one particular demanded topic.
+    ``root`` is the key of a demanded topic: of ``topic`` itself, if the demand lists it as an
+    input, or of the input from which a service makes ``topic``. It is empty if a service makes
+    ``topic`` from all its inputs together.
     """
 
     topic: InputTopic
@@ -87,8 +88,8 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
 def version_of_instance(app: Application, service: Service) -> str:
     """Return the version that the keys of a service's instances contain.
 
-    This is the version of a separate application. It is an empty text for any other application
-    and for a shared service.
+    This is the version of the application if it is a separate instance. It is an empty text for
+    any other application, and for a shared service.
     """
     return "" if service.shared else app.own_version
 

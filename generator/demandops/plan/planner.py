@@ -179,10 +179,10 @@ def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str
 def demanded_inputs(
     world: World, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield (role, topic, root) for each input of a service that comes from an application.
+    """Yield (role, topic, root) for each topic that a service reads because of an application.
 
-    The root is the key of the demanded topic: of the input itself, or of the topic that the input
-    is made from. It is empty if the input is not made from one particular demanded topic.
+    ``role`` is the service's input that reads the topic. ``root`` is that of
+    :class:`demandops.plan.flows.PublishedTopic`.
     """
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)

@@ -73,11 +73,11 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return the replicas of a service that may keep some for a while (``scaling.downAfter``).
+    """Return how many replicas a service has, and the step that keeps some of them, or ``None``.
 
-    ``steps`` are the kept replicas (:mod:`demandops.ledger.kept_replicas`). If the first step has
-    more replicas than the demands need, return its number and the step. Otherwise return ``needed``
-    and ``None``.
+    A service may keep replicas for a while (``scaling.downAfter``). ``steps`` say how many, and how
+    long (:mod:`demandops.ledger.kept_replicas`). A step that keeps no more replicas than the
+    demands need has no effect.
     """
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None

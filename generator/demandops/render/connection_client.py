@@ -38,12 +38,12 @@ def render(client: Client, config: Config, engine: Engine) -> str:
         raise Refused.at("images", message, code=UNSUPPORTED)
     configuration, settings = client.configuration(), client.settings(config)
     check_configuration(kind.word, configuration, client.name)
-    restarts = client.written(client.needs_restart(configuration))
+    at_start = client.written(client.read_at_start(configuration))
     return engine.text(
         f"connections/{kind.word}/client.yaml.j2",
         client=client,
         configuration=client.written(configuration),
-        checksum=hashlib.sha256(restarts.encode()).hexdigest(),
+        checksum=hashlib.sha256(at_start.encode()).hexdigest(),
         node=node,
         selector=node.labels(),
         tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],

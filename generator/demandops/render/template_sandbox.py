@@ -137,7 +137,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Take steps for the size of a new value; return the value, with iterators as lists."""
+    """Take as many steps as a new value has parts; return it, with iterators as lists."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
@@ -186,8 +186,8 @@ def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
 
 
 @lru_cache(maxsize=256)  # each configuration has a sandbox, but all have the same filters
-def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``function`` as a filter that takes steps and refuses to make too large a result."""
+def _counted_filter(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a Jinja filter that takes steps from the budget and refuses too large a result."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -207,8 +207,8 @@ def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @lru_cache(maxsize=256)
-def _test(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return ``function`` as a test that takes steps for the size of its arguments."""
+def _counted_test(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a Jinja test (``is …``) that takes as many steps as its arguments have parts."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -321,11 +321,13 @@ class Sandbox(ImmutableSandboxedEnvironment):
         assert written is not None  # noqa: S101 - our own options
         self.finalize = lambda value: written(_kept(value, data=True))
         kept = {name: one for name, one in self.filters.items() if name in _FILTERS}
-        self.filters = {name: _counted(name, one) for name, one in {**kept, **filters}.items()}
+        self.filters = {
+            name: _counted_filter(name, one) for name, one in {**kept, **filters}.items()
+        }
         self.filters |= {"_iterated": _iterated, "_measured": _measured}
         self.filters["_concatenated"] = _concatenated
         self.tests = {
-            name: _test(cast(Callable[..., Any], one))
+            name: _counted_test(cast(Callable[..., Any], one))
             for name, one in self.tests.items()
             if name != "sameas"
         }
@@ -369,7 +371,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _kept(super().call_binop(context, operator, left, right))
 
     def getitem(self, obj: Any, argument: Any) -> Any:  # noqa: ANN401
-        """Return an item of a value; a key that is a tuple takes steps for its size."""
+        """Return an item of a value; if the key is a tuple, take as many steps as it has parts."""
         if isinstance(argument, tuple):
             _budget.get().take(_size(argument))
         return super().getitem(obj, argument)

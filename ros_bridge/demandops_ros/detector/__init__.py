@@ -1,1 +1,1 @@
-"""The event detector: a node that watches topics and demands by rules."""
+"""The event detector: a node that watches topics, and sends the demands that its rules ask for."""

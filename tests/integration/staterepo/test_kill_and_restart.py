@@ -89,8 +89,8 @@ def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
 POINTS = [
     ("committed", "a commit object stands that no branch knows", False),
     ("publishing", "all commits of the batch stand, none is published", False),
-    ("published", "the remote has it, the outbox does not know", True),
-    ("unanswered", "the outbox knows, the requester does not", True),
+    ("published", "the remote has it, the journal does not know", True),
+    ("unanswered", "the journal knows, the requester does not", True),
 ]
 
 
@@ -390,7 +390,7 @@ def test_an_empty_journal_holds_nothing_and_harms_nothing(
     assert len(rig.operations(bare)) == 1
 
 
-def test_two_processes_have_slots_of_their_own_and_a_dead_ones_outbox_is_adopted(
+def test_two_processes_have_slots_of_their_own_and_a_dead_ones_journal_is_adopted(
     drivers: Drivers, bare: Path, url: str, data_home: Path
 ) -> None:
     with rig.running(url) as first:
@@ -409,7 +409,7 @@ def test_two_processes_have_slots_of_their_own_and_a_dead_ones_outbox_is_adopted
     rig.assert_sound(bare)
 
 
-def test_the_outbox_of_one_state_repo_is_never_played_into_another(
+def test_the_journal_of_one_state_repo_is_never_played_into_another(
     drivers: Drivers,
     new_repo: Callable[[str], Path],
     tmp_path: Path,
@@ -428,7 +428,7 @@ def test_the_outbox_of_one_state_repo_is_never_played_into_another(
     assert rig.operations(there / "state.git") == []
 
 
-def test_the_outbox_is_found_again_however_the_folder_is_named(
+def test_the_journal_is_found_again_however_the_folder_is_named(
     drivers: Drivers, bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = [[demand("join-1", goal(1))]]

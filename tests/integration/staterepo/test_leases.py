@@ -71,7 +71,7 @@ def ends(generator: Generator, demand: str) -> datetime:
     return max(claim.lease.expires_at for claim in held(generator, demand) if claim.lease)
 
 
-def leave_in_outbox(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
+def leave_in_journal(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
     """Write a demand into the journal, as a killed generator would leave it there."""
     slot = Slot(settings.data_home(str(repo)))
     slot.journal.append([JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
@@ -144,7 +144,7 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     with rig.running(bare, runtime=clock) as generator:
         rig.book(generator, put("d", 60))
     # by the record, the lease ended 40 s ago; the renewal came before, while no generator ran
-    leave_in_outbox(bare, "op-renew", renew("d"), clock.now() + timedelta(seconds=50))
+    leave_in_journal(bare, "op-renew", renew("d"), clock.now() + timedelta(seconds=50))
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:
         rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")

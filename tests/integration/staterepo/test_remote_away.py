@@ -64,7 +64,7 @@ def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
     rig.assert_sound(bare)
 
 
-def test_what_waits_in_the_outbox_is_judged_on_what_the_remote_has_become(
+def test_what_waits_in_the_journal_is_judged_on_what_the_remote_has_become(
     url: str, bare: Path, tmp_path: Path
 ) -> None:
     """While two joins wait in the journal, another generator books one of them and a third."""

@@ -61,7 +61,7 @@ def test_while_another_generator_writes_all_the_time(bare: Path) -> None:
     rig.assert_sound(bare)
 
 
-def test_what_a_crash_left_in_the_outbox_is_carried_out_at_the_next_start(
+def test_what_a_crash_left_in_the_journal_is_carried_out_at_the_next_start(
     bare: Path, drivers: rig.Drivers
 ) -> None:
     with rig.running(bare) as generator:

@@ -27,8 +27,7 @@ def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
 def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
     """Follow each topic through both clients of its connection.
 
-    Return, for each connection, the ROS topic at the target by the ROS topic at the source and the
-    MQTT topic.
+    Return connection → (ROS topic at the source, MQTT topic) → ROS topic at the target.
     """
     deployments = books.objects("Deployment")
     ways: dict[str, dict[str, dict[str, str]]] = {}

@@ -78,9 +78,10 @@ def running(repo: MemoryRepo) -> Books:
 
 
 class Recorded:
-    """A recorded table (the books, or what runs) after each step: in the reference, and here.
+    """A table of the recorded run: the books, or what runs.
 
-    A recorded step has only the changes.
+    ``there`` is the table in the reference after a step, ``here`` the one that DemandOps must have.
+    The record of a step lists only what changed in ``there``, and what differs in ``here``.
     """
 
     def __init__(self, name: str) -> None:

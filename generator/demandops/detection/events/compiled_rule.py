@@ -79,12 +79,12 @@ class ThresholdRule(CompiledRule):
         self.field, self._limits = limits.field, limits
 
     def starts(self, value: float) -> bool:
-        """Return whether the condition starts at a value."""
+        """Return whether the condition starts when an entity reports this value."""
         above, below = self._limits.above, self._limits.below
         return (above is not None and value > above) or (below is not None and value < below)
 
     def stops(self, value: float) -> bool:
-        """Return whether the condition stops at a value."""
+        """Return whether the condition stops when an entity reports this value."""
         is_low = value <= self._limits.stop
         return is_low if self._limits.above is not None else value >= self._limits.stop
 

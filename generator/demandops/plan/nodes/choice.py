@@ -78,8 +78,8 @@ def with_overridden_nodes(app: Application, world: World) -> Application:
 def shares(service: Service, one: Application, other: Application) -> bool:
     """Return whether two applications share the instances of a service that runs for each topic.
 
-    They do if they have the same appdef, node and separate version. The generator then tries to
-    place the service on one node for both applications.
+    They do if they have the same appdef and node; a separate instance shares only with those of
+    its version. The generator then tries to place the service on one node for both applications.
     """
     of = ((app.appdef, app.node, app.own_version) for app in (one, other))
     return service.scope == "topic" and len({*of}) == 1

@@ -150,7 +150,7 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
     Args:
         repo: the repository.
         commits: the commits to verify, oldest first.
-        whole: whether each commit is verified whole, and none by differences.
+        whole: whether all commits are verified whole; otherwise most are verified by differences.
     """
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
