@@ -22,19 +22,17 @@ from demandops.quoting import one_line, quoted
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt, Ticket
 from demandops_interfaces.srv import GetBookkeeping
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
-from demandops_ros.action_endpoints import DEEP_QOS, OtherServers
+from demandops_ros.action_endpoints import DEEP_QOS, LastingResults, OtherServers
 from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
 from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
-_RESULT_KEPT_S = 900
-"""How many seconds a client may ask for a goal's result; rclpy's default is only ten."""
 _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
@@ -112,8 +110,8 @@ class DemandNode(Node):  # type: ignore[misc]
         others = OtherServers(self, (action_name, demand_action_name))
         self._diagnostics = Diagnostics(self, generator, others)
 
-    def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> ActionServer:
-        return ActionServer(
+    def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
+        return LastingResults(
             self,
             adapter.action,
             name,
@@ -126,7 +124,6 @@ class DemandNode(Node):  # type: ignore[misc]
             result_service_qos_profile=DEEP_QOS,
             cancel_service_qos_profile=DEEP_QOS,
             feedback_pub_qos_profile=DEEP_QOS,
-            result_timeout=_RESULT_KEPT_S,
         )
 
     def close(self) -> None:
