@@ -10,7 +10,7 @@ may touch any subject: no demand overtakes it, and it overtakes no demand.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
 class _Place:
     """The place of a demand in the queue.
 
-    ``number`` counts the arrivals. ``subjects`` is None if the demand may touch any subject.
+    ``number`` is the place in the order of arrival. ``subjects`` is None if the demand may touch any subject.
     ``is_left``: the demand has left the queue.
     """
 
@@ -57,12 +57,28 @@ class FairQueue:
         self._arrived += 1
         place = _Place(self._arrived, ticket, subjects_of(ticket.goal))
         self._places[ticket] = place
-        lane = "" if self._in_order else requester_of(ticket.goal)
-        self._lanes.setdefault(lane, deque()).append(place)
+        self._lanes.setdefault(self._lane(ticket), deque()).append(place)
         for subject in place.subjects or ():
             self._subjects.setdefault(subject, deque()).append(place)
         if place.subjects is None:
             self._barriers.append(place)
+
+    def put_back(self, tickets: Sequence[Ticket]) -> None:
+        """Put demands that left the queue back to its front, in the order in which they left."""
+        first = min((place.number for place in self._places.values()), default=1) - len(tickets)
+        places = {
+            ticket: _Place(number, ticket, subjects_of(ticket.goal))
+            for number, ticket in enumerate(tickets, start=first)
+        }
+        lanes = dict.fromkeys(map(self._lane, tickets))
+        self._lanes = {name: self._lanes.pop(name, deque()) for name in lanes} | self._lanes
+        for place in reversed(places.values()):
+            self._lanes[self._lane(place.ticket)].appendleft(place)
+            for subject in place.subjects or ():
+                self._subjects.setdefault(subject, deque()).appendleft(place)
+            if place.subjects is None:
+                self._barriers.appendleft(place)
+        self._places = places | self._places
 
     def remove(self, tickets: Collection[Ticket]) -> None:
         """Remove demands; ignore those that are not in the queue."""
@@ -91,6 +107,9 @@ class FairQueue:
                 self._forget(first)
                 return first.ticket
             first = before
+
+    def _lane(self, ticket: Ticket) -> str:
+        return "" if self._in_order else requester_of(ticket.goal)
 
     def _before(self, place: _Place) -> _Place | None:
         """Return the place of a demand that must leave the queue before ``place``, or None."""
