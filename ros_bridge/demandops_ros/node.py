@@ -40,7 +40,11 @@ _SHALLOW = (
     f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
 )
 _MOST_READERS = 4
-"""How many calls of the bookkeeping service to answer at once; each may read the whole history."""
+"""How many calls of the bookkeeping service may wait for their answers.
+
+Each may read the whole history. One is answered after the other, because several threads that
+compute would hold up the demands much longer.
+"""
 
 
 @dataclass(eq=False)
@@ -92,6 +96,7 @@ class DemandNode(Node):  # type: ignore[misc]
         """The goals without a result, by ``id()`` of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
+        self._last_reading: Future | None = None
         # a separate callback group, so that a waiting service call does not block the events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
@@ -143,18 +148,22 @@ class DemandNode(Node):  # type: ignore[misc]
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response
-        self._readers += 1
-        done = Future(executor=self.executor)
+        before, done = self._last_reading, Future(executor=self.executor)
 
         def work() -> None:
             filled = fill_response(self._generator, request, response)
             self._in_executor(partial(done.set_result, filled))
 
-        REAL.start_thread("bookkeeping", work)
+        self._readers, self._last_reading = self._readers + 1, done
         try:
+            if before is not None and not before.done():
+                await before
+            REAL.start_thread("bookkeeping", work)
             return await done
         finally:
             self._readers -= 1
+            if not done.done():  # the thread did not start
+                done.set_result(None)
 
     # ---- callbacks of the action server, in the executor's thread ----
 

@@ -24,8 +24,8 @@ _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
 class _Place:
     """The place of a demand in the queue.
 
-    ``number`` is the place in the order of arrival. ``subjects`` is None if the demand may touch any subject.
-    ``is_left``: the demand has left the queue.
+    ``number`` is the place in the order of arrival. ``subjects`` is None if the demand may touch
+    any subject. ``is_left``: the demand has left the queue.
     """
 
     number: int
