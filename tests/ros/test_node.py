@@ -277,6 +277,28 @@ def test_bookkeeping_is_answered_over_ros(shared: Served, caller: Client) -> Non
     )
 
 
+def test_calls_for_the_bookkeeping_are_answered_one_after_the_other(
+    shared: Served, caller: Client
+) -> None:
+    first = caller.call(connection(1005)).message.removeprefix("booked: ")
+    service = caller.node.create_client(GetBookkeeping, "/demandops/get_bookkeeping")
+    caller.wait(service.service_is_ready)
+    threads = Path(f"/proc/{shared.process.pid}/task")
+    idle, most, answers = len(list(threads.iterdir())), 0, list[Any]()
+    for _ in range(10):
+        calls = [service.call_async(GetBookkeeping.Request(at=first)) for _ in range(5)]
+        end = time.monotonic() + 60
+        while not all(call.done() for call in calls):
+            assert time.monotonic() < end
+            caller.executor.spin_once(timeout_sec=0.001)
+            most = max(most, len(list(threads.iterdir())))
+        answers += [call.result() for call in calls]
+    assert most <= idle + 2, "one reads, and the one before it may still be ending"
+    assert sum(answer.ok for answer in answers) >= 40
+    refused = {answer.message for answer in answers if not answer.ok}
+    assert refused <= {"4 calls are being answered; try again later"}
+
+
 def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are_signed(
     serve: Serve,
     ros_domain: int,
