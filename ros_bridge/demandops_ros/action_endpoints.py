@@ -223,8 +223,8 @@ class OtherServers:
             now = self._others(action)
             if now and now != others:
                 self._node.get_logger().warning(
-                    f"{', '.join(now)} serves {action} too: a client may get an answer of either; "
-                    "give each node an action name of its own"
+                    f"{', '.join(now)} serves {action} too: a client may get an answer of "
+                    "either, or none; give each node an action name of its own"
                 )
             elif others and not now:
                 self._node.get_logger().info(f"no other node serves {action} any more")
