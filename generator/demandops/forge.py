@@ -31,12 +31,14 @@ PullRequestState = Literal["open", "merged", "closed"]
 class ForgeError(DemandOpsError):
     """Raised when a forge fails or refuses; ``status`` is its HTTP status, if it answered.
 
-    No message contains the token.
+    ``asks_to_wait``: the forge got too many calls. No message contains the token.
     """
 
-    def __init__(self, message: str, status: int | None = None) -> None:
+    def __init__(
+        self, message: str, status: int | None = None, *, asks_to_wait: bool = False
+    ) -> None:
         super().__init__(message)
-        self.status = status
+        self.status, self.asks_to_wait = status, asks_to_wait
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,8 @@ class Forge(ABC):
             reason = _reason(data if isinstance(data, dict) else {"message": answer.reason})
             moved = "; redirects are not followed: check the API's address"
             remedy = moved if answer.is_redirect else ""
-            raise ForgeError(f"{where}: {answer.status} {reason}{remedy}", answer.status)
+            text = f"{where}: {answer.status} {reason}{remedy}"
+            raise ForgeError(text, answer.status, asks_to_wait=answer.asks_to_wait)
         if data is _NO_JSON:
             raise ForgeError(f"{where}: the answer is not JSON; check the API's address")
         return data

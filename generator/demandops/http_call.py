@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import httpx
 
 _MOST_BYTES = 4_000_000
+_TOO_MANY_REQUESTS = 429
 
 for _name in ("httpx", "httpcore"):  # they log URLs and headers
     logging.getLogger(_name).setLevel(logging.WARNING)
@@ -34,11 +35,16 @@ class NoAnswer(DemandOpsError):
 
 @dataclass(frozen=True, slots=True)
 class HttpAnswer:
-    """An answer: its status, the status in words, and the body."""
+    """An answer: its status, the status in words, and the body.
+
+    ``asks_to_wait``: the service got too many calls. Some services then answer 429, others (GitHub)
+    403 with headers that say so.
+    """
 
     status: int
     reason: str
     body: bytes
+    asks_to_wait: bool = False
 
     @property
     def is_success(self) -> bool:
@@ -80,7 +86,14 @@ def call(
                     raise NoAnswer(f"the answer is longer than {_MOST_BYTES} bytes; check the URL")
                 if REAL.monotonic() > end:
                     raise NoAnswer(_too_slow(timeout))
-            return HttpAnswer(answer.status_code, answer.reason_phrase, content)
+            return HttpAnswer(
+                answer.status_code,
+                answer.reason_phrase,
+                content,
+                answer.status_code == _TOO_MANY_REQUESTS
+                or (answer.is_error and "retry-after" in answer.headers)
+                or (answer.is_error and answer.headers.get("x-ratelimit-remaining") == "0"),
+            )
     except httpx.TimeoutException:
         raise NoAnswer(_too_slow(timeout)) from None
     except httpx.TransportError as error:

@@ -1,14 +1,15 @@
-"""A client that sends goals of an action, and a search for other nodes that serve the action."""
+"""The ends of actions: a client that sends goals, a server, and a search for other servers."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import rclpy
 from action_msgs.msg import GoalStatus
 from demandops.runtime import REAL
-from rclpy.action import ActionClient
+from rclpy.action import ActionClient, ActionServer
 from rclpy.action.client import ClientGoalHandle
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -25,6 +26,13 @@ _UNHEARD_S = 5.0
 normally responds within milliseconds."""
 
 _ASK_AGAIN_S = 0.2
+
+_WITH_GOAL_S = 10
+"""How many seconds ROS keeps a goal that has ended."""
+_RESULT_S = 900
+"""How many seconds longer :class:`LastingResults` keeps the goal's result."""
+_MOST_RESULTS = 2_000
+"""How many results :class:`LastingResults` keeps at most; then it forgets the oldest."""
 
 
 class DemandError(Exception):
@@ -193,6 +201,43 @@ class GoalSender:
         return DemandError("timeout", text)
 
 
+class LastingResults(ActionServer):  # type: ignore[misc]
+    """An action server that keeps results longer than goals, for clients that ask late.
+
+    Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each goal that
+    it keeps makes every other goal slower, here and in every client. Therefore ROS keeps goals for
+    ten seconds only, as by default, and this class keeps their results.
+
+    The class overrides methods that rclpy calls internally. If a version of rclpy does not call
+    them, results are kept for ten seconds.
+    """
+
+    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401
+        """Start the server; the arguments are those of :class:`ActionServer`."""
+        self._lasting: OrderedDict[bytes, tuple[float, Any]] = OrderedDict()
+        super().__init__(*args, result_timeout=_WITH_GOAL_S, **options)
+
+    async def _execute_expire_goals(self, expired_goals: Any) -> None:  # noqa: ANN401
+        now = REAL.monotonic()
+        for goal in expired_goals:
+            id = bytes(goal.goal_id.uuid)
+            self._lasting[id] = (now, self._result_futures[id])
+        while self._lasting:
+            oldest, _ = next(iter(self._lasting.values()))
+            if now - oldest <= _RESULT_S and len(self._lasting) <= _MOST_RESULTS:
+                break
+            self._lasting.popitem(last=False)
+        await super()._execute_expire_goals(expired_goals)
+
+    async def _execute_get_result_request(self, request: Any) -> None:  # noqa: ANN401
+        header, asked = request
+        id = bytes(asked.goal_id.uuid)
+        if id in self._lasting and id not in self._goal_handles:
+            self._send_result_response(header, self._lasting[id][1])
+        else:
+            await super()._execute_get_result_request(request)
+
+
 class OtherServers:
     """Finds other nodes that serve the same actions as ``node``, and logs changes."""
 
@@ -207,8 +252,8 @@ class OtherServers:
             now = self._others(action)
             if now and now != others:
                 self._node.get_logger().warning(
-                    f"{', '.join(now)} serves {action} too: a client may get an answer of either; "
-                    "give each node an action name of its own"
+                    f"{', '.join(now)} serves {action} too: a client may get an answer of "
+                    "either, or none; give each node an action name of its own"
                 )
             elif others and not now:
                 self._node.get_logger().info(f"no other node serves {action} any more")

@@ -22,19 +22,17 @@ from demandops.quoting import one_line, quoted
 from demandops.runtime import REAL
 from demandops.service import Generator, Receipt, Ticket
 from demandops_interfaces.srv import GetBookkeeping
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 
-from demandops_ros.action_endpoints import DEEP_QOS, OtherServers
+from demandops_ros.action_endpoints import DEEP_QOS, LastingResults, OtherServers
 from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
 from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
-_RESULT_KEPT_S = 900
-"""How many seconds a client may ask for a goal's result; rclpy's default is only ten."""
 _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
@@ -42,7 +40,11 @@ _SHALLOW = (
     f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
 )
 _MOST_READERS = 4
-"""How many calls of the bookkeeping service to answer at once; each may read the whole history."""
+"""How many calls of the bookkeeping service may wait for their answers.
+
+Each may read the whole history. One is answered after the other, because several threads that
+compute would hold up the demands much longer.
+"""
 
 
 @dataclass(eq=False)
@@ -94,6 +96,7 @@ class DemandNode(Node):  # type: ignore[misc]
         """The goals without a result, by ``id()`` of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
+        self._last_reading: Future | None = None
         # a separate callback group, so that a waiting service call does not block the events
         self._wake = self.create_guard_condition(
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
@@ -112,8 +115,8 @@ class DemandNode(Node):  # type: ignore[misc]
         others = OtherServers(self, (action_name, demand_action_name))
         self._diagnostics = Diagnostics(self, generator, others)
 
-    def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> ActionServer:
-        return ActionServer(
+    def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
+        return LastingResults(
             self,
             adapter.action,
             name,
@@ -126,7 +129,6 @@ class DemandNode(Node):  # type: ignore[misc]
             result_service_qos_profile=DEEP_QOS,
             cancel_service_qos_profile=DEEP_QOS,
             feedback_pub_qos_profile=DEEP_QOS,
-            result_timeout=_RESULT_KEPT_S,
         )
 
     def close(self) -> None:
@@ -146,18 +148,22 @@ class DemandNode(Node):  # type: ignore[misc]
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response
-        self._readers += 1
-        done = Future(executor=self.executor)
+        before, done = self._last_reading, Future(executor=self.executor)
 
         def work() -> None:
             filled = fill_response(self._generator, request, response)
             self._in_executor(partial(done.set_result, filled))
 
-        REAL.start_thread("bookkeeping", work)
+        self._readers, self._last_reading = self._readers + 1, done
         try:
+            if before is not None and not before.done():
+                await before
+            REAL.start_thread("bookkeeping", work)
             return await done
         finally:
             self._readers -= 1
+            if not done.done():  # the thread did not start
+                done.set_result(None)
 
     # ---- callbacks of the action server, in the executor's thread ----
 

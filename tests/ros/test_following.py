@@ -100,8 +100,8 @@ def test_another_node_that_serves_the_same_action_is_noticed(
     caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.OK))
     caller.wait(lambda: len(told()) == 2)
     assert told() == [
-        f"/test_client serves {DEFAULT_ACTION_NAME} too: a client may get an answer of either; "
-        "give each node an action name of its own",
+        f"/test_client serves {DEFAULT_ACTION_NAME} too: a client may get an answer of either, "
+        "or none; give each node an action name of its own",
         f"no other node serves {DEFAULT_ACTION_NAME} any more",
     ]
 

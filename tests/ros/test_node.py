@@ -16,11 +16,14 @@ from typing import Any
 
 import pytest
 import rclpy
+from action_msgs.msg import GoalStatusArray
 from builtin_interfaces.msg import Time
 from demandops.quoting import is_visible
+from demandops.settings import DEFAULT_ACTION_NAME
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.ros_process import RosLogHandler
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import qos_profile_action_status_default
 from rosgraph_msgs.msg import Clock
 
 from examples.experiment import paper
@@ -129,7 +132,7 @@ def test_a_goal_that_the_journal_cannot_keep_is_rejected_and_the_log_says_why(
     assert client.call(connection(3)).status == "succeeded"
 
 
-def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy(
+def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy_but_its_goal_is_not(
     serve: Serve, client: Client
 ) -> None:
     serve(None, "--ros-args", "-p", "use_sim_time:=true")
@@ -137,6 +140,13 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy(
     heard: list[Any] = []
     client.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
 
+    listed: list[GoalStatusArray] = []
+    client.node.create_subscription(
+        GoalStatusArray,
+        f"{DEFAULT_ACTION_NAME}/_action/status",
+        listed.append,
+        qos_profile_action_status_default,
+    )
     told = 0
 
     def pass_time(seconds: int) -> None:
@@ -159,6 +169,15 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy(
     again = first.handle.get_result_async()
     client.wait(again.done)
     assert again.result().result.message == first.message
+    # each goal that ROS still lists would make all goals slower
+    second = client.call(connection(2))
+    newest = bytes(second.handle.goal_id.uuid)
+
+    def lists_only_the_newest() -> bool:
+        goals = listed[-1].status_list if listed else []
+        return [bytes(goal.goal_info.goal_id.uuid) for goal in goals] == [newest]
+
+    client.wait(lists_only_the_newest)
 
 
 def test_a_goal_sent_again_succeeds_without_a_commit(shared: Served, caller: Client) -> None:
@@ -256,6 +275,28 @@ def test_bookkeeping_is_answered_over_ros(shared: Served, caller: Client) -> Non
         "'nonsense' is neither a commit of the state repo nor a time; `demandops log` lists the "
         "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
     )
+
+
+def test_calls_for_the_bookkeeping_are_answered_one_after_the_other(
+    shared: Served, caller: Client
+) -> None:
+    first = caller.call(connection(1005)).message.removeprefix("booked: ")
+    service = caller.node.create_client(GetBookkeeping, "/demandops/get_bookkeeping")
+    caller.wait(service.service_is_ready)
+    threads = Path(f"/proc/{shared.process.pid}/task")
+    idle, most, answers = len(list(threads.iterdir())), 0, list[Any]()
+    for _ in range(10):
+        calls = [service.call_async(GetBookkeeping.Request(at=first)) for _ in range(5)]
+        end = time.monotonic() + 60
+        while not all(call.done() for call in calls):
+            assert time.monotonic() < end
+            caller.executor.spin_once(timeout_sec=0.001)
+            most = max(most, len(list(threads.iterdir())))
+        answers += [call.result() for call in calls]
+    assert most <= idle + 2, "one reads, and the one before it may still be ending"
+    assert sum(answer.ok for answer in answers) >= 40
+    refused = {answer.message for answer in answers if not answer.ok}
+    assert refused <= {"4 calls are being answered; try again later"}
 
 
 def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are_signed(

@@ -167,6 +167,15 @@ class Demands:
             room = min(limit - len(batch), len(self._waiting))
             batch += [self._waiting.popleft() for _ in range(room)]
 
+    def put_back(self, batch: list[Ticket]) -> None:
+        """Move all demands of a batch back to the front of the queue.
+
+        Other requesters, of whom demands arrived meanwhile, then have their turn earlier.
+        """
+        with self._changed:
+            self._waiting.put_back([each for each in batch if each not in self._taken_back])
+            batch.clear()
+
     # ---- changes of state ----
 
     def arrive(self, ticket: Ticket) -> None:

@@ -10,7 +10,7 @@ a decommission may touch any subject: no demand overtakes it, and it overtakes n
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,12 +57,28 @@ class FairQueue:
         self._arrived += 1
         queued = _Queued(self._arrived, ticket, subjects_of(ticket.goal))
         self._queued[ticket] = queued
-        lane = "" if self._in_order else requester_of(ticket.goal)
-        self._lanes.setdefault(lane, deque()).append(queued)
+        self._lanes.setdefault(self._lane(ticket), deque()).append(queued)
         for subject in queued.subjects or ():
             self._subjects.setdefault(subject, deque()).append(queued)
         if queued.subjects is None:
             self._barriers.append(queued)
+
+    def put_back(self, tickets: Sequence[Ticket]) -> None:
+        """Put demands that left the queue back to its front, in the order in which they left."""
+        first = min((one.number for one in self._queued.values()), default=1) - len(tickets)
+        again = {
+            ticket: _Queued(number, ticket, subjects_of(ticket.goal))
+            for number, ticket in enumerate(tickets, start=first)
+        }
+        lanes = dict.fromkeys(map(self._lane, tickets))
+        self._lanes = {name: self._lanes.pop(name, deque()) for name in lanes} | self._lanes
+        for queued in reversed(again.values()):
+            self._lanes[self._lane(queued.ticket)].appendleft(queued)
+            for subject in queued.subjects or ():
+                self._subjects.setdefault(subject, deque()).appendleft(queued)
+            if queued.subjects is None:
+                self._barriers.appendleft(queued)
+        self._queued = again | self._queued
 
     def remove(self, tickets: Collection[Ticket]) -> None:
         """Remove demands; ignore those that are not in the queue."""
@@ -91,6 +107,9 @@ class FairQueue:
                 self._forget(first)
                 return first.ticket
             first = before
+
+    def _lane(self, ticket: Ticket) -> str:
+        return "" if self._in_order else requester_of(ticket.goal)
 
     def _before(self, queued: _Queued) -> _Queued | None:
         """Return a demand that must leave the queue before ``queued``, or None."""

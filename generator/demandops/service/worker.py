@@ -18,7 +18,12 @@ from demandops.service.evaluation import Evaluator
 from demandops.service.fault_log import FaultLog
 from demandops.service.remote_status import RemoteMonitor
 from demandops.service.ticket import Ticket
-from demandops.service.timing.backoff import LIMIT_LOCAL, LIMIT_REMOTE, Backoff
+from demandops.service.timing.backoff import (
+    LIMIT_LOCAL,
+    LIMIT_REMOTE,
+    LONGEST_EVALUATION_S,
+    Backoff,
+)
 from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.service.timing.own_work import OwnWork
 from demandops.service.timing.polling import PollTimer
@@ -176,7 +181,7 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        The batch is empty afterwards.
+        The batch is empty afterwards; what took too long to evaluate is in the queue again.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -240,8 +245,11 @@ class Worker:
         if commits.start.commit != tip:
             return None
         began = self._runtime.monotonic()
-        for ticket in part:
+        for number, ticket in enumerate(part):
             self._require_not_ending()
+            if number and self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
+                part, left = part[:number], part[number:] + left
+                break
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluated(commits, ticket))
             if commits.is_empty:
@@ -249,6 +257,8 @@ class Worker:
         if not left:
             for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
                 results.append(self._evaluated(commits, ticket))
+                if self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
+                    break
         evaluated = self._runtime.monotonic()
         if commits.is_empty and not self._tip_is_fresh:
             # nothing to push, so only a fetch shows whether the remote has moved
@@ -257,6 +267,7 @@ class Worker:
                 return None
         if self._publish_commits(commits, results, certain):
             batch[:] = left
+            self._demands.put_back(batch)
             backoff.published()
             return None
         log.info("the state repo has moved; evaluating %d demands again", len(results))

@@ -117,6 +117,23 @@ def test_a_requester_may_have_only_so_many_proposals(
         assert sorted([branch, other.branch]) == branches(bare)
 
 
+def test_a_demand_waits_for_few_of_the_branches_that_are_pushed_for_others(
+    bare: Path, person: Person
+) -> None:
+    slow = {"name": "slow", "requesters": ["station*"], "approval": "required"}
+    person.policy(rules=[slow, {"name": "others", "requesters": ["vehicle*"]}])
+    rig.hook(bare, "pre-receive", "grep -q heads/demand/ && sleep 0.3; exit 0")
+    with rig.running(f"file://{bare}") as generator:
+        proposed = [
+            Proposed(generator, goals.put(f"slow{number}", "station00")) for number in range(12)
+        ]
+        rig.wait_until(lambda: branches(bare), "the first branch is pushed")
+        rig.book(generator, goals.put("quick", "vehicle00"))
+        assert len(branches(bare)) < 10
+        assert sorted(each.branch for each in proposed) == branches(bare)
+        rig.book(generator, goals.put("another", "vehicle00"))
+
+
 def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Person) -> None:
     before = rig.tip(bare)
     with rig.running(url) as generator:

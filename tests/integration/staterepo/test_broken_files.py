@@ -7,6 +7,7 @@ restart the same files are in effect, and every commit verifies by its trailers.
 from __future__ import annotations
 
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -16,6 +17,7 @@ import pytest
 import yaml
 from demandops.service import Generator
 from demandops.settings import GENERATED_ROOTS
+from demandops.staterepo.history import authorship
 from demandops.staterepo.load import snapshot, state_in_effect
 
 from tests.kit import rig
@@ -301,6 +303,27 @@ def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_cal
         }
         assert not any("evil" in one or "link" in one or "377" in one for one in entries())
     rig.assert_sound(bare)
+
+
+def test_with_many_broken_files_a_demand_reads_no_history(
+    bare: Path, person: Person, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    origin_of = authorship.fault_origin
+
+    def fault_origin(*args: Any) -> Callable[[str], tuple[str, str] | None]:
+        origin = origin_of(*args)
+        return lambda path: (asked.append(path), origin(path))[1]
+
+    monkeypatch.setattr(authorship, "fault_origin", fault_origin)
+    with rig.running(bare) as generator:
+        person.change({f"overrides/o{number:03}.yaml": "a: [" for number in range(150)})
+        rig.book(generator, goal(1))
+        assert len(generator.snapshot.problems) == 150
+        assert len(asked) >= 100
+        asked.clear()
+        rig.book(generator, goal(2), goal(3))
+        assert asked == []
 
 
 def test_a_broken_file_is_judged_once_and_not_on_each_demand(

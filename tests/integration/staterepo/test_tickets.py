@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from demandops.runtime import Runtime
 from demandops.service import Generator, Ticket
 
 from tests.kit import rig
+from tests.kit.clock import Clock
+from tests.kit.goals import put
 from tests.kit.limits import files_end_at
 from tests.kit.rig import Drivers, Gate, Stages, demand, goal
 
@@ -224,6 +227,35 @@ def test_a_requester_may_have_only_so_many_demands_waiting(bare: Path) -> None:
         for ticket in (first, second, other):
             rig.receipt(ticket)
         assert rig.book(generator, goal(1))[0].outcome == "unchanged"
+
+
+def test_a_demand_waits_for_few_slow_ones_of_another_requester(bare: Path) -> None:
+    clock, gate = Clock(), Gate()
+    begun, begun_before = list[str](), dict[str, int]()
+
+    def slow(stage: str, text: str) -> None:
+        if stage == "admitted":
+            begun.append(text)
+            clock.pass_(0.6)
+
+    def quick(name: str, stage: str, text: str) -> None:
+        if stage == "pushed":
+            begun_before[name] = len(begun)
+
+    with rig.running(bare, runtime=clock) as generator:
+        first = generator.submit(put("first"), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        tickets = [first]
+        for number in range(12):
+            made = put(f"slow{number}", "station00")
+            tickets.append(generator.submit(made, listener=slow))
+        for name in ("vehicle01", "vehicle02"):
+            made = put(name, name)
+            tickets.append(generator.submit(made, listener=partial(quick, name)))
+        gate.open.set()
+        assert {rig.receipt(ticket).outcome for ticket in tickets} == {"booked"}
+    assert len(begun) == 12
+    assert max(begun_before.values()) <= 3
 
 
 def test_demands_are_counted_while_others_come_and_go(bare: Path) -> None:

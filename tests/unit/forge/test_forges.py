@@ -130,17 +130,53 @@ def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message
     assert str(error.value) == f"the token file {file}{message}"
 
 
-def test_a_forge_that_is_asked_too_often_is_left_alone_for_a_minute(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("status", "headers"),
+    [(429, {}), (403, {"Retry-After": "60"}), (403, {"X-RateLimit-Remaining": "0"})],
+)
+def test_a_forge_that_is_asked_too_often_is_left_alone_for_a_minute(
+    tmp_path: Path, status: int, headers: dict[str, str]
+) -> None:
+    (tmp_path / "token").write_text(TOKEN)
+    turns, told = Turns(1), list[str]()
+    slow_down = Answer.json({"message": "slow down"}, status, **headers)
+    with serving(lambda call: slow_down) as server:
+        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
+        proposals = Proposals.model_validate(at)
+        worker = ForgeWorker(tmp_path / "token", told.append, turns)
+        for branch in ("demand/x", "demand/y", "demand/z"):
+            worker.open(proposals, branch, "x", "x")
+        turns.sleep(59)
+        assert len(server.calls) == 1
+        assert told == ["demand/x", "demand/y", "demand/z"], "their requesters need not wait"
+        turns.sleep(2)
+        assert len(server.calls) == 2
+
+
+def test_a_forge_that_may_not_be_used_is_asked_again_at_the_usual_interval(tmp_path: Path) -> None:
     (tmp_path / "token").write_text(TOKEN)
     turns = Turns(1)
-    with serving(lambda call: Answer.json({"message": "slow down"}, 429)) as server:
+    with serving(lambda call: Answer.json({"message": "no"}, 403)) as server:
         at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
         worker = ForgeWorker(tmp_path / "token", lambda branch: None, turns)
         worker.open(Proposals.model_validate(at), "demand/x", "x", "x")
-        turns.sleep(59)
-        assert len(server.calls) == 1
-        turns.sleep(2)
+        turns.sleep(31)
         assert len(server.calls) == 2
+
+
+def test_while_a_forge_is_away_no_requester_waits_for_the_calls_of_others(tmp_path: Path) -> None:
+    (tmp_path / "token").write_text(TOKEN)
+    turns, told = Turns(1), list[tuple[str, int]]()
+    with serving(lambda call: Answer(200, b"<html>")) as server:
+        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
+        proposals = Proposals.model_validate(at)
+        worker = ForgeWorker(
+            tmp_path / "token", lambda branch: told.append((branch, len(server.calls))), turns
+        )
+        for branch in ("demand/x", "demand/y"):
+            worker.open(proposals, branch, "x", "x")
+        turns.sleep(1)
+        assert told == [("demand/x", 1), ("demand/y", 1)]
 
 
 def test_no_token_file_is_told_with_the_remedy() -> None:

@@ -66,6 +66,18 @@ def test_nothing_overtakes_what_may_touch_anything() -> None:
     assert order(*waiting) == ["a0", "a1", "all", "b0"]
 
 
+def test_what_was_put_back_comes_first_and_requesters_take_turns_again() -> None:
+    queue = FairQueue()
+    for each in (*(ticket(f"a{n}", "a", f"x{n}") for n in range(4)), ticket("b0", "b", "y")):
+        queue.append(each)
+    taken = [queue.popleft() for _ in range(4)]
+    assert [each.operation for each in taken] == ["a0", "b0", "a1", "a2"]
+    queue.append(ticket("c0", "c", "z"))
+    queue.put_back(taken[1:])
+    left = [queue.popleft().operation for _ in range(len(queue))]
+    assert left == ["b0", "a1", "c0", "a2", "a3"]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> None:
     random = Random(seed)
@@ -85,6 +97,12 @@ def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> 
         while waiting and random.random() < 0.3:
             left.append(queue.popleft())
             waiting.remove(left[-1])
+        if left and random.random() < 0.1:
+            count = random.randrange(min(3, len(left)))
+            left, back = left[: len(left) - count], left[len(left) - count :]
+            queue.put_back(back)
+            waiting += back
+            assert len(queue) == len(waiting)
     while waiting:
         left.append(queue.popleft())
         waiting.remove(left[-1])

@@ -55,6 +55,9 @@ from demandops.staterepo.write.proposal_branch import (
 
 log = logging.getLogger("demandops")
 
+_LONGEST_CHECK_S = 0.5
+"""How many seconds a check may go on while a demand waits; it may push many branches."""
+
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
 
@@ -229,7 +232,11 @@ class Approvals:
             for proposal in self._proposals.values():
                 if proposal.branch == branch:
                     proposal.checked_at = ""
-        for proposal in list(self._proposals.values()):
+        began, proposals = self._runtime.monotonic(), list(self._proposals.values())
+        for number, proposal in enumerate(proposals):
+            if number and self._must_pause(began):
+                self._check_next(proposals[number:])
+                break
             try:
                 if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
                     self._check(proposal, snapshot, heads)
@@ -243,6 +250,17 @@ class Approvals:
                 else:
                     self._end(proposal, error)
         self._timer.ended(str(snapshot.commit))
+
+    def _must_pause(self, began: float) -> bool:
+        """Return whether to interrupt a check that began at a time, because a demand waits."""
+        is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
+        return is_long and self._demands.has_waiting
+
+    def _check_next(self, proposals: list[Proposal]) -> None:
+        """Make a check due that begins with ``proposals``."""
+        first = set(proposals)
+        self._proposals = {k: p for k, p in self._proposals.items() if p in first} | self._proposals
+        self._changed.append(proposals[0].branch)
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Decide the verdict on a proposal, and carry it out."""

@@ -22,7 +22,6 @@ log = logging.getLogger("demandops")
 POLL_S = 30.0
 """The seconds between queries of the forge, which alone knows that a pull request was closed."""
 
-_TOO_MANY_REQUESTS = 429
 _REST_S = 60.0
 """The pause after a forge answers that it got too many requests."""
 
@@ -110,8 +109,11 @@ class ForgeWorker:
                     if str(error) != self._last_error:
                         log.warning("%s: %s", task.branch, error)
                     self._last_error = str(error)
-                    if error.status == _TOO_MANY_REQUESTS:
-                        self._remember(task, pull_request)
+                    if error.asks_to_wait or error.status is None:
+                        # no requester must wait until the forge answers again
+                        for each in (task, *self._tasks):
+                            self._remember(each, self._pull_requests.get(each.branch))
+                    if error.asks_to_wait:
                         self._tasks.appendleft(task)
                         self._runtime.sleep(_REST_S)
                         continue

@@ -26,6 +26,12 @@ The limit is higher for a remote, because a push takes about 50 ms. Moving a bra
 on this disk takes less than 1 ms.
 """
 
+LONGEST_EVALUATION_S = 1.0
+"""How many seconds to evaluate demands before those that are evaluated are published.
+
+The others go back to the queue, so that demands that arrived meanwhile take their turn.
+"""
+
 
 class Backoff:
     """The delays of one batch of demands."""

@@ -53,18 +53,20 @@ def with_origins(
 ) -> tuple[Problem, ...]:
     """Return a problem for each fault.
 
-    A known problem keeps its commit and author. ``origin`` finds those of a new problem.
+    A known problem keeps its commit and author. ``origin`` finds those of a new problem, but only
+    of those that :func:`write` lists: the others would be sought again for each demand.
     """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
+    found = sorted({(fault.file, fault.field, fault.message) for fault in faults})
     problems = []
-    for fault in sorted({(fault.file, fault.field, fault.message) for fault in faults}):
+    for fault in found[:_MOST]:
         file, field, message = map(one_line, fault)
         if (file, field, message) in existing:
             problems.append(existing[file, field, message])
             continue
         commit, author = origin(fault[0]) or ("", "")
         problems.append(Problem(file, field, message, commit, one_line(author)))
-    return tuple(problems)
+    return (*problems, *(Problem(*fault) for fault in found[_MOST:]))
 
 
 def write(problems: tuple[Problem, ...]) -> str | None:
