@@ -60,14 +60,14 @@ def _requesters(outcome: Outcome) -> Iterator[str]:
     inside: set[str] = set()
     for formed in outcome.formed:
         inside ^= {formed.vehicle}
-        if fault := differ(fleet.requesters(inside), formed.books):
+        if fault := differ(fleet.requesters(inside), formed.bookkeeping):
             yield f"{formed}: {fault}"
 
 
 def _as_in_the_paper(outcome: Outcome) -> Iterator[Check]:
     settings = outcome.settings
     if settings.seed == 0 and not settings.short and not settings.vanish:
-        found = [formed.books for formed in outcome.formed]
+        found = [formed.bookkeeping for formed in outcome.formed]
         table = [paper.expected(step) for step in range(1, len(paper.STEPS) + 1)]
         yield Check("the requesters are those of the paper's table", differ(table, found))
 

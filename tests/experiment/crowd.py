@@ -133,5 +133,5 @@ def _requesters(formed: Iterable[Formed], passing: Mapping[str, int]) -> Iterato
             inside[one.vehicle] = passing[one.vehicle]
         else:
             inside.pop(one.vehicle, None)
-        if one.books is not None and (fault := differ(requesters(inside), one.books)):
+        if one.bookkeeping is not None and (fault := differ(requesters(inside), one.bookkeeping)):
             yield f"{one}: {fault}"

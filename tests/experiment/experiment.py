@@ -193,7 +193,7 @@ class Experiment:
 
     def _released(self, since: str, expected: int) -> bool:
         """Return whether all demands are committed, and only the initial deployment is booked."""
-        return len(self._commits(since)) >= expected and not self._books(self._world.tip())
+        return len(self._commits(since)) >= expected and not self._bookkeeping(self._world.tip())
 
     def _is_settled(self, number: int, since: str) -> bool:
         """Return whether the first `number` events have had their consequences.
@@ -241,25 +241,25 @@ class Experiment:
             stays, lacks = sorted(lines - self._before), sorted(self._before - lines)
             raise AssertionError(f"after {seconds:.0f} s too much: {stays}, missing: {lacks}")
 
-    def _books(self, commit: str) -> dict[str, list[str]]:
+    def _bookkeeping(self, commit: str) -> dict[str, list[str]]:
         """Return the requesters of each service and connection after a commit.
 
         The result leaves out the initial deployment.
         """
         repository = str(self._rig.repository(self._world.name))
         options = ("--state-repo", repository, "--at", commit, "--output", "json")
-        books = json.loads(demandops(self._made("reader"), "bookkeeping", *options))
-        rows = paper.observed(books)
+        printed = json.loads(demandops(self._made("reader"), "bookkeeping", *options))
+        rows = paper.observed(printed)
         return {row: who for row, who in rows.items() if not row.endswith(" to cloud")}
 
     def _formed(self, since: str) -> Iterator[Formed]:
         """Yield a demand for each vehicle that a commit adds to or removes from the requesters."""
         stages, inside = self._cloud.commits(), set()
         for commit in self._commits(since):
-            books = self._books(commit)
-            now = {who for whos in books.values() for who in whos if who in routes.VEHICLES}
+            read = self._bookkeeping(commit)
+            now = {who for whos in read.values() for who in whos if who in routes.VEHICLES}
             for vehicle in sorted(now ^ inside):
-                yield Formed(commit, vehicle, vehicle in now, stages.get(commit, {}), books)
+                yield Formed(commit, vehicle, vehicle in now, stages.get(commit, {}), read)
             inside = now
 
     def _node_ids(self) -> dict[str, str]:

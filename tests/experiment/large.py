@@ -170,14 +170,17 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demands that the commits' trailers name; only some get `books`."""
+        """Yield the demand of each commit, by its trailers.
+
+        The bookkeeping is read only at some of the commits (:data:`_LOOKS`).
+        """
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
         for commit in commits:
             operation, *requesters = self._trailers(commit)
             (vehicle,) = self.passing.keys() & set(requesters)
-            books = self._books(commit) if commit in looks else None
-            yield Formed(commit, vehicle, operation == "join", stages.get(commit, {}), books)
+            read = self._bookkeeping(commit) if commit in looks else None
+            yield Formed(commit, vehicle, operation == "join", stages.get(commit, {}), read)
 
     def _trailers(self, commit: str) -> list[str]:
         keys = "".join(f"%(trailers:key={key},valueonly)%n" for key in ("Operation", "Requester"))

@@ -41,13 +41,17 @@ class Settings:
 
 @dataclass(frozen=True)
 class Formed:
-    """A demand of the detector: its commit, when it reached each stage, and the books after it."""
+    """A demand of the detector: its commit, and when it reached each stage.
+
+    `bookkeeping` has the requesters of each service and connection after the commit; None if it was
+    not read at this commit.
+    """
 
     commit: str
     vehicle: str
     joins: bool
     stages: dict[str, float]
-    books: dict[str, list[str]] | None  # None: the bookkeeping was not read
+    bookkeeping: dict[str, list[str]] | None
 
     def __str__(self) -> str:
         return f"{self.vehicle} {'joins' if self.joins else 'leaves'}"

@@ -274,11 +274,12 @@ def _savings(outcome: Outcome) -> str:
 def _demands(outcome: Outcome) -> str:
     rows = []
     for step, formed in zip(steps(outcome), outcome.formed, strict=False):
-        books = "<br>".join(
-            f"{escape(row)}: {escape(', '.join(who))}" for row, who in (formed.books or {}).items()
+        held = "<br>".join(
+            f"{escape(row)}: {escape(', '.join(who))}"
+            for row, who in (formed.bookkeeping or {}).items()
         )
-        if formed.books is None:
+        if formed.bookkeeping is None:
             continue
         at = f"{step.event.at - outcome.set_off:.1f} s"
-        rows.append((at, escape(str(formed)), formed.commit[:10], books or "nothing is demanded"))
+        rows.append((at, escape(str(formed)), formed.commit[:10], held or "nothing is demanded"))
     return _table(("event", "", "commit", "requesters after it"), rows)

@@ -112,7 +112,7 @@ BREAKS: dict[str, tuple[Callable[[Outcome], dict[str, Any]], str]] = {
     "no demand": (lambda run: {"formed": []}, "plain script"),
     "a demand too much": (lambda run: {"formed": [*run.formed, run.formed[0]]}, "plain script"),
     "other requesters": (
-        lambda run: {"formed": [replace(run.formed[0], books={}), run.formed[1]]},
+        lambda run: {"formed": [replace(run.formed[0], bookkeeping={}), run.formed[1]]},
         "requesters of every service",
     ),
     "no input": (lambda run: {"inputs": run.inputs[:1]}, "fusion subscribed"),

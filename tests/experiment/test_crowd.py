@@ -74,11 +74,11 @@ def test_each_vehicle_passes_one_intersection() -> None:
 
 def test_demands_of_different_vehicles_may_overtake_and_others_are_found() -> None:
     assert faults(formed()) == []
-    overtaken = [replace(one, books=None) for one in formed()]
+    overtaken = [replace(one, bookkeeping=None) for one in formed()]
     overtaken[0], overtaken[1] = overtaken[1], overtaken[0]
     assert faults(overtaken) == []
     assert faults(formed()[1:])[0].startswith("the detector formed")
-    wrong = [replace(formed()[0], books={}), *formed()[1:]]
+    wrong = [replace(formed()[0], bookkeeping={}), *formed()[1:]]
     assert faults(wrong) == [
         "the requesters of every service and connection are right after the demands that were "
         "looked at"

@@ -118,7 +118,10 @@ class Ran:
 
 
 class Rig:
-    """A state repo, and processes that book demands in it; with ``remote`` they use its URL."""
+    """A state repo, and processes that book demands in it.
+
+    With ``remote`` the processes address the repo by its URL, otherwise by its folder.
+    """
 
     def __init__(self, folder: Path, *, remote: bool) -> None:
         self.folder, self.remote = folder / "here", remote

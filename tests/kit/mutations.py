@@ -50,9 +50,10 @@ class Mutation(NamedTuple):
         return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the texts that a fault about a broken reference may quote.
+        """Return the keys on the path to the mistake, and all texts in the value it replaced.
 
-        These are the keys of the mistake's place and all texts in its former value.
+        If another field refers to what the mistake broke, the fault in that field quotes one of
+        these texts.
         """
         names = {str(part) for part in self.place}
         values = [self.value]

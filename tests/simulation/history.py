@@ -213,7 +213,10 @@ class History:
         return self._maker.any()
 
     def _tallied(self) -> Goal:
-        """Return a put, release or renewal for an instance on the node in two access domains."""
+        """Return a put, release or renewal of an application of the type `tally`.
+
+        The application runs on the node that is in two access domains.
+        """
         topics = self.chance.sample(range(4), self.chance.randrange(1, 5))
         inputs = {"ego_data": [{"topic": f"/e{one}", "source": "vehicle00"} for one in topics]}
         known = [one for one in self._sent if one.get("demand", "").startswith("tally")]

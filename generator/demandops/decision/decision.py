@@ -299,7 +299,7 @@ def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.N
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state after a service stops keeping replicas whose time is over.
+    """Return the state without a service's kept replicas whose time has ended.
 
     The second value is the changeset, which has the files to write.
 

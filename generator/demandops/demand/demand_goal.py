@@ -194,9 +194,10 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the path in the goal of a field of an item, for messages about this field.
+    """Return where a goal has a field of an application or connection, so that a fault can name it.
 
-    The requesters are a field of the goal, not of the item.
+    ``item`` is the path of the application or connection in the goal. The requesters are a field of
+    the goal itself.
     """
     if path.startswith("requesters"):
         return path

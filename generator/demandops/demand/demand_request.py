@@ -19,7 +19,7 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""A function from the path of a field in an item to its path in the goal, for messages.
+"""A function that maps the path of a field in an item to its path in the goal, which faults name.
 
 An example of the first path is ``inputs.ego_data[2].source``.
 """

@@ -88,10 +88,10 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the path in the message of a field of an application, for messages about this field.
+    """Return where a goal has a field of an application, so that a fault can name the place.
 
-    ``item`` is the application's path (``apps[0]``), and ``path`` is the field's path in
-    :class:`Application`. ``lists`` maps roles to the message's lists.
+    ``item`` is the application's path in the goal (``apps[0]``), and ``path`` is the field's path
+    in :class:`Application`. ``lists`` maps roles to the goal's lists of topics.
     """
     name, _, rest = path.partition(".")
     if name in ("id", "node"):
@@ -109,11 +109,11 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the path in the message of a field of a connection, for messages about this field.
+    """Return where a goal has a field of a connection, so that a fault can name the place.
 
-    ``item`` is the connection's path (``connections[0]``), and ``path`` is the field's path in
-    :class:`Connection`. The message has two lists of topics: the names at the source, and the names
-    at the target.
+    ``item`` is the connection's path in the goal (``connections[0]``), and ``path`` is the field's
+    path in :class:`Connection`. The goal has two lists of topics: the names at the source, and the
+    names at the target.
     """
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"

@@ -121,8 +121,8 @@ class MqttConnection(_Part):
         names = [targets[one].ros_topic for one in self.mqtt2ros.mqtt_topics if one in targets]
         return list(zip(self.ros2mqtt.ros_topics, names, strict=False))
 
-    def other_topics(self) -> list[str]:
-        """Return the topics that only earlier requests listed."""
+    def dropped_topics(self) -> list[str]:
+        """Return the topics that an earlier request listed, and the last request did not."""
         return sorted(set(self.ros2mqtt.__pydantic_extra__) - {*self.ros2mqtt.ros_topics})
 
 

@@ -179,7 +179,7 @@ class _Inventory:
         else:
             source, target, topics = spec.source, spec.target, spec.topics() or [("", "")]
             broker = self._broker(name, spec)
-            if more := spec.other_topics():
+            if more := spec.dropped_topics():
                 self.warnings.append(
                     f"{name}: earlier requests also listed {', '.join(more)}; its clients may "
                     "still carry these topics, so add to the map those that are needed"

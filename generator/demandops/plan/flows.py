@@ -123,10 +123,10 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
     version = version_of_instance(app, producer)
     for role in producer.roots:
         for one in app.inputs.get(role, ()):
-            told = distinguishing_text(config, role, one, version) if producer.root else ""
+            text = distinguishing_text(config, role, one, version) if producer.root else ""
             node = one.source if producer.at_source else node_of(app, producer, one.source)
             yield PublishedTopic(
-                published_topic(pattern, one.source, told), node, (role, one.topic, one.source)
+                published_topic(pattern, one.source, text), node, (role, one.topic, one.source)
             )
 
 

@@ -60,13 +60,14 @@ def distinguishing_text(config: Config, role: str, topic: InputTopic, version: s
 
 
 @lru_cache(maxsize=65_536)
-def published_topic(pattern: str, source: str, told: str) -> InputTopic:
+def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
     """Return the topic that a service publishes for ``source``.
 
-    ``told`` is the result of :func:`distinguishing_text`. A fusion reads hundreds of such topics,
-    so the results are cached.
+    ``distinguishing`` is the text from :func:`distinguishing_text`, by which the topic's name
+    differs from other names that are made from the same source. A fusion reads hundreds of such
+    topics, so the results are cached.
     """
-    return InputTopic(topic_name(pattern, naming.topic_part(source, told)), source)
+    return InputTopic(topic_name(pattern, naming.topic_part(source, distinguishing)), source)
 
 
 def topic_name(pattern: str, instance: str) -> str:

@@ -144,7 +144,10 @@ def test_every_golden_release_gives_what_the_server_takes(
 
 
 def templated(rig: Rig, chart: Path, values: Path, release: str) -> list[Manifest]:
-    """Return the manifests that helm renders for a chart, with the namespace of an install."""
+    """Return the manifests that helm renders for a chart.
+
+    `helm template` may leave out the namespace. An install would add it, so this function does too.
+    """
     text = rig.helm(
         "template", release, str(chart), f"--namespace={NAMESPACE}", f"--values={values}"
     )

@@ -1,5 +1,7 @@
 """Run the Go toolchain on one wrapper module, and report progress.
 
+A wrapper is a Go module under `tests/e2e/tools/` that pins the programs to build.
+
 Only this module runs `go`, and only `tools` uses it. A build follows the committed `go.mod` and
 `go.sum`, and ignores the caller's Go settings. It uses the installed Go and fetches no toolchain.
 It runs at the lowest priority, because a build with an empty cache uses two cores for about twenty
@@ -85,7 +87,7 @@ class Workspace:
 
     @property
     def module(self) -> Path:
-        """The folder of the wrapper's copy, with its vendor folder."""
+        """The folder with the copy of the wrapper; :meth:`vendor` adds the vendor folder to it."""
         return self.folder / "wrapper"
 
     def vendor(self, go: Go, wrapper: Path, report: Report) -> None:

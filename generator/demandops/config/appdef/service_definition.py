@@ -123,7 +123,9 @@ class ServiceDefinition(Deployed, FileModel):
                 "have 'nodes'"
             )
         if self.placement == "source" and self.scope == "cluster":
-            raise ValueError("scope 'cluster' runs at its nodes; leave out placement")
+            raise ValueError(
+                "with scope 'cluster' the service runs on the nodes in 'nodes'; leave out placement"
+            )
         if (self.each is None) is (self.scope == "topic"):
             raise ValueError("scope 'topic' needs 'each', and no other scope may have 'each'")
         if self.each and self.each not in self.inputs:

@@ -78,10 +78,14 @@ class _Proof:
         self._committed = _generated_files(commit.tree)
         self._render(())
 
-    def is_reconfigured(self, commit: Commit) -> bool:
-        """Return whether a commit changes configuration, ended overrides or the problem report."""
+    def can_advance_to(self, commit: Commit) -> bool:
+        """Return whether :meth:`advance` may be called with a later commit.
+
+        It may not if the configuration, the markers of ended overrides or the problem report
+        differ. Such a commit needs a new proof.
+        """
         roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
-        return trees.differ(self._commit.tree, commit.tree, roots)
+        return not trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
         """Advance to a later commit, and render the releases that its changes affect.
@@ -166,11 +170,11 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
             if whole or place == len(commits) or entry.first("In-Force"):
                 differing = _differing_whole(commit, _loaded(repo, entry))
             else:
-                if before is None or before.is_reconfigured(commit):
-                    proof = _Proof(_loaded(repo, entry), commit)
-                else:
+                if before is not None and before.can_advance_to(commit):
                     before.advance(commit)
                     proof = before
+                else:
+                    proof = _Proof(_loaded(repo, entry), commit)
                 differing = proof.differing()
         except _Unreadable as error:
             why = f"a file was not valid then: {error}"
