@@ -5,8 +5,10 @@ Each process is a fork of this one, which has imported all modules. This saves a
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -17,10 +19,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta, timezone
 from functools import cache
+from hashlib import sha256
+from itertools import count
 from pathlib import Path
+from uuid import NAMESPACE_OID, uuid5
 
 import yaml
+from demandops.runtime import Runtime
 
 from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
@@ -37,6 +44,18 @@ PLENTY_S = 60.0
 END_S = 8.0
 """How many seconds after SIGTERM a process is killed."""
 BEGIN = "/faults-begin"
+_FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
+"""The time of the first process. It stands still in a process and moves on with each.
+
+So a demand has the same commits each time: its calls keep their numbers, and a state of the disk
+that was met before is known again (:meth:`Rig.fingerprint`).
+"""
+_ADOPT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
+_CHANCE = re.compile(
+    r"(?<=pack_git2_)[0-9a-f]+?(?=idx|rev|$)|(?<=demandops-pack-)\w+|"
+    r"(?<=tmp_objdir-incoming-)\w+|(?<=tmp_obj_)\w+|(?<=tmp_pack_)\w+|(?<=tmp_idx_)\w+"
+)
+"""The parts of a file's name that a program chooses at random; nothing depends on them."""
 
 GIT = "git"
 """The value of ``Strace.at`` that traces each process of git by itself."""
@@ -50,11 +69,12 @@ if [ "$program" = git ]; then
 fi
 if [ -n "$FAULTS_AT" ]; then
   number=1
-  until mkdir "$FAULTS_TRACES/$command $number" 2>/dev/null; do number=$((number + 1)); done
+  set -C  # fails at a file that exists; the shell does this itself, mkdir would be a process
+  until true 2>/dev/null >"$FAULTS_TRACES/$command $number"; do number=$((number + 1)); done
   case "$FAULTS_AT" in git | "git $command $number")
     trace="$FAULTS_TRACES/$command $number"
-    pwd -P >"$trace/folder"
-    exec strace -y -o "$trace/calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
+    pwd -P >"$trace.folder"
+    exec strace -y -o "$trace.calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
     ;;
   esac
 fi
@@ -95,7 +115,10 @@ class GitTrace:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a process did: its exit code, its output, its traces, and how it hung if it did."""
+    """What a process did: its exit code, its output, its traces, and how it hung if it did.
+
+    ``lingers``: a process that it started, such as ``git push``, still ran when it had ended.
+    """
 
     code: int
     out: str
@@ -104,6 +127,7 @@ class Ran:
     roles: dict[int, str] = field(default_factory=dict)
     git: tuple[GitTrace, ...] = ()
     hangs: str = ""
+    lingers: bool = False
 
     @property
     def commit(self) -> str:
@@ -124,9 +148,13 @@ class Rig:
         self.scratch, self._template = folder / "scratch", folder / "template"
         self.state, self.home = self.folder / "state.git", self.folder / "home"
         self.address = self.state.as_uri() if remote else str(self.state)
+        self._runs = self._runs_of_template = 0
+        self.proved: set[object] = set()
+        """The states of the disk from which a restart was tried and found sound."""
         self.scratch.mkdir(parents=True)
         self._wrap_git()
         self.folder.mkdir()
+        ctypes.CDLL(None).prctl(_ADOPT_ORPHANS, 1)  # so that this process can tell who lingers
         self.must(self.demandops("init", str(self.state), "--bare"))
         began = time.monotonic()
         self.limit = PLENTY_S
@@ -157,11 +185,24 @@ class Rig:
         """Copy all files, for :meth:`restore`."""
         shutil.rmtree(self._template, ignore_errors=True)
         shutil.copytree(self.folder, self._template, symlinks=True)
+        self._runs_of_template = self._runs
 
     def restore(self) -> None:
         """Replace all files by those of the last :meth:`save`."""
         shutil.rmtree(self.folder)
         shutil.copytree(self._template, self.folder, symlinks=True)
+        self._runs = self._runs_of_template
+
+    def fingerprint(self) -> str:
+        """Return a digest of all that the next process can find: names, modes, bytes, its clock."""
+        told = sha256(str(self._runs).encode())
+        for path in sorted(self.folder.rglob("*")):
+            told.update(f"\0{_CHANCE.sub('*', str(path))}\0{path.lstat().st_mode}\0".encode())
+            if path.is_symlink():
+                told.update(os.readlink(path).encode())
+            elif path.is_file():
+                told.update(sha256(path.read_bytes()).digest())
+        return told.hexdigest()
 
     def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
         """Book the demand of a number; return what the process did."""
@@ -182,21 +223,26 @@ class Rig:
         traces.mkdir()
         environment = NO_GIT_CONFIG | {
             "DEMANDOPS_DATA_HOME": str(self.home),
-            "PATH": f"{self._git}:{os.environ['PATH']}",
-            "GIT_EXEC_PATH": str(self._git),
-            "FAULTS_EXEC": str(_git_core()),
-            "FAULTS_TRACES": str(traces),
-            "FAULTS_AT": "",
         }
         if strace is not None and strace.is_of_git:
-            environment |= {"FAULTS_AT": strace.at, "FAULTS_STRACE": " ".join(strace.options)}
+            environment |= {
+                "PATH": f"{self._git}:{os.environ['PATH']}",
+                "GIT_EXEC_PATH": str(self._git),
+                "FAULTS_EXEC": str(_git_core()),
+                "FAULTS_TRACES": str(traces),
+                "FAULTS_AT": strace.at,
+                "FAULTS_STRACE": " ".join(strace.options),
+            }
         told, tell = os.pipe()
         waits, go = os.pipe()
+        now = _FIRST_TIME + timedelta(minutes=self._runs)
+        self._runs += 1
         process = os.fork()
         if process == 0:
             os.close(told)
             os.close(go)
             os.environ.update(environment)
+            _repeat(now)
             _become(command, paths["out"], paths["err"], tell, waits)
         os.close(tell)
         os.close(waits)
@@ -257,7 +303,8 @@ class Rig:
         }
         if alone:
             texts["trace"] = "".join(f"{alone} {line}\n" for line in texts["trace"].splitlines())
-        return Ran(os.waitstatus_to_exitcode(status), roles=roles, hangs=hangs, **texts)
+        code = os.waitstatus_to_exitcode(status)
+        return Ran(code, roles=roles, hangs=hangs, lingers=_lingers(), **texts)
 
 
 def goal(number: int) -> Goal:
@@ -271,11 +318,21 @@ def _git_core() -> Path:
 
 
 def _git_traces(folder: Path) -> Iterator[GitTrace]:
-    for calls in sorted(folder.glob("*/calls")):
-        command, number = calls.parent.name.rsplit(" ", 1)
-        started_in = calls.with_name("folder").read_text().strip()
+    for calls in sorted(folder.glob("*.calls")):
+        command, number = calls.stem.rsplit(" ", 1)
+        started_in = calls.with_suffix(".folder").read_text().strip()
         text = calls.read_text(errors="replace")
         yield GitTrace(f"{GIT} {command}", int(number), started_in, text)
+
+
+def _lingers() -> bool:
+    """Reap the orphans that have ended; return whether another one still runs."""
+    while True:
+        try:
+            if os.waitpid(-1, os.WNOHANG)[0] == 0:
+                return True
+        except ChildProcessError:
+            return False
 
 
 def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
@@ -285,6 +342,17 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
     line = tracer.stderr.readline()
     assert "attached" in line, line
     return tracer
+
+
+def _repeat(now: datetime) -> None:
+    """Give this forked process a clock that stands still, and ids that follow from it."""
+    numbers = count(1)
+
+    def fresh_id(_: Runtime) -> str:
+        return str(uuid5(NAMESPACE_OID, f"{now} {next(numbers)}"))
+
+    Runtime.now = lambda _: now  # type: ignore[method-assign]
+    Runtime.fresh_id = fresh_id  # type: ignore[method-assign]
 
 
 def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int) -> None:
