@@ -199,7 +199,7 @@ class Rig:
         for path in sorted(self.folder.rglob("*")):
             told.update(f"\0{_CHANCE.sub('*', str(path))}\0{path.lstat().st_mode}\0".encode())
             if path.is_symlink():
-                told.update(os.readlink(path).encode())
+                told.update(str(path.readlink()).encode())
             elif path.is_file():
                 told.update(sha256(path.read_bytes()).digest())
         return told.hexdigest()
