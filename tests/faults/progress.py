@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
@@ -32,13 +33,14 @@ class Tried:
             print("the program has changed since the run that was interrupted: beginning anew")
             lines = []
         for line in lines[1:]:
-            task, results = json.loads(line)
-            self.sound[task] = [
-                Result(each["part"], tuple(each["where"]), each["fault"], ()) for each in results
-            ]
+            with suppress(ValueError):  # cut off by the interruption
+                task, results = json.loads(line)
+                self.sound[task] = [
+                    Result(each["part"], tuple(each["where"]), each["fault"], ())
+                    for each in results
+                ]
         file.parent.mkdir(exist_ok=True)
-        if not lines:
-            file.write_text(f"{program}\n")
+        file.write_text("".join(f"{line}\n" for line in lines or [program]))
 
     def add(self, task: str, results: Iterable[Result]) -> None:
         """Keep the results of a task, unless a promise was broken: then it must be tried again."""
