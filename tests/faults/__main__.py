@@ -160,7 +160,9 @@ def _report(results: list[Result], seconds: float) -> None:
     by_class: dict[str, Counter[str]] = {}
     for result in results:
         name = " ".join((result.part, *result.where))
-        by_class.setdefault(name, Counter()).update(result.problems or ("sound",))
+        known = [f"known and open: {problem}" for problem in result.known]
+        verdicts = [*result.problems, *known] or ["sound"]
+        by_class.setdefault(name, Counter()).update(verdicts)
     OUT.parent.mkdir(exist_ok=True)
     in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # runs add up
     for name, verdicts in by_class.items():
@@ -170,7 +172,11 @@ def _report(results: list[Result], seconds: float) -> None:
         told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
         print(f"{name}: {told}")
     wrong = sum(bool(result.problems) for result in results)
-    print(f"{len(results)} faults and states, {wrong} with a violation, {seconds:.0f} s")
+    known = sum(bool(result.known) for result in results)
+    print(
+        f"{len(results)} faults and states, {wrong} with a violation, "
+        f"{known} with what is known and open, {seconds:.0f} s"
+    )
 
 
 if __name__ == "__main__":

@@ -36,7 +36,9 @@ class Tried:
             with suppress(ValueError):  # cut off by the interruption
                 task, results = json.loads(line)
                 self.sound[task] = [
-                    Result(each["part"], tuple(each["where"]), each["fault"], ())
+                    Result(
+                        each["part"], tuple(each["where"]), each["fault"], (), tuple(each["known"])
+                    )
                     for each in results
                 ]
         file.parent.mkdir(exist_ok=True)
