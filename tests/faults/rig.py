@@ -50,7 +50,7 @@ _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
 So a demand has the same commits each time: its calls keep their numbers, and a state of the disk
 that was met before is known again (:meth:`Rig.fingerprint`).
 """
-_ADOPT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
+_END_WITH_PARENT, _ADOPT_ORPHANS = 1, 36  # PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER
 _CHANCE = re.compile(
     r"(?<=pack_git2_)[0-9a-f]+?(?=idx|rev|$)|(?<=demandops-pack-)\w+|"
     r"(?<=tmp_objdir-incoming-)\w+|(?<=tmp_obj_)\w+|(?<=tmp_pack_)\w+|(?<=tmp_idx_)\w+"
@@ -369,6 +369,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
 
     code = 70
     try:
+        ctypes.CDLL(None).prctl(_END_WITH_PARENT, signal.SIGKILL)  # also if the run is interrupted
         os.setsid()
         for path, number in ((out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
