@@ -55,10 +55,20 @@ The counts vary, because either thread may write the journal.
 """
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls that a demand makes in this process, by the rig's folder."""
-_OF_SERVER = ("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch")
+_OF_SERVER = (
+    "failed to update ref",
+    "unpack",
+    "Killed",
+    "hung up",
+    "signal 9",
+    "has no branch",
+    "the server cannot read the branch",
+    "check the path in the address",
+)
 """Messages of a git process, here or at the server, that do not give the reason of its failure.
 
-A server that cannot read its references offers none, so the remote "has no branch".
+A server that cannot read its references offers none, so the remote "has no branch", or one of
+zeros. A server that cannot read its folder says that this is no repository.
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """Messages about files that libgit2 could not read, without a reason."""
