@@ -142,7 +142,7 @@ class Result:
     """The problems that one fault caused.
 
     ``where`` has the thread or program, the call and the class of file. ``known`` has the problems
-    that docs/reliability.md lists as open.
+    that docs/reliability.md lists as open. ``hangs``: a process did not end in time.
     """
 
     part: str
@@ -150,6 +150,7 @@ class Result:
     fault: str
     problems: tuple[str, ...]
     known: tuple[str, ...] = ()
+    hangs: bool = False
 
 
 def sites(rig: Rig) -> list[Site]:
@@ -191,13 +192,17 @@ def _site(call: Call, rig: Rig, which: int = 0) -> Site:
     return Site(call.role, call.kind, file, call.n, creates, which)
 
 
+def _is_of_journal(site: Site) -> bool:
+    return site.is_threads and site.file.endswith("/outbox.jsonl") and not site.creates
+
+
 def _counted(rig: Rig, site: Site) -> tuple[int, list[str]]:
     """Return the call's number for strace, and the options that limit what strace counts.
 
     For a thread's call on the journal, strace counts only calls on the journal. The number of other
     calls, such as those that wake a thread, depends on timing.
     """
-    if site.is_threads and site.file.endswith("/outbox.jsonl") and not site.creates:
+    if _is_of_journal(site):
         return site.place + 1, ["-P", str(next(rig.home.rglob("outbox.jsonl")))]
     return site.n, []
 
@@ -248,34 +253,42 @@ def run(rig: Rig, job: Job) -> Result:
         sites(rig)
     site = _here(rig, job.site)
     result = _run(rig, job, site)
-    for _ in range(_TRIES):
+    for tries in range(_TRIES):
         if result.problems != (_MISSED,):
             break
-        site = _recounted(rig, job.site, site)
+        recounted = _recounted(rig, site) if tries == 0 else None
+        if recounted is None:
+            sites(rig)
+            recounted = _here(rig, job.site)
+        site = recounted
         result = _run(rig, job, site)
+    if result.problems and result.hangs:
+        rig.restore()
+        if rig.is_slower(DEMAND):
+            return run(rig, job)
     return result
 
 
-def _recounted(rig: Rig, wanted: Site, here: Site) -> Site:
+def _recounted(rig: Rig, site: Site) -> Site | None:
     """Return a call with its number in a new process that meets no fault.
 
-    Only the thread or process that made the call ``here`` is traced. If it does not make the call
-    this time, all are counted anew.
+    Only the thread or process that makes the call is traced, which is cheaper than :func:`sites`.
+    Return None if it does not make the call this time, or if its number says nothing
+    (:func:`_counted`).
     """
-    known = _KNOWN[rig.folder]
-    before = [
-        each
-        for each in known
-        if (each.of_class, each.which) == (here.of_class, here.which) and each.place < here.place
-    ]
+    if _is_of_journal(site):
+        return None
+    before = sum(
+        (each.of_class, each.which) == (site.of_class, site.which) and each.place < site.place
+        for each in _KNOWN[rig.folder]
+    )
     rig.restore()
-    ran = rig.must(rig.book(DEMAND, Strace(_traces(here), _at(here)), PLENTY_S))
-    made = [_site(call, rig, which) for which, call in _calls_at(rig, here, ran)]
-    same = [each for each in made if each.of_class == here.of_class]
-    if len(same) > len(before):
-        return replace(same[len(before)], which=here.which, place=here.place)
-    sites(rig)
-    return _here(rig, wanted)
+    ran = rig.must(rig.book(DEMAND, Strace(_traces(site), _at(site)), PLENTY_S))
+    made = [_site(call, rig, which) for which, call in _calls_at(rig, site, ran)]
+    same = [each for each in made if each.of_class == site.of_class]
+    if len(same) <= before:
+        return None
+    return replace(same[before], which=site.which, place=site.place)
 
 
 def _at(site: Site) -> str:
@@ -317,6 +330,7 @@ def _run(rig: Rig, job: Job, site: Site) -> Result:
     if site.role == "git receive-pack":  # an operator removes its locks; the generator waits
         rig.unlock_server()
     found = tuple(after_restart(rig, ran))
+    hangs = bool(ran.hangs) or any("the next start fails" in each for each in found)
     if where == _UNNOTICED:
-        return Result(part, where, job.fault, tuple(problems), known=found)
-    return Result(part, where, job.fault, (*problems, *found))
+        return Result(part, where, job.fault, tuple(problems), known=found, hangs=hangs)
+    return Result(part, where, job.fault, (*problems, *found), hangs=hangs)
