@@ -6,13 +6,16 @@ The program writes ``build/faults.json`` and ends with exit code 1 if a promise 
 from __future__ import annotations
 
 import argparse
+import gc
+import io
 import json
+import os
 import sys
 import tempfile
-import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import current_process, get_context
@@ -21,15 +24,19 @@ from pkgutil import walk_packages
 from typing import Any
 
 import demandops
+from demandops.cli import main as command_line
 
 from tests.faults import disk, injection, power_loss
 from tests.faults.injection import Result
+from tests.faults.progress import Progress, Tried
 from tests.faults.rig import Rig
 
-WORKERS = 2
+WORKERS = (os.cpu_count() or 1) + 1
+"""More than there are cores: while a worker waits for a disk or a lock, a core is free."""
 MEMORY = Path("/dev/shm")
 """A file system in memory, where a sync takes no time; strace still shows each sync."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
+TRIED = OUT.with_name("faults-tried.jsonl")
 _RIGS: dict[tuple[bool, bool], Rig] = {}
 _FOLDER, _SHORT = Path(), True
 
@@ -48,22 +55,42 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", action="store_true", help="every call, and every fault at it")
     parser.add_argument("--only", default="", help="only tasks whose text contains this")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with a run that was interrupted"
+    )
     chosen = parser.parse_args()
-    for module in walk_packages(demandops.__path__, "demandops."):  # no import under strace
-        import_module(module.name)
-    began = time.monotonic()
-    results: list[Result] = []
+    tried = Tried(TRIED, resume=chosen.resume)
     fast = MEMORY if MEMORY.is_dir() else None
     with tempfile.TemporaryDirectory(prefix="demandops-faults-", dir=fast) as folder:
+        _prepare(Path(folder))
         tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
-        print(f"{len(tasks)} tasks", flush=True)
+        left = [each for each in tasks if str(each) not in tried.sound]
+        known = f", of which {len(tasks) - len(left)} were tried before" if chosen.resume else ""
+        print(f"{len(tasks)} tasks{known}", flush=True)
+        results = [one for each in tasks for one in tried.sound.get(str(each), [])]
+        progress = Progress(len(left))
         start = (Path(folder), not chosen.long)
         with get_context("fork").Pool(WORKERS, _start, start) as pool:
-            for found in pool.imap_unordered(_run, tasks):
+            for task, found in pool.imap_unordered(_run, left):
                 results += found
                 _tell_problems(found)
-    _report(results, time.monotonic() - began)
+                tried.add(task, found)
+                progress.add(found)
+    _report(results, progress.seconds)
+    tried.finish()
     return int(any(result.problems for result in results))
+
+
+def _prepare(folder: Path) -> None:
+    """Import all modules and compile the templates, so that no forked process does it again."""
+    for module in walk_packages(demandops.__path__, "demandops."):
+        import_module(module.name)
+    rig = Rig(folder / "first", remote=False)
+    with redirect_stdout(io.StringIO()):
+        code = command_line.run(["verify", "--state-repo", str(rig.state)])
+    assert code == 0, code
+    gc.collect()
+    gc.freeze()  # else the collector of each forked process would copy all memory
 
 
 def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
@@ -93,12 +120,13 @@ def _start(folder: Path, short: bool) -> None:
     _FOLDER, _SHORT = folder / current_process().name, short
 
 
-def _run(task: _Task) -> list[Result]:
+def _run(task: _Task) -> tuple[str, list[Result]]:
     try:
-        return _results(task)
+        return str(task), _results(task)
     except Exception as error:  # the other tasks' results must not be lost
         traceback.print_exc()
-        return [Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))]
+        failed = Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))
+        return str(task), [failed]
 
 
 def _results(task: _Task) -> list[Result]:
@@ -132,7 +160,9 @@ def _report(results: list[Result], seconds: float) -> None:
     by_class: dict[str, Counter[str]] = {}
     for result in results:
         name = " ".join((result.part, *result.where))
-        by_class.setdefault(name, Counter()).update(result.problems or ("sound",))
+        known = [f"known and open: {problem}" for problem in result.known]
+        verdicts = [*result.problems, *known] or ["sound"]
+        by_class.setdefault(name, Counter()).update(verdicts)
     OUT.parent.mkdir(exist_ok=True)
     in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # runs add up
     for name, verdicts in by_class.items():
@@ -142,7 +172,11 @@ def _report(results: list[Result], seconds: float) -> None:
         told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
         print(f"{name}: {told}")
     wrong = sum(bool(result.problems) for result in results)
-    print(f"{len(results)} faults and states, {wrong} with a violation, {seconds:.0f} s")
+    known = sum(bool(result.known) for result in results)
+    print(
+        f"{len(results)} faults and states, {wrong} with a violation, "
+        f"{known} with what is known and open, {seconds:.0f} s"
+    )
 
 
 if __name__ == "__main__":

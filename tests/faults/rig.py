@@ -6,8 +6,10 @@ process.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -18,10 +20,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta, timezone
 from functools import cache
+from hashlib import sha256
+from itertools import count
 from pathlib import Path
+from uuid import NAMESPACE_OID, uuid5
 
 import yaml
+from demandops.runtime import Runtime
 
 from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
@@ -38,6 +45,18 @@ PLENTY_S = 60.0
 END_S = 8.0
 """How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
+_FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
+"""The time of the first process. It stands still in a process and moves on with each.
+
+So a demand has the same commits each time: its calls keep their numbers, and a state of the disk
+that was met before is known again (:meth:`Rig.fingerprint`).
+"""
+_END_WITH_PARENT, _ADOPT_ORPHANS = 1, 36  # PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER
+_CHANCE = re.compile(
+    r"(?<=pack_git2_)[0-9a-f]+?(?=idx|rev|$)|(?<=demandops-pack-)\w+|"
+    r"(?<=tmp_objdir-incoming-)\w+|(?<=tmp_obj_)\w+|(?<=tmp_pack_)\w+|(?<=tmp_idx_)\w+"
+)
+"""The parts of a file's name that a program chooses at random; nothing depends on them."""
 
 GIT = "git"
 """The value of ``Strace.at`` with which strace traces each process of git by itself."""
@@ -51,11 +70,12 @@ if [ "$program" = git ]; then
 fi
 if [ -n "$FAULTS_AT" ]; then
   number=1
-  until mkdir "$FAULTS_TRACES/$command $number" 2>/dev/null; do number=$((number + 1)); done
+  set -C  # fails at a file that exists; the shell does this itself, mkdir would be a process
+  until true 2>/dev/null >"$FAULTS_TRACES/$command $number"; do number=$((number + 1)); done
   case "$FAULTS_AT" in git | "git $command $number")
     trace="$FAULTS_TRACES/$command $number"
-    pwd -P >"$trace/folder"
-    exec strace -y -o "$trace/calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
+    pwd -P >"$trace.folder"
+    exec strace -y -o "$trace.calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
     ;;
   esac
 fi
@@ -96,7 +116,10 @@ class GitTrace:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a process did: its exit code, its output, its traces, and how it hung, if it did."""
+    """What a process did: its exit code, its output, its traces, and how it hung if it did.
+
+    ``lingers``: a process that it started, such as ``git push``, still ran when it had ended.
+    """
 
     code: int
     out: str
@@ -105,6 +128,7 @@ class Ran:
     roles: dict[int, str] = field(default_factory=dict)
     git: tuple[GitTrace, ...] = ()
     hangs: str = ""
+    lingers: bool = False
 
     @property
     def commit(self) -> str:
@@ -128,14 +152,16 @@ class Rig:
         self.scratch, self._template = folder / "scratch", folder / "template"
         self.state, self.home = self.folder / "state.git", self.folder / "home"
         self.address = self.state.as_uri() if remote else str(self.state)
+        self._runs = self._runs_of_template = 0
+        self.proved: set[object] = set()
+        """The states of the disk from which a restart was tried and found sound."""
         self.scratch.mkdir(parents=True)
         self._wrap_git()
         self.folder.mkdir()
+        ctypes.CDLL(None).prctl(_ADOPT_ORPHANS, 1)  # so that this process can tell who lingers
         self.must(self.demandops("init", str(self.state), "--bare"))
-        began = time.monotonic()
-        self.limit = PLENTY_S
-        self.must(self.book(0))
-        self.limit = max(LIMIT_S, PATIENCE * (time.monotonic() - began))
+        self.limit = 0.0
+        self.is_slower(0)
         self.save()
 
     def _wrap_git(self) -> None:
@@ -147,6 +173,17 @@ class Rig:
         for program in _git_core().glob("git*"):
             (self._git / program.name).symlink_to(wrapper)
 
+    def is_slower(self, number: int) -> bool:
+        """Book a demand that meets no fault, and return whether the limit had to be raised.
+
+        A process that was taken to hang may only have had too little of a busy machine.
+        """
+        began = time.monotonic()
+        self.must(self.book(number, limit=PLENTY_S))
+        before = self.limit
+        self.limit = max(LIMIT_S, before, PATIENCE * (time.monotonic() - began))
+        return self.limit > before
+
     def unlock_server(self) -> None:
         for lock in self.state.rglob("*.lock"):
             lock.unlink()
@@ -157,14 +194,35 @@ class Rig:
         return ran
 
     def save(self) -> None:
-        """Copy all files, so that :meth:`restore` can bring them back."""
+        """Copy all files, for :meth:`restore`.
+
+        Set their times one second apart, in the order of their names. Git opens the newest pack
+        first, so packs of one age would be opened in another order in another rig.
+        """
         shutil.rmtree(self._template, ignore_errors=True)
         shutil.copytree(self.folder, self._template, symlinks=True)
+        files = sorted(path for path in self._template.rglob("*") if path.is_file())
+        oldest = time.time() - len(files)
+        for number, path in enumerate(files):
+            os.utime(path, (oldest + number, oldest + number))
+        self._runs_of_template = self._runs
 
     def restore(self) -> None:
         """Bring back all files as they were at the last :meth:`save`."""
         shutil.rmtree(self.folder)
         shutil.copytree(self._template, self.folder, symlinks=True)
+        self._runs = self._runs_of_template
+
+    def fingerprint(self) -> str:
+        """Return a digest of all that the next process can find: names, modes, bytes, its clock."""
+        told = sha256(str(self._runs).encode())
+        for path in sorted(self.folder.rglob("*")):
+            told.update(f"\0{_CHANCE.sub('*', str(path))}\0{path.lstat().st_mode}\0".encode())
+            if path.is_symlink():
+                told.update(str(path.readlink()).encode())
+            elif path.is_file():
+                told.update(sha256(path.read_bytes()).digest())
+        return told.hexdigest()
 
     def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
         """Book the demand with a number; return what the process did."""
@@ -185,21 +243,26 @@ class Rig:
         traces.mkdir()
         environment = NO_GIT_CONFIG | {
             "DEMANDOPS_DATA_HOME": str(self.home),
-            "PATH": f"{self._git}:{os.environ['PATH']}",
-            "GIT_EXEC_PATH": str(self._git),
-            "FAULTS_EXEC": str(_git_core()),
-            "FAULTS_TRACES": str(traces),
-            "FAULTS_AT": "",
         }
         if strace is not None and strace.is_of_git:
-            environment |= {"FAULTS_AT": strace.at, "FAULTS_STRACE": " ".join(strace.options)}
+            environment |= {
+                "PATH": f"{self._git}:{os.environ['PATH']}",
+                "GIT_EXEC_PATH": str(self._git),
+                "FAULTS_EXEC": str(_git_core()),
+                "FAULTS_TRACES": str(traces),
+                "FAULTS_AT": strace.at,
+                "FAULTS_STRACE": " ".join(strace.options),
+            }
         told, tell = os.pipe()
         waits, go = os.pipe()
+        now = _FIRST_TIME + timedelta(minutes=self._runs)
+        self._runs += 1
         process = os.fork()
         if process == 0:
             os.close(told)
             os.close(go)
             os.environ.update(environment)
+            _repeat(now)
             _become(command, paths["out"], paths["err"], tell, waits)
         os.close(tell)
         os.close(waits)
@@ -260,7 +323,8 @@ class Rig:
         }
         if alone:
             texts["trace"] = "".join(f"{alone} {line}\n" for line in texts["trace"].splitlines())
-        return Ran(os.waitstatus_to_exitcode(status), roles=roles, hangs=hangs, **texts)
+        code = os.waitstatus_to_exitcode(status)
+        return Ran(code, roles=roles, hangs=hangs, lingers=_lingers(), **texts)
 
 
 def goal(number: int) -> Goal:
@@ -274,11 +338,21 @@ def _git_core() -> Path:
 
 
 def _git_traces(folder: Path) -> Iterator[GitTrace]:
-    for calls in sorted(folder.glob("*/calls")):
-        command, number = calls.parent.name.rsplit(" ", 1)
-        started_in = calls.with_name("folder").read_text().strip()
+    for calls in sorted(folder.glob("*.calls")):
+        command, number = calls.stem.rsplit(" ", 1)
+        started_in = calls.with_suffix(".folder").read_text().strip()
         text = calls.read_text(errors="replace")
         yield GitTrace(f"{GIT} {command}", int(number), started_in, text)
+
+
+def _lingers() -> bool:
+    """Reap the orphans that have ended; return whether another one still runs."""
+    while True:
+        try:
+            if os.waitpid(-1, os.WNOHANG)[0] == 0:
+                return True
+        except ChildProcessError:
+            return False
 
 
 def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
@@ -290,12 +364,24 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
     return tracer
 
 
+def _repeat(now: datetime) -> None:
+    """Give this forked process a clock that stands still, and ids that follow from it."""
+    numbers = count(1)
+
+    def fresh_id(_: Runtime) -> str:
+        return str(uuid5(NAMESPACE_OID, f"{now} {next(numbers)}"))
+
+    Runtime.now = lambda _: now  # type: ignore[method-assign]
+    Runtime.fresh_id = fresh_id  # type: ignore[method-assign]
+
+
 def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int) -> None:
     """Run the command line in this forked process, then end the process."""
     from demandops.cli import main
 
     code = 70
     try:
+        ctypes.CDLL(None).prctl(_END_WITH_PARENT, signal.SIGKILL)  # also if the run is interrupted
         os.setsid()
         for path, number in ((out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)

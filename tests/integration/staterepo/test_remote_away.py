@@ -194,20 +194,44 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
     rig.assert_sound(bare)
 
 
+@pytest.mark.parametrize(
+    ("server", "told"),
+    [
+        (
+            "echo 'git@edge: Permission denied (publickey).' >&2",
+            "git@edge: Permission denied (publickey); give git credentials for it: a credential "
+            "helper, ~/.netrc or an SSH key",
+        ),
+        (  # the server ends in the middle of its answer, of which git complains last
+            "printf '000eversion 2\\n'\n"
+            "echo \"warning: unable to access 'config': Input/output error\" >&2\n"
+            "echo 'fatal: unknown error occurred while reading the configuration files' >&2",
+            "warning: unable to access 'config': Input/output error",
+        ),
+        (  # its disk did not give it the reference, and it names none
+            f"echo 'fatal: git upload-pack: not our ref {'0' * 40}' >&2",
+            f"fatal: git upload-pack: not our ref {'0' * 40}; the server cannot read the branch: "
+            "check its disk, and who may read its files",
+        ),
+        (
+            "echo \"fatal: detected dubious ownership in repository at '/srv/state.git'\" >&2",
+            "fatal: detected dubious ownership in repository at '/srv/state.git'; check the path "
+            "in the address, and whose files they are",
+        ),
+    ],
+    ids=["credentials", "cut off", "no reference", "owner"],
+)
 def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The message leaves out git's last lines, which are the same whatever the reason is."""
     ssh = tmp_path / "ssh"
-    ssh.write_text("#!/bin/sh\necho 'git@edge: Permission denied (publickey).' >&2\nexit 255\n")
+    ssh.write_text(f"#!/bin/sh\n{server}\nexit 255\n")
     ssh.chmod(0o755)
     monkeypatch.setenv("GIT_SSH_COMMAND", str(ssh))
     with pytest.raises(StateRepoError) as error:
         Generator("ssh://git@edge/state.git")
-    assert str(error.value) == (
-        "ssh://edge/state.git cannot be fetched: git@edge: Permission denied (publickey); give git "
-        "credentials for it: a credential helper, ~/.netrc or an SSH key"
-    )
+    assert str(error.value) == f"ssh://edge/state.git cannot be fetched: {told}"
 
 
 def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(

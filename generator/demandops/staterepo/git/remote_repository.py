@@ -47,7 +47,7 @@ _RULE = re.compile(r"fsck|exceeds maximum|[Ii]nsufficient permission")
 _WITHOUT_REASON = re.compile(
     r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
     r"error: failed to push some refs|Please make sure you have the correct access|"
-    r"and the repository exists|send-pack: unexpected disconnect|"
+    r"and the repository exists|send-pack: unexpected disconnect|fatal: expected flush after|"
     r"fatal: unknown error occurred while reading the configuration files"
 )
 """Matches lines at the end of git's output that do not give the reason of a failure."""
@@ -67,6 +67,14 @@ _REMEDIES = (
     (
         re.compile(r"not found|returned error: 404|does not appear to be a git", re.IGNORECASE),
         "check the path in the address, and whether you may read it",
+    ),
+    (
+        re.compile(r"detected dubious ownership"),
+        "check the path in the address, and whose files they are",
+    ),
+    (
+        re.compile(r"not our ref 0{40}"),
+        "the server cannot read the branch: check its disk, and who may read its files",
     ),
     (
         re.compile(r"refused|timed out|unreachable|couldn't connect", re.IGNORECASE),
@@ -407,7 +415,13 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 def _reason(text: str) -> str:
     """Return the last line of git's error output that gives a reason."""
     text = text.replace("stderr: '", "")  # GitPython's prefix
-    lines = [line.strip(" '\"") for line in text.splitlines() if line.strip(" '\"")]
+    lines = [_without_open_quote(line) for line in text.splitlines() if line.strip(" '\"")]
     telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines
     fatal = [line for line in telling if line.startswith(("fatal:", "error:", "remote:", "!"))]
     return (fatal or telling or ["git gave no reason"])[-1].rstrip(".")
+
+
+def _without_open_quote(line: str) -> str:
+    """Return a line without the quote that GitPython puts after the last one."""
+    line = line.strip(' "')
+    return line.removesuffix("'") if line.count("'") % 2 else line

@@ -1,0 +1,64 @@
+"""A run of the fault injection that takes the place of an interrupted one tries only the rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.faults import progress
+from tests.faults.injection import Result
+from tests.faults.progress import Tried
+
+SOUND = Result("remote", ("git push", "openat", "state.git/HEAD"), "EIO", ())
+BROKEN = Result(
+    "remote", ("git push", "write", "state.git/HEAD"), "EIO", ("acknowledged, missing",)
+)
+
+
+def interrupted(file: Path) -> None:
+    """Try two tasks, of which one breaks a promise; do not reach the end."""
+    run = Tried(file, resume=False)
+    run.add("one", [SOUND, SOUND])
+    run.add("two", [SOUND, BROKEN])
+
+
+def test_a_run_goes_on_with_what_was_not_tried_or_not_sound(tmp_path: Path) -> None:
+    file = tmp_path / "build" / "tried.jsonl"
+    interrupted(file)
+    assert Tried(file, resume=True).sound == {"one": [SOUND, SOUND]}
+
+
+def test_a_line_that_the_interruption_cut_off_is_tried_again(tmp_path: Path) -> None:
+    file = tmp_path / "tried.jsonl"
+    interrupted(file)
+    whole = file.read_text()
+    file.write_text(whole + '["three", [{"pa')
+    resumed = Tried(file, resume=True)
+    resumed.add("four", [SOUND])
+    assert list(resumed.sound) == ["one"]
+    assert list(Tried(file, resume=True).sound) == ["one", "four"]
+
+
+def test_a_run_begins_anew_unless_it_is_told_to_go_on(tmp_path: Path) -> None:
+    file = tmp_path / "tried.jsonl"
+    interrupted(file)
+    assert Tried(file, resume=False).sound == {}
+    assert Tried(file, resume=True).sound == {}
+
+
+def test_nothing_is_taken_over_from_another_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "tried.jsonl"
+    interrupted(file)
+    monkeypatch.setattr(progress, "_program", lambda: "another")
+    assert Tried(file, resume=True).sound == {}
+    assert "the program has changed" in capsys.readouterr().out
+
+
+def test_a_run_that_reached_its_end_leaves_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "tried.jsonl"
+    interrupted(file)
+    Tried(file, resume=True).finish()
+    assert not file.exists()
