@@ -34,6 +34,7 @@ from tests.e2e.rig.kube import Kube, Manifest
 from .running_pod import Container, RunningPod, path_in_pod, program_of
 
 _TICK_S = 0.1
+_WATCH_S = 60
 _NOT_YET = (LookupError, ApiException, HTTPError, OSError)
 """Errors when an object does not exist yet, or when the API server cannot be reached."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
@@ -85,13 +86,22 @@ class ProcessRunner:
     # --- watching ---------------------------------------------------------------------------
 
     def _watch(self, kind: str, method: str) -> None:
-        """Queue each change of the objects of a kind, until the runner is closed."""
+        """Queue all objects of a kind, then each change, until the runner is closed.
+
+        A watch ends now and then. What is deleted before the next one begins is in no event, so all
+        objects are read again.
+        """
         read: Any = getattr(CoreV1Api(self._kube.api), method)
+        plain = self._kube.api.sanitize_for_serialization
         while not self._closed.is_set():
             with suppress(Exception):  # the server may be away; the next round reads all again
-                for event in Watch().stream(read, self._namespace, timeout_seconds=60):
-                    item = self._kube.api.sanitize_for_serialization(event["object"])
-                    self._events.put((f"{kind} {event['type']}", item))
+                listed = read(self._namespace)
+                self._events.put((f"{kind} LISTED", {"items": plain(listed.items)}))
+                version = listed.metadata.resource_version
+                for event in Watch().stream(
+                    read, self._namespace, resource_version=version, timeout_seconds=_WATCH_S
+                ):
+                    self._events.put((f"{kind} {event['type']}", plain(event["object"])))
             self._closed.wait(_TICK_S)
 
     def _run(self) -> None:
@@ -110,6 +120,12 @@ class ProcessRunner:
 
     def _take(self, event: str, item: Manifest) -> None:
         kind, change = event.split()
+        if change == "LISTED":
+            for found in item["items"]:
+                self._take(f"{kind} MODIFIED", found)
+            if kind == "Pod":
+                self._end_all_but({found["metadata"]["uid"] for found in item["items"]})
+            return
         uid = item["metadata"]["uid"]
         if kind == "ConfigMap":
             if change == "MODIFIED":
@@ -121,6 +137,13 @@ class ProcessRunner:
         elif item["spec"].get("nodeName") and uid not in self.pods:
             folder = self._folder / item["metadata"]["name"]
             self._waiting.setdefault(uid, RunningPod(item, folder, time.time()))
+
+    def _end_all_but(self, there: set[str]) -> None:
+        """End the pods that no longer exist; ``there`` has the uids of those that do."""
+        for uid in self._waiting.keys() - there:
+            del self._waiting[uid]
+        for uid in self.pods.keys() - there:
+            self._end(self.pods[uid])
 
     def _prepare(self) -> None:
         """Prepare the waiting pods whose volumes can be filled; leave the others for later."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -52,17 +53,23 @@ class KubeApi:
                 self.put(plural, namespace, name, item["status"], metadata=metadata, **more)
             self.patches.append((path, body))
 
+    def forget(self, plural: str, namespace: str, name: str) -> None:
+        """Delete an object while nobody watches, so that no watch reports it."""
+        with self._changed:
+            del self._items[plural, namespace, name]
+
     def listed(self, plural: str, namespace: str) -> Item:
         with self._changed:
             found = [item for key, item in self._items.items() if key[:2] == (plural, namespace)]
             return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
 
-    def events(self, plural: str, namespace: str, since: int) -> Iterator[Item]:
+    def events(self, plural: str, namespace: str, since: int, seconds: float) -> Iterator[Item]:
         """Yield the changes of a kind of objects in a namespace until the server is closed.
 
-        The changes begin after the version ``since``.
+        The changes begin after the version ``since``, and end after so many seconds.
         """
-        while not self.closed:
+        end = time.monotonic() + seconds
+        while not self.closed and time.monotonic() < end:
             with self._changed:
                 if len(self._log) == since:
                     self._changed.wait(_BEAT_S)
@@ -116,7 +123,9 @@ def kube_api() -> Iterator[KubeApi]:
             self.send_header("Transfer-Encoding", "chunked")
             self.end_headers()
             try:
-                for event in api.events(plural, namespace, int(query["resourceVersion"][0])):
+                since = int(query["resourceVersion"][0])
+                seconds = float(query.get("timeoutSeconds", ["inf"])[0])
+                for event in api.events(plural, namespace, since, seconds):
                     line = json.dumps(event).encode() + b"\n"
                     self.wfile.write(b"%x\r\n%s\r\n" % (len(line), line))
                 self.wfile.write(b"0\r\n\r\n")
