@@ -21,7 +21,7 @@ from collections.abc import (
 )
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import lru_cache, wraps
 from itertools import islice
 from typing import Any, cast
 
@@ -185,6 +185,7 @@ def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
         raise SecurityError("'sum' adds numbers only")
 
 
+@lru_cache  # every sandbox has the same filters and tests
 def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a filter that takes steps too, and raises SecurityError for too large a result."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
@@ -205,6 +206,7 @@ def _counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
     return counted
 
 
+@lru_cache
 def _test(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a test that also takes steps for the size of its arguments."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0

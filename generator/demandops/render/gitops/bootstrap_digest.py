@@ -25,8 +25,13 @@ def with_digest(render: Callable[[str], str]) -> str:
 
     ``render`` returns the text with a given digest. The digest does not cover comments.
     """
-    objects = json.dumps(list(strict_yaml.load_all(render(""))), sort_keys=True)
-    return render(hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH])
+    return render(_digest(render("")))
+
+
+@lru_cache(maxsize=64)  # each commit renders the files again, mostly the same
+def _digest(text: str) -> str:
+    objects = json.dumps(list(strict_yaml.load_all(text)), sort_keys=True)
+    return hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH]
 
 
 def digest_of(item: Mapping[str, Any]) -> str:
