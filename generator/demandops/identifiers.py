@@ -29,6 +29,8 @@ def absolute_topic(topic: str) -> str:
 
 def control_character(text: str) -> str:
     """Return the first invisible or bidirectional control character, like ``U+202E``, or ""."""
+    if text.isprintable():  # all of these characters are unprintable
+        return ""
     for char in text:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return f"U+{ord(char):04X}"
