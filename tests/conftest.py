@@ -71,7 +71,7 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
         patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
         patch.setenv(HELM_BIN, "/nowhere/helm")  # so `check` never finds Helm
-        for name, value in repo.NO_GIT_CONFIG.items():
+        for name, value in repo.TEST_GIT_CONFIG.items():
             patch.setenv(name, value)
         yield
 

@@ -32,6 +32,8 @@ def control_character(text: str) -> str:
 
     The result is its name, like ``U+202E``. It is empty if there is no such character.
     """
+    if text.isprintable():  # all of these characters are unprintable
+        return ""
     for char in text:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
             return f"U+{ord(char):04X}"

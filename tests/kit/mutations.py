@@ -89,9 +89,9 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
         for kind, new in (wrong | _OF_TYPE[type(value)]).items():
             if new != value or type(new) is not type(value):
                 yield Mutation(place, kind, _replaced(document, place, new), value, place)
-        changed = copy.deepcopy(document)
-        del _at(changed, place[:-1])[place[-1]]
-        yield Mutation(place, "removed", changed, value, place)
+        holder = copy.copy(_at(document, place[:-1]))
+        del holder[place[-1]]
+        yield Mutation(place, "removed", _replaced(document, place[:-1], holder), value, place)
         if isinstance(value, dict):
             more = {**value, "zz": {"q": [1]}}
             added = (*place, "zz")
@@ -133,10 +133,11 @@ def _at(document: Any, place: Place) -> Any:
 
 
 def _replaced(document: Any, place: Place, value: Any) -> Any:
+    """Return a document with another value at a place; both share the parts beside the place."""
     if not place:
         return value
-    changed = copy.deepcopy(document)
-    _at(changed, place[:-1])[place[-1]] = value
+    changed = copy.copy(document)
+    changed[place[0]] = _replaced(document[place[0]], place[1:], value)
     return changed
 
 

@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,10 @@ NO_GIT_CONFIG = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C.UTF-8",
 }
-GIT_ENVIRONMENT = NO_GIT_CONFIG | {
+TEST_GIT_CONFIG = NO_GIT_CONFIG | {
+    "GIT_CONFIG_GLOBAL": str(Path(__file__).with_name("gitconfig")),
+}
+GIT_ENVIRONMENT = TEST_GIT_CONFIG | {
     "GIT_AUTHOR_NAME": "Petra Platform",
     "GIT_AUTHOR_EMAIL": "petra@example.org",
     "GIT_COMMITTER_NAME": "Petra Platform",
@@ -242,6 +246,13 @@ _FORMAT = "%H%x1f%P%x1f%s%x1f%(trailers:only,unfold,separator=%x1e)%x1d"
 
 def commits(repo: Path, revisions: str = "main") -> list[Commit]:
     """Return the commits of ``revisions``, oldest first, without the repository's first commit."""
+    range_ = pygit2.Repository(str(repo)).revparse(revisions)
+    ends = (range_.from_object, range_.to_object)
+    return [*_commits(repo, "..".join(str(end.id) for end in ends if end))]
+
+
+@lru_cache(maxsize=64)  # a test that waits for a commit asks again and again
+def _commits(repo: Path, revisions: str) -> tuple[Commit, ...]:
     text = git(repo, "log", "--reverse", f"--format={_FORMAT}", revisions)
     found = []
     for record in text.split("\x1d"):
@@ -250,7 +261,7 @@ def commits(repo: Path, revisions: str = "main") -> list[Commit]:
         commit, parents, summary, trailers = record.strip("\n").split("\x1f")
         pairs = [tuple(line.split(": ", 1)) for line in trailers.split("\x1e") if ": " in line]
         found.append(Commit(commit, tuple(parents.split()), summary, tuple(pairs)))  # type: ignore[arg-type]
-    return [commit for commit in found if commit.parents]
+    return tuple(commit for commit in found if commit.parents)
 
 
 def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
