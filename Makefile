@@ -78,7 +78,7 @@ coverage: system-test setup  ## Report what the tests cover, then what the core'
 	@$(PY) -m pytest -n auto --dist worksteal $(CORE_TESTS) \
 	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
 
-# The long form tries every call: make faults FAULTS=--long. It takes over an hour on 2 cores;
+# The long form tries every call: make faults FAULTS=--long. It may take an hour on 2 busy cores;
 # FAULTS='--long --resume' goes on with one that was interrupted.
 faults: system-faults setup  ## Kill generators; inject an error, a kill, a full disk or power loss at each system call of a demand; four minutes
 	@$(PY) -m pytest -q -n auto $(KILL_TESTS)

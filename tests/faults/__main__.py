@@ -15,7 +15,7 @@ import tempfile
 import traceback
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing import current_process, get_context
@@ -28,6 +28,7 @@ from demandops.cli import main as command_line
 
 from tests.faults import disk, injection, power_loss
 from tests.faults.injection import Result
+from tests.faults.invariants import DEMAND
 from tests.faults.progress import Progress, Tried
 from tests.faults.rig import Rig
 
@@ -82,13 +83,15 @@ def main() -> int:
 
 
 def _prepare(folder: Path) -> None:
-    """Import all modules and compile the templates, so that no forked process does it again."""
+    """Import all modules, and compile templates and schemas: no forked process does it again."""
     for module in walk_packages(demandops.__path__, "demandops."):
         import_module(module.name)
     rig = Rig(folder / "first", remote=False)
-    with redirect_stdout(io.StringIO()):
-        code = command_line.run(["verify", "--state-repo", str(rig.state)])
-    assert code == 0, code
+    state = ("--state-repo", str(rig.state))
+    for command in (("verify",), ("request", str(rig.goal_file(DEMAND)), "--dry-run")):
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            code = command_line.run([*command, *state])
+        assert code == 0, code
     gc.collect()
     gc.freeze()  # else the collector of each forked process would copy all memory
 

@@ -49,10 +49,16 @@ _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often a call that the injection missed is counted and tried again.
+"""How often a call that was missed is counted and tried again, because the counts vary."""
+_TRIES_ON_JOURNAL = 40
+"""How often it is tried in one thread and the other, if it is a call on the journal.
 
-The counts vary, because either of two threads may write the journal.
+Either thread may journal a demand. These calls are counted by themselves (:func:`_counted`).
 """
+_OTHER_THREAD = {
+    "demandops-journal": "demandops-writer",
+    "demandops-writer": "demandops-journal",
+}
 _KNOWN: dict[Path, list[Site]] = {}
 """The calls that a demand makes in this process, by the rig's folder."""
 _OF_SERVER = (
@@ -255,14 +261,13 @@ def run(rig: Rig, job: Job) -> Result:
         sites(rig)
     site = _here(rig, job.site)
     result = _run(rig, job, site)
-    for tries in range(_TRIES):
+    for tries in range(_TRIES_ON_JOURNAL if _is_of_journal(site) else _TRIES):
         if result.problems != (_MISSED,):
             break
-        recounted = _recounted(rig, site) if tries == 0 else None
-        if recounted is None:
-            sites(rig)
-            recounted = _here(rig, job.site)
-        site = recounted
+        if _is_of_journal(site):
+            site = replace(site, role=_OTHER_THREAD.get(site.role, site.role))
+        else:
+            site = _counted_anew(rig, job.site, site, only_here=tries == 0)
         result = _run(rig, job, site)
     if result.problems and result.hangs:
         rig.restore()
@@ -271,26 +276,25 @@ def run(rig: Rig, job: Job) -> Result:
     return result
 
 
-def _recounted(rig: Rig, site: Site) -> Site | None:
+def _counted_anew(rig: Rig, wanted: Site, here: Site, *, only_here: bool) -> Site:
     """Return a call with its number in a new process that meets no fault.
 
-    Only the thread or process that makes the call is traced, which is cheaper than :func:`sites`.
-    Return None if it does not make the call this time, or if its number says nothing
-    (:func:`_counted`).
+    If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If it
+    does not make the call this time, trace all.
     """
-    if _is_of_journal(site):
-        return None
-    before = sum(
-        (each.of_class, each.which) == (site.of_class, site.which) and each.place < site.place
-        for each in _KNOWN[rig.folder]
-    )
-    rig.restore()
-    ran = rig.must(rig.book(DEMAND, Strace(_traces(site), _at(site)), PLENTY_S))
-    made = [_site(call, rig, which) for which, call in _calls_at(rig, site, ran)]
-    same = [each for each in made if each.of_class == site.of_class]
-    if len(same) <= before:
-        return None
-    return replace(same[before], which=site.which, place=site.place)
+    if only_here:
+        before = sum(
+            (each.of_class, each.which) == (here.of_class, here.which) and each.place < here.place
+            for each in _KNOWN[rig.folder]
+        )
+        rig.restore()
+        ran = rig.must(rig.book(DEMAND, Strace(_traces(here), _at(here)), PLENTY_S))
+        made = [_site(call, rig, which) for which, call in _calls_at(rig, here, ran)]
+        same = [each for each in made if each.of_class == here.of_class]
+        if len(same) > before:
+            return replace(same[before], which=here.which, place=here.place)
+    sites(rig)
+    return _here(rig, wanted)
 
 
 def _at(site: Site) -> str:

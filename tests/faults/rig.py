@@ -224,11 +224,16 @@ class Rig:
                 told.update(sha256(path.read_bytes()).digest())
         return told.hexdigest()
 
-    def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
-        """Book the demand with a number; return what the process did."""
+    def goal_file(self, number: int) -> Path:
+        """Write the demand with a number to a file, and return its path."""
         file = self.scratch / f"{number}.yaml"
         file.write_text(yaml.safe_dump(goal(number)))
-        command = ("request", str(file), "--state-repo", self.address, "--output", "json")
+        return file
+
+    def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
+        """Book the demand with a number; return what the process did."""
+        file = str(self.goal_file(number))
+        command = ("request", file, "--state-repo", self.address, "--output", "json")
         return self.demandops(*command, strace=strace, limit=limit or self.limit)
 
     def demandops(
