@@ -20,7 +20,7 @@ class Dialogue:
     """``demandops`` on a pseudoterminal, which has its input, output and errors."""
 
     def __init__(self, *args: str | Path, folder: Path | None = None, **environment: str) -> None:
-        self.text, self._typed = "", b""
+        self.text, self._typed, self._typed_at = "", b"", 0
         self._pid, self._master = pty.fork()
         if self._pid == 0:
             os.chdir(folder or Path.cwd())
@@ -44,14 +44,15 @@ class Dialogue:
             assert self._read(end - time.monotonic()), f"no {wanted!r} in:\n{self.text}"
 
     def type(self, text: str) -> None:
-        self._typed = text.encode()
+        self._typed, self._typed_at = text.encode(), len(self.text)
         os.write(self._master, self._typed)
 
     def end(self) -> int:
         """Read until the command ends; return its exit code.
 
         After some seconds of silence, this types the last text again, as people do: Python can miss
-        a signal that arrives just before it begins to read.
+        a signal that arrives just before it begins to read. If the command has answered already, a
+        second Ctrl-C would kill it while it ends.
         """
         end = time.monotonic() + PATIENCE_S
         while self._read(_SILENCE_S) or self._runs_silently():
@@ -64,7 +65,8 @@ class Dialogue:
         """Return whether the command still runs; if it is silent, type the last text again."""
         if select.select([self._master], [], [], 0)[0]:
             return self._read(0)
-        os.write(self._master, self._typed)
+        if not self.text[self._typed_at :].strip("^C\r\n"):
+            os.write(self._master, self._typed)
         return True
 
     def _read(self, wait_s: float) -> bool:
