@@ -353,7 +353,7 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     made = commits(repo)
     assert [commit.id for commit in made if len(commit.parents) != 1] == []
     ids = [found for commit in made if (found := commit.one("Operation-Id"))]
-    assert sorted(ids) == sorted(set(ids))
+    assert sorted(ids) == sorted(set(ids)), sorted(one for one in ids if ids.count(one) > 1)
     before = made[-verify_last - 1].id if 0 < verify_last < len(made) else None
     assert differing(repo, before) == {}
 

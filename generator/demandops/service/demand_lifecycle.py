@@ -50,6 +50,11 @@ _NEXT: dict[State, tuple[State, ...]] = {
 }
 
 
+_MOST_ANSWERED = 10_000
+"""How many operation ids of answered demands are remembered. A demand that is sent again with such
+an id counts once."""
+
+
 class Demands:
     """The demands that have no answer yet, and the journal.
 
@@ -66,6 +71,7 @@ class Demands:
         self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
+        self._answered: dict[str, str] = {}
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
@@ -221,6 +227,10 @@ class Demands:
                     self._of_requester[requester_of(ticket.goal)] -= 1
                     refused.append((ticket, failure))
             for ticket in taken:
+                twin = self._tickets.get(ticket.operation)
+                base = twin.base if twin else self._answered.get(ticket.operation)
+                if base is not None:  # sent again: an earlier sending may be published
+                    ticket.mark_maybe_published(base)
                 self._tickets[ticket.operation] = ticket
                 _change(ticket, "waiting")
                 self._waiting.append(ticket)
@@ -362,6 +372,9 @@ class Demands:
                 _change(ticket, "done")
                 if self._tickets.pop(ticket.operation, None):
                     self._leave(ticket)
+                self._answered[ticket.operation] = ticket.base
+            while len(self._answered) > _MOST_ANSWERED:
+                del self._answered[next(iter(self._answered))]
         for ticket, result in results:
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")
