@@ -50,9 +50,16 @@ def test_killed_at_random_moments_loses_and_doubles_nothing(
             open_ = [(name, made) for name, made in client if name not in acknowledged]
             if last:  # finish the begun demands, and a few more
                 open_ = open_[:2]
-            # the operation id again, or a new one as from a restarted client
+            # The operation id again, or a new one as from a restarted client. A leave keeps its id:
+            # with a new one it is no repeat if its requester has joined something since
+            # (docs/decisions/0023-a-shutdown-takes-holds.md).
             again = "" if random.random() < 0.5 else f"-try{turn}"
-            lanes.append([demand(name, made, f"op-{name}{again}") for name, made in open_])
+            lanes.append(
+                [
+                    demand(name, made, f"op-{name}{again if name.startswith('join') else ''}")
+                    for name, made in open_
+                ]
+            )
         run = drivers.start(address, lanes)
         delay = random.choice([random.uniform(0, 0.03), random.uniform(0.03, 0.16)])
         killer = threading.Timer(delay, run.kill)
