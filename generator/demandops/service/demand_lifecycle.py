@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 from demandops.errors import (
@@ -63,15 +63,30 @@ class Demands:
     """
 
     def __init__(
-        self, journal: Journal, limit: int, requester_limit: int | None, runtime: Runtime
+        self,
+        journal: Journal,
+        limit: int,
+        requester_limit: int | None,
+        runtime: Runtime,
+        answered: Mapping[str, str],
     ) -> None:
+        """Queue the journal's demands.
+
+        Args:
+            journal: the journal, with the demands that an earlier process left.
+            limit: how many demands may wait.
+            requester_limit: how many demands of one requester may wait; None is no limit.
+            runtime: provides the time and the threads.
+            answered: operation id → a commit before the demand's own, for the demands that earlier
+                processes answered.
+        """
         self._journal = journal
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
-        self._answered: dict[str, str] = {}
+        self._answered = dict(answered)
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
@@ -212,6 +227,10 @@ class Demands:
                 ticket = self._arrived.popleft()
                 error = self._why_refused(ticket, len(taken))
                 if error is None:
+                    twin = self._tickets.get(ticket.operation)
+                    base = twin.base if twin else self._answered.get(ticket.operation)
+                    if base is not None:  # sent again: an earlier sending may be published
+                        ticket.mark_maybe_published(base)  # before its base is journaled
                     self._of_requester[requester_of(ticket.goal)] += 1
                     taken.append(ticket)
                 else:
@@ -227,10 +246,6 @@ class Demands:
                     self._of_requester[requester_of(ticket.goal)] -= 1
                     refused.append((ticket, failure))
             for ticket in taken:
-                twin = self._tickets.get(ticket.operation)
-                base = twin.base if twin else self._answered.get(ticket.operation)
-                if base is not None:  # sent again: an earlier sending may be published
-                    ticket.mark_maybe_published(base)
                 self._tickets[ticket.operation] = ticket
                 _change(ticket, "waiting")
                 self._waiting.append(ticket)

@@ -22,6 +22,7 @@ from demandops.staterepo.git.open_repository import connect
 from demandops.staterepo.git.repository import access_error
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import revisions
+from demandops.staterepo.history.commit_log import recent_operations
 from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.slot import Slot
@@ -33,6 +34,12 @@ _GRACE_S = 5.0
 """How many more seconds a stop waits for the worker when the timeout of the stop is over.
 
 A running call of git or ssh-keygen ends sooner.
+"""
+_MOST_RECENT = 1_000
+"""How many commits are read at the start for the demands that earlier processes answered.
+
+A demand that a client sends again with the same operation id counts once if its commit is one of
+these.
 """
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
@@ -96,7 +103,10 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
+        answered = recent_operations(repository.objects, snapshot.commit, _MOST_RECENT)
+        self._demands = Demands(
+            self._slot.journal, queue_limit, requester_limit, runtime, answered
+        )
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,

@@ -139,6 +139,22 @@ def test_a_demand_that_was_taken_up_again_is_not_taken_up_a_third_time(
     assert rig.tip(bare) == tip
 
 
+@pytest.mark.parametrize("point", ["unanswered:2", "published:2"])
+def test_a_leave_that_is_sent_again_after_its_answer_was_lost_spares_a_later_join(
+    drivers: Drivers, url: str, bare: Path, point: str
+) -> None:
+    """Only the history knows the leave, because its process ended."""
+    opening, lanes = demand("join-1", goal(1)), [[demand("leave-1", leave(1))]]
+    drivers.start(url, lanes, opening=opening, die_at=point).listen()
+    assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        again = rig.receipt(generator.submit(leave(1), "op-leave-1"))
+    assert again.outcome == "released"
+    assert again.commit == str(rig.commits(bare)[1].id)
+    assert rig.books(bare) == rig.books_after([goal(1)])
+
+
 @pytest.mark.parametrize(
     ("point", "reason"),
     [

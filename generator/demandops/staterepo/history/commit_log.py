@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from itertools import islice
 from typing import Literal, get_args
 
 import git
@@ -201,6 +203,22 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
             for operation in entry.trailers.get(key, ()):
                 outcomes[operation] = RecordedOutcome(entry.commit, "waiting" if waits else outcome)
     return outcomes
+
+
+def recent_operations(repo: Repository, tip: str | Oid, most: int) -> dict[str, str]:
+    """Return operation id → the commit before the one that records it, oldest first.
+
+    Only the last ``most`` commits along the first parents are read. Signatures are not checked, so
+    :func:`operations_since` must confirm a found id; the commit before is its ``base``. It is
+    empty for the first commit.
+    """
+    found: dict[str, str] = {}
+    with suppress(pygit2.GitError, KeyError):  # an older commit is damaged or missing
+        for commit in islice(first_parents(repo, tip), most):
+            before = str(commit.parent_ids[0]) if commit.parent_ids else ""
+            trailers = entry_of(commit).trailers
+            found.update((each, before) for key in _OUTCOMES for each in trailers.get(key, ()))
+    return dict(reversed(found.items()))
 
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
