@@ -50,9 +50,9 @@ _NEXT: dict[State, tuple[State, ...]] = {
 }
 
 
-_MOST_ANSWERED = 10_000
-"""How many operation ids of answered demands are remembered. A demand that is sent again with such
-an id counts once."""
+_MOST_KNOWN = 10_000
+"""How many operation ids are remembered. A demand that is sent again with one of them counts once.
+"""
 
 
 class Demands:
@@ -68,7 +68,7 @@ class Demands:
         limit: int,
         requester_limit: int | None,
         runtime: Runtime,
-        answered: Mapping[str, str],
+        bases: Mapping[str, str],
     ) -> None:
         """Queue the journal's demands.
 
@@ -77,8 +77,8 @@ class Demands:
             limit: how many demands may wait.
             requester_limit: how many demands of one requester may wait; None is no limit.
             runtime: provides the time and the threads.
-            answered: operation id → a commit before the demand's own, for the demands that earlier
-                processes answered.
+            bases: operation id → a commit before the demand's own, for the demands that earlier
+                processes carried out.
         """
         self._journal = journal
         self._limit, self._requester_limit = limit, requester_limit
@@ -86,7 +86,7 @@ class Demands:
         self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
-        self._answered = dict(answered)
+        self._bases = {**bases, **{ticket.operation: ticket.base for ticket in resumed}}
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
@@ -227,14 +227,16 @@ class Demands:
                 ticket = self._arrived.popleft()
                 error = self._why_refused(ticket, len(taken))
                 if error is None:
-                    twin = self._tickets.get(ticket.operation)
-                    base = twin.base if twin else self._answered.get(ticket.operation)
-                    if base is not None:  # sent again: an earlier sending may be published
-                        ticket.mark_maybe_published(base)  # before its base is journaled
+                    is_known = ticket.operation in self._bases
+                    base = self._bases.setdefault(ticket.operation, ticket.base)
+                    if is_known:  # sent again: an earlier sending may be published
+                        ticket.mark_maybe_published(base)
                     self._of_requester[requester_of(ticket.goal)] += 1
                     taken.append(ticket)
                 else:
                     refused.append((ticket, error))
+            while len(self._bases) > _MOST_KNOWN:
+                del self._bases[next(iter(self._bases))]
             new = [each for each in taken if each.operation not in self._journal.pending]
             try:
                 self._journal.append(ticket.journal_entry() for ticket in new)
@@ -387,9 +389,6 @@ class Demands:
                 _change(ticket, "done")
                 if self._tickets.pop(ticket.operation, None):
                     self._leave(ticket)
-                self._answered[ticket.operation] = ticket.base
-            while len(self._answered) > _MOST_ANSWERED:
-                del self._answered[next(iter(self._answered))]
         for ticket, result in results:
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")

@@ -31,12 +31,12 @@ log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
 _GRACE_S = 5.0
-"""How many more seconds a stop waits for the worker when the timeout of the stop is over.
+"""How many more seconds a stop waits for the threads when the timeout of the stop is over.
 
 A running call of git or ssh-keygen ends sooner.
 """
 _MOST_RECENT = 1_000
-"""How many commits are read at the start for the demands that earlier processes answered.
+"""How many commits are read at the start for the demands that earlier processes carried out.
 
 A demand that a client sends again with the same operation id counts once if its commit is one of
 these.
@@ -103,10 +103,8 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        answered = recent_operations(repository.objects, snapshot.commit, _MOST_RECENT)
-        self._demands = Demands(
-            self._slot.journal, queue_limit, requester_limit, runtime, answered
-        )
+        bases = recent_operations(repository.objects, snapshot.commit, _MOST_RECENT)
+        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime, bases)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -120,8 +118,10 @@ class Generator:
         self._stop_lock = runtime.lock()
         for operation in self.operations:
             log.info("resuming demand %s from the journal", operation)
-        runtime.keep_running("journal", self._demands.journal_arrivals)
-        self._thread = runtime.keep_running("writer", self._worker.run)
+        self._threads = [
+            runtime.keep_running("writer", self._worker.run),
+            runtime.keep_running("journal", self._demands.journal_arrivals),
+        ]
 
     @property
     def snapshot(self) -> Snapshot:
@@ -243,8 +243,8 @@ class Generator:
                 journal for the next start, and their futures raise ``ShuttingDown``.
 
         Returns:
-            A future that returns whether everything was published. It is ready once the worker has
-            ended, or :data:`_GRACE_S` after the timeout.
+            A future that returns whether everything was published. It is ready once the threads
+            have ended, or :data:`_GRACE_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:
@@ -255,11 +255,9 @@ class Generator:
         return finished
 
     def _end(self, timeout: float, finished: Future[bool]) -> None:
-        self._thread.join(timeout)
-        if self._thread.is_alive():
+        if not self._have_ended(timeout):
             self._worker.end_soon()
-            self._thread.join(_GRACE_S)
-        if self._thread.is_alive():  # the worker may still hold locks
+        if not self._have_ended(_GRACE_S):  # a thread may still hold locks
             log.error("the generator did not end; its demands stay in the journal")
             finished.set_result(False)
             return
@@ -267,6 +265,13 @@ class Generator:
         self._slot.close()
         finished.set_result(not unpublished)
 
+    def _have_ended(self, timeout: float) -> bool:
+        """Wait for the threads to end, for up to ``timeout`` seconds; return whether they have."""
+        end = self._runtime.monotonic() + timeout
+        for thread in self._threads:
+            thread.join(max(0.0, end - self._runtime.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)
+
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
-        """Stop, wait for the worker to end, and return whether everything was published."""
+        """Stop, wait for the threads to end, and return whether everything was published."""
         return self.stop(timeout).result()

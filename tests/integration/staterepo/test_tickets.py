@@ -360,6 +360,20 @@ def test_one_operation_id_handed_in_twice_is_one_commit(bare: Path) -> None:
     assert rig.operations(bare) == ["op-0", "op-1"]
 
 
+def test_a_leave_that_is_sent_twice_in_a_batch_spares_the_join_between(bare: Path) -> None:
+    gate = Gate()
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        generator.submit(goal(0), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        leave = generator.submit(rig.leave(1), "op-leave")
+        generator.submit(goal(1), "op-join")
+        again = generator.submit(rig.leave(1), "op-leave")
+        gate.open.set()
+        assert rig.receipt(again).commit == rig.receipt(leave).commit
+    assert rig.operations(bare)[1:] == ["op-0", "op-leave", "op-join"]
+
+
 # ---- a disk that is full ----
 
 
