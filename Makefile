@@ -38,7 +38,7 @@ setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 inte
 $(STAMP): pyproject.toml constraints.txt
 	@echo "setup: installing Python packages into $(VENV), about a minute"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[ros,dev,docs]'
+	@$(PY) -m pip install --quiet --disable-pip-version-check --use-pep517 -c constraints.txt -e '.[ros,dev,docs]'
 	@touch $@
 
 go:
