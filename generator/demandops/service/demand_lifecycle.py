@@ -225,30 +225,33 @@ class Demands:
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
+                earlier = self._tickets.get(ticket.operation)
+                if earlier is not None:
+                    earlier.join(ticket)
+                    continue
                 error = self._why_refused(ticket, len(taken))
-                if error is None:
-                    is_known = ticket.operation in self._bases
-                    base = self._bases.setdefault(ticket.operation, ticket.base)
-                    if is_known:  # sent again: an earlier sending may be published
-                        ticket.mark_maybe_published(base)
-                    self._of_requester[requester_of(ticket.goal)] += 1
-                    taken.append(ticket)
-                else:
+                if error is not None:
                     refused.append((ticket, error))
+                    continue
+                if ticket.operation in self._bases:  # sent again: the first may be published
+                    ticket.mark_maybe_published(self._bases[ticket.operation])
+                self._bases[ticket.operation] = ticket.base
+                self._of_requester[requester_of(ticket.goal)] += 1
+                self._tickets[ticket.operation] = ticket
+                taken.append(ticket)
             while len(self._bases) > _MOST_KNOWN:
                 del self._bases[next(iter(self._bases))]
-            new = [each for each in taken if each.operation not in self._journal.pending]
             try:
-                self._journal.append(ticket.journal_entry() for ticket in new)
+                self._journal.append(ticket.journal_entry() for ticket in taken)
             except (StateRepoError, Unsound) as failure:
                 log.error("%s", failure)
                 self.wake()  # the worker ends the process, if it must
-                for ticket in new:
-                    taken.remove(ticket)
+                for ticket in taken:
+                    del self._tickets[ticket.operation]
                     self._of_requester[requester_of(ticket.goal)] -= 1
                     refused.append((ticket, failure))
+                taken = []
             for ticket in taken:
-                self._tickets[ticket.operation] = ticket
                 _change(ticket, "waiting")
                 self._waiting.append(ticket)
             self._new += taken

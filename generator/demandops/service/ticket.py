@@ -74,6 +74,7 @@ class Ticket:
     ``base`` is the tip that was known when the demand arrived. ``maybe_published``: the remote may
     have accepted a push of the demand although no answer arrived. ``has_released``: the demand
     released another demand that awaited approval, so there may be no claims to release.
+    ``joined`` are tickets of the same operation id that arrived later; they get the same answer.
     """
 
     operation: str
@@ -87,6 +88,7 @@ class Ticket:
     has_released: bool = False
     state: State = "waiting"
     notified: set[str] = field(default_factory=set)
+    joined: list[Ticket] = field(default_factory=list)
     proposal: ProposalRecord | None = None
 
     def __post_init__(self) -> None:
@@ -105,6 +107,20 @@ class Ticket:
         self.future.set_exception(error)
         self.journaled.set_result(False)
 
+    def join(self, other: Ticket) -> None:
+        """Give ``other``, which has the same operation id, the stages and answer of this ticket."""
+
+        def answer(future: Future[Receipt]) -> None:
+            error = future.exception()
+            if error is None:
+                other.future.set_result(future.result())
+            else:
+                other.future.set_exception(error)
+
+        self.joined.append(other)
+        self.future.add_done_callback(answer)
+        self.journaled.add_done_callback(lambda done: other.journaled.set_result(done.result()))
+
     def notify(self, stage: Stage, text: str) -> None:
         """Report a stage to the listener, but only once, even if the demand is evaluated again.
 
@@ -114,10 +130,11 @@ class Ticket:
         if key in self.notified:
             return
         self.notified.add(key)
-        try:
-            self.listener(stage, text)
-        except Exception:
-            log.exception("a listener failed")
+        for ticket in (self, *self.joined):
+            try:
+                ticket.listener(stage, text)
+            except Exception:
+                log.exception("a listener failed")
 
     def mark_maybe_published(self, base: str) -> None:
         """Record that a push on top of ``base`` may have succeeded although it seemed to fail."""
@@ -168,6 +185,7 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
             log.error("%s: refused: %s", demand, text)
 
     ticket.listener = tell
+    ticket.journaled.set_result(True)
     ticket.mark_maybe_published(entry.base)
     if entry.proposal is not None:
         ticket.proposal = entry.proposal

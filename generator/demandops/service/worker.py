@@ -245,15 +245,11 @@ class Worker:
         if commits.start.commit != tip:
             return None
         began = self._runtime.monotonic()
-        operations = set[str]()
         for number, ticket in enumerate(part):
             self._require_not_ending()
-            took_long = number and self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            # a demand that was sent twice must find the commit of its first sending
-            if took_long or ticket.operation in operations:
+            if number and self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
                 part, left = part[:number], part[number:] + left
                 break
-            operations.add(ticket.operation)
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluated(commits, ticket))
             if commits.is_empty:

@@ -374,6 +374,28 @@ def test_a_leave_that_is_sent_twice_in_a_batch_spares_the_join_between(bare: Pat
     assert rig.operations(bare)[1:] == ["op-0", "op-leave", "op-join"]
 
 
+def test_a_demand_that_is_sent_again_while_it_waits_gets_the_answer_of_its_first_sending(
+    url: str, bare: Path
+) -> None:
+    gate = Gate()
+    stages: list[str] = []
+    with rig.running(url) as generator:
+        generator.submit(goal(0), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        first = generator.submit(goal(1), "op-1")
+        again = generator.submit(goal(1), "op-1", lambda stage, text: stages.append(stage))
+        wrong = [generator.submit(rig.impossible(), "op-wrong") for _ in range(2)]
+        assert first.journaled.result(rig.PATIENCE_S)
+        assert again.journaled.result(rig.PATIENCE_S)
+        gate.open.set()
+        assert rig.receipt(first) == rig.receipt(again)
+        errors = [ticket.future.exception(rig.PATIENCE_S) for ticket in wrong]
+    assert isinstance(errors[0], DemandOpsError)
+    assert errors[0] is errors[1]
+    assert stages == ["admitted", "booked", "committed", "pushed"]
+    assert rig.operations(bare) == ["op-0", "op-1"]
+
+
 # ---- a disk that is full ----
 
 
