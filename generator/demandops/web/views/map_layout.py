@@ -68,7 +68,7 @@ class Box:
 def by_cluster(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
-    """Return id → card in its place, one box for each cluster, and the height of the map.
+    """Return the placed cards by node id, one box for each cluster, and the height of the map.
 
     Each box has a group of rows of cards for each type of node.
     """
@@ -121,10 +121,10 @@ def _box(
 def by_place(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], float]:
-    """Return id → card in its place, and the height of the map.
+    """Return the placed cards by node id, and the height of the map.
 
     A node that has a position is placed there, with north at the top. The nodes without a position
-    are in rows below.
+    follow in rows below.
     """
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
