@@ -19,14 +19,14 @@ from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.kube_api import KubeApi, kube_api
 
 _LONG_ENOUGH_S = 0.2
-"""After this time the trigger's thread has seen what happened before."""
+"""After a wait of this length, the trigger's thread has seen what the test did before."""
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
 
 def trigger(
     case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
 ) -> None:
-    """Trigger the cluster of a golden case once; ``changed`` lists the paths that have changed."""
+    """Wake the cluster of a golden case once; ``changed`` lists the paths that have changed."""
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)
@@ -155,11 +155,11 @@ def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(
     clock.pass_(30)
     waker(state.config)
     time.sleep(_LONG_ENOUGH_S)
-    assert len(api.patches) == 1  # half a minute later it is still busy with the first fetch
+    assert len(api.patches) == 1  # half a minute later Flux is still busy with the first fetch
     if step == "applied":
         apply(api, "b")
         time.sleep(_LONG_ENOUGH_S)
-        assert len(api.patches) == 1  # it has just become idle
+        assert len(api.patches) == 1  # Flux has just become idle
         clock.pass_(1)
     else:
         clock.pass_(30)
