@@ -9,7 +9,7 @@ from demandops.errors import InvalidInput
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
-    """Return (name, text) of a file; the name is the one for messages. ``-`` is standard input.
+    """Return a file's name, as messages give it, and its text. ``-`` is standard input.
 
     Raises:
         InvalidInput: if the file cannot be read or is not UTF-8.
