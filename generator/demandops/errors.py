@@ -95,7 +95,7 @@ class InvalidInput(DemandOpsError):
 
 
 def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
-    """Yield the first faults of each file, then how many more the file has, as one fault.
+    """Yield the first faults of each file, and one fault that says how many more the file has.
 
     Long field names are shortened.
     """

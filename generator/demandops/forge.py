@@ -29,7 +29,7 @@ PullRequestState = Literal["open", "merged", "closed"]
 
 
 class ForgeError(DemandOpsError):
-    """Raised when a forge fails or refuses; ``status`` is its HTTP status, if it answered.
+    """Raised when a forge fails or refuses; ``status`` is the HTTP status, if it answered.
 
     ``asks_to_wait`` says whether the forge got too many calls. No message contains the token.
     """

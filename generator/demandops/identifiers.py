@@ -41,7 +41,7 @@ def control_character(text: str) -> str:
 
 
 def id_problem(value: str) -> str:
-    """Return the problem of an id, or an empty string.
+    """Return what is wrong with an id, or an empty string.
 
     An id may be nearly any text. It must not contain invisible characters or ``..``, and must not
     start or end with white space.

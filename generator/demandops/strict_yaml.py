@@ -71,7 +71,7 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""The function that makes the value of a scalar, by tag. Values of other tags do not fit JSON."""
+"""The function that makes a scalar's value, by tag. Values of other tags do not fit JSON."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -251,7 +251,7 @@ _LISTED = re.compile(
 )
 """Matches a field with a list of plain texts, as :func:`to_json` writes it."""
 _LONG = 200
-"""Lists of at least this many characters are read by the json module, 20 times faster."""
+"""The json module reads lists of at least this many characters, as it is 20 times faster."""
 _STAND_IN = "demandops-list"
 """The prefix of the words that replace long lists while PyYAML reads the rest of a text."""
 
@@ -288,7 +288,7 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
     try:
         if len(text) > _MOST_KEPT:
             return _only_document(text)
-        return marshal.loads(_kept(text))  # noqa: S302 - bytes of our own
+        return marshal.loads(_kept(text))  # noqa: S302 - bytes of this process
     except InvalidInput as error:
         raise InvalidInput(faults_in(error, file)) from error.__cause__
 
@@ -400,7 +400,7 @@ def set_key(text: str, key: str, value: object) -> str:
 
 
 def to_json(value: object) -> str:
-    """Return ``value`` as JSON that is also valid YAML; ``{{ … }}`` in a template gives this text.
+    """Return ``value`` as JSON that is also valid YAML. ``{{ … }}`` in a template writes this text.
 
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
     """

@@ -1,4 +1,4 @@
-"""Watches one ConfigMap, and passes its data on, first at the start and after each change."""
+"""Watches one ConfigMap, and passes on its data: once at the start, and after each change."""
 
 from __future__ import annotations
 

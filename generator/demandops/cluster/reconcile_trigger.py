@@ -35,15 +35,15 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""The least number of seconds before a fetch, both since the last fetch and since Flux has applied
-what it fetched. Two fetches within a second can make source-controller corrupt an artifact."""
+"""A fetch begins at least this many seconds after the last one, and after Flux has applied what the
+last one brought. Two fetches within a second can make source-controller corrupt an artifact."""
 _LONGEST_WAIT_S = 60.0
 """Flux is woken this many seconds after a push at the latest, even if it is not idle."""
 _REFRESH = "argocd.argoproj.io/refresh"
 
 
 ChangesSince = Callable[[str], tuple[str, list[str] | None]]
-"""Returns the newest published commit, and the paths changed since a given one, or None."""
+"""Returns the newest published commit, and the paths changed since the given commit, if known."""
 
 
 @dataclass(eq=False)
@@ -62,7 +62,7 @@ class _Wake:
     idle_from: float = -inf
     """Since when the controller is known to be idle; infinity while it is busy."""
     handled: dict[str, str] = field(default_factory=dict)
-    """For each domain, the last request that its GitRepository had handled before the call."""
+    """For each domain, the last request that its GitRepository had handled before the last call."""
 
     @property
     def is_untried(self) -> bool:
@@ -192,7 +192,7 @@ class ReconcileTrigger:
 
         Only the first failure is logged.
         """
-        assert self._config is not None  # noqa: S101 - only a push makes wakes
+        assert self._config is not None  # noqa: S101 - without a push there is no wake
         objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}
         wake.handled = {
             domain.name: Flux().handled_request(_on_cluster(wake, domain), objects)

@@ -61,7 +61,7 @@ class RolloutWatcher:
         history: History,
         runtime: Runtime = REAL,
     ) -> None:
-        """Make a watcher. It starts to watch an access domain when the domain's first rollout does.
+        """Make a watcher. It starts to watch an access domain with the first rollout there.
 
         Args:
             clusters: the access to each cluster; clusters without a kubeconfig are ignored.

@@ -103,7 +103,7 @@ class Follower:
         If ``revision`` is empty, return the newest situation.
 
         Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or its state is not valid.
+            InvalidInput, StateRepoError: if there is no such commit, or its state cannot be read.
         """
         newest = self.newest
         if not revision:

@@ -32,8 +32,8 @@ class WebServer:
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows. The server closes the follower when the server
-                is closed or cannot start.
+            follower: provides what the page shows. It is closed together with the server, and also
+                if the server cannot start.
 
         Raises:
             InvalidInput: if the server cannot listen on the address.

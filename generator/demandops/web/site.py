@@ -57,7 +57,7 @@ _DOCS_HEADERS = _HEADERS | {
 }
 """Headers of the documentation's pages, which contain inline scripts and styles.
 
-To allow these is safe, because the documentation contains no data of a state repo.
+Allowing them is safe, because the documentation contains no data of a state repo.
 """
 _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0

@@ -137,9 +137,9 @@ class CommitState:
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield each planned release of ``before`` that other claims on ``subjects`` need now.
+        """Yield the planned releases of ``before`` whose claims on ``subjects`` have changed.
 
-        The yielded releases have the new claims.
+        The yielded values have the new claims.
         """
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
@@ -289,7 +289,7 @@ class HealthChange:
     """A change of a release's health.
 
     ``before`` and ``after`` are words for a health (:mod:`~demandops.web.views.health_word`).
-    ``lasted_s`` is for how many seconds a release that became healthy was unhealthy before. It is
+    ``lasted_s`` says for how many seconds a release that became healthy had been unhealthy. It is
     None if the release did not become healthy, or if the time is not known.
     """
 

@@ -60,7 +60,7 @@ class ViewRequest:
         return self.params.get(name, "").strip()[:500]
 
     def page(self) -> int:
-        """Return the number of the requested page of a list; 1 without a valid number."""
+        """Return the number of the requested page of a list; 1 if the request gives none."""
         text = self.get("page")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 

@@ -33,7 +33,11 @@ class ArgoCd(HealthReader):
     service_kind = "Application"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the folder's Application, and the namespace's Applications and Deployments."""
+        """Return the objects on which the health of a domain and of its releases depends.
+
+        These are the Application of the domain's folder, and all Applications and Deployments in
+        the domain's namespace.
+        """
         folder = ObjectSelector("Application", *_folder_application(domain))
         return folder, *self.objects_to_confirm(domain)
 
@@ -135,7 +139,7 @@ def _why_outdated(
     application = objects.get(("Application", *_folder_application(domain))) or {}
     folder = (application.get("spec") or {}).get("source") or {}
     if source.get("repoURL") != folder.get("repoURL"):
-        return ""  # a registry has the chart: its version is in the source, which was compared
+        return ""  # the chart is in a registry, and its version is part of the compared source
     revision = str(sync.get("revision", ""))
     path = str(source.get("path", ""))
     if history.includes(revision, commit) or history.unchanged(revision, commit, path):

@@ -85,7 +85,7 @@ class Flux(HealthReader):
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
-        """Return whether Flux has finished what the domain's last fetch started.
+        """Return whether Flux has finished all work of a domain's last fetch.
 
         Flux is idle too if the domain's objects do not exist or are suspended.
 

@@ -115,7 +115,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects that the health of a domain and its releases depends on."""
+        """Return the objects on which the health of a domain and of its releases depends."""
 
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
         """Return the objects to read again before a release counts as healthy.

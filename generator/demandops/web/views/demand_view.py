@@ -21,10 +21,10 @@ from demandops.web.situation import Situation
 class Consequence:
     """What would change if a demand were released, and how to release it.
 
-    ``how`` says in words how to release the demand. ``file`` is the text of a file with which
-    ``demandops request`` releases it; it is empty if that command cannot. ``approval`` names the
-    rules that require a person's approval. ``refused`` is the reason why the generator would refuse
-    the release, or empty.
+    ``how`` says in words how to release the demand. ``file`` is the text of a file for ``demandops
+    request`` that releases the demand; it is empty if no file can. ``approval`` names the rules
+    that require a person's approval. ``refused`` is the reason why the generator would refuse to
+    release the demand, or empty.
     """
 
     releases: tuple[ReleaseChange, ...]

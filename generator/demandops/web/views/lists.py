@@ -24,10 +24,10 @@ Values: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """A kind of list: its name in addresses, its title, its columns and its entries.
+    """One of the lists: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values; it
-    is called again only if a value of the entry has changed.
+    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values. For
+    an entry whose values have not changed, ``row`` is not called again.
     """
 
     name: str
@@ -49,7 +49,7 @@ def demand_part(id: str) -> Part:
 
 
 def health_cell(word: str) -> Cell:
-    """Return the cell for a health word; cells are sorted from the worst to the best health."""
+    """Return the cell for a health word; its sort key puts the worst health first."""
     return cell(word, tone=WORDS[word], order=RANKS[word])
 
 

@@ -29,8 +29,9 @@ class ServiceMark:
 class NodeCard:
     """A node as it is drawn.
 
-    ``count`` is the number of all services. ``services`` lists the services that the card shows;
-    it is empty if there is no room. ``more`` counts the services that such a list leaves out.
+    ``count`` is the number of all services on the node. ``services`` lists the services that the
+    card shows; it is empty if the card is too small. ``more`` counts the services that do not fit
+    on a card that shows some.
     """
 
     id: str
@@ -70,7 +71,7 @@ def by_cluster(
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
     """Return the placed cards by node id, one box for each cluster, and the height of the map.
 
-    Each box has a group of rows of cards for each type of node.
+    The cards in a box are in rows, grouped by the type of the node.
     """
     clusters: dict[str, dict[str, list[NodeCard]]] = {}
     for node in sorted(nodes, key=lambda one: one.id):

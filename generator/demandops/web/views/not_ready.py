@@ -1,4 +1,4 @@
-"""The applications that are not ready; the causes, since when they exist, and who can fix them."""
+"""Which applications are not ready, for which causes, since when, and who can fix the causes."""
 
 from __future__ import annotations
 
@@ -288,7 +288,7 @@ def _waits(waiting: WaitingDemand) -> Cause:
 
 
 def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
-    """Yield one cause for all releases of a cluster that are not healthy for the same reason."""
+    """Yield a cause for each reason why releases on a cluster are not healthy."""
     together: dict[tuple[str, str, str, str], list[str]] = {}
     for name, release in now.commit_state.releases.items():
         status = now.status(name)
@@ -335,9 +335,9 @@ def _why(kind: Kind, object: str, several: bool) -> str:
 
 
 def _affected(commit_state: CommitState, names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Return the applications, requesters and demands that releases affect.
+    """Return the applications, requesters and demands that need the releases ``names``.
 
-    A connection affects the applications of the demands that hold it.
+    The applications that need a connection are those of the demands that hold the connection.
     """
     applications: dict[str, None] = {}
     claims = [claim for name in names for claim in commit_state.claims_of_releases[name]]

@@ -43,7 +43,7 @@ _BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommi
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of the time line: a commit, or a change of health without a commit."""
+    """An event of the time line: a commit, or a change of a release's health."""
 
     lane: str
     time: datetime
