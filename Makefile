@@ -5,20 +5,21 @@ PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.setup-done
 # Each target first checks that the system provides what it needs.
 SYSTEM := system-demo system-test system-page system-faults system-e2e system-e2e-argocd
-# Distributions have too old a Go, so the end-to-end tests bring this one unless PATH has it.
+# The Go of distributions is too old, so the end-to-end tests install this version unless PATH has
+# it or a newer one.
 GO     := 1.26
 GO_DIR := build/go-$(GO)
-# Slow, so other targets of the gate run them.
+# These tests are slow, so `make test` leaves them out and other targets run them.
 PACKAGE_TESTS := tests/packages
 PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
-# More than there are cores: while a test waits for another process, a core is free.
+# More workers than cores, because a core is free while a test waits for another process.
 WORKERS := $(shell echo $$(($$(nproc) + 2)))
-# Tests and the demo talk on this machine only.
+# The ROS nodes of the tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
-# Tests start many processes, and each would compile all modules anew.
+# Tests start many processes, and without bytecode files each would compile all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
@@ -62,11 +63,12 @@ test: system-test setup  ## Run all tests but the slow ones, which other targets
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
 
-# With FIGURES=1 it also writes the screenshots of the docs: docs/figures
+# With FIGURES=1 the target also writes the screenshots of the docs: docs/figures
 page: system-page setup  ## Look at the web page in a headless browser: every view, live, light, dark, on a phone
 	@$(PY) -m pytest -q $(PAGE_TESTS)
 
-# The core's tests need no Git: without_git forbids its import, and --confcutdir leaves conftest.py out.
+# The core's tests must not import Git: without_git forbids that, and --confcutdir leaves out
+# tests/conftest.py, which imports it.
 CORE := config decision demand ledger plan render
 CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
   $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
@@ -78,13 +80,13 @@ coverage: system-test setup  ## Report what the tests cover, then what the core'
 	@$(PY) -m pytest -n auto --dist worksteal $(CORE_TESTS) \
 	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
 
-# The long form tries every call: make faults FAULTS=--long. It may take an hour on 2 busy cores;
-# FAULTS='--long --resume' goes on with one that was interrupted.
+# The long form tries every system call: make faults FAULTS=--long. It may take an hour on 2 busy
+# cores. If it was interrupted, FAULTS='--long --resume' continues it.
 faults: system-faults setup  ## Kill generators; inject an error, a kill, a full disk or power loss at each system call of a demand; four minutes
 	@$(PY) -m pytest -q -n auto $(KILL_TESTS)
 	@$(PY) -m tests.faults $(FAULTS)
 
-# On a cluster that is there (E2E_KUBECONFIG) the tests start no programs of their own.
+# If E2E_KUBECONFIG names a cluster, the tests use that cluster and start no programs of their own.
 e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for flux; fi
@@ -95,7 +97,7 @@ e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONF
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
 
-# With FIGURES=1 it also draws the plots of the docs: docs/figures
+# With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (docs/experiment.md)
 	@$(PY) -m tests.experiment $(EXPERIMENT)
@@ -113,13 +115,13 @@ format: setup  ## Format the code and mend what the linter can
 	@$(PY) -m ruff format .
 	@$(PY) -m ruff check --fix .
 
-golden: setup  ## Rewrite the golden folders, and the schemas and tables of the charts; review the diff
+golden: setup  ## Rewrite the golden files, and the schemas and tables of the charts; review the diff
 	@$(PY) -m tests.golden.write
 	@$(PY) -m tests.terminal.write
 	@$(PY) -m tests.unit.charts.write
 	@$(PY) -m tests.unit.messages
 
-bench: system-page setup  ## Measure the cost of commits and demands as the ledger grows, the event detector and the page
+bench: system-page setup  ## Measure the event detector, the page, and the cost of commits and demands as the ledger grows
 	@$(PY) -m tests.benchmarks.commits
 	@$(PY) -m tests.benchmarks.growth
 	@$(PY) -m tests.benchmarks.configured
@@ -133,16 +135,16 @@ bench-audit: setup  ## Measure the cost of an auditor's questions after 10,000 c
 load: setup  ## Test load: four generators and a person write 2,000 demands at once, while connections are cut
 	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py tests/integration/staterepo/test_people_in_the_loop.py
 
-# The gate gives each target 2 seconds. What it found before is tried again: build/fuzz/corpus.
+# The gate sets 2 seconds. Inputs that earlier runs kept in build/fuzz/corpus are tried again.
 fuzz: export FUZZ_S ?= 10
-fuzz: system-test setup  ## Try odd inputs at every parser and writer, FUZZ_S seconds for each (default 10)
+fuzz: system-test setup  ## Try odd inputs on every parser and writer, each for FUZZ_S seconds (default 10)
 	@$(PY) -m tests.fuzz
 
 simulate: setup  ## Find planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
 	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
 
-# The theme's authors announce their next program at each build unless this is set.
+# Without this variable, each build prints an announcement of the theme's authors.
 docs: export NO_MKDOCS_2_WARNING := 1
 docs: setup  ## Build the documentation into build/site, check its links, run its commands
 	@$(PY) -m mkdocs build

@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from demandops.quoting import clipped, one_line
 
 MOST_FAULTS = 100
-"""How many faults of one file, or of a request, are listed; the others are counted."""
+"""How many faults of one file, or of a request, are listed; further ones are only counted."""
 _LONGEST_FIELD = 2_000
 _COMPARED = 12
 
@@ -26,8 +26,8 @@ class Fault:
 
     ``code`` is a stable word for programs (``unknown-node``). ``field`` is the path inside the
     input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it, on one
-    line. ``file`` names the file, if the input is one, and ``line`` the line of the field, if it is
-    known.
+    line. ``file`` names the file, if the input is a file. ``line`` is the line of the field, if it
+    is known.
     """
 
     code: str
@@ -95,7 +95,7 @@ class InvalidInput(DemandOpsError):
 
 
 def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
-    """Yield the first faults of each file, then one fault for each file that counts its others.
+    """Yield the first faults of each file, and one fault that says how many more the file has.
 
     Long field names are shortened.
     """
@@ -141,7 +141,7 @@ class ShuttingDown(DemandOpsError):
 
 
 class Unsound(DemandOpsError):
-    """Raised when a demand could be lost or booked twice, or another process might answer it too.
+    """Raised when a demand could be lost, booked twice, or answered by another process as well.
 
     No requester gets an answer, and the process ends with exit code 3. The next start reads the
     journal.
@@ -188,8 +188,8 @@ def _neighbors(word: str, names: list[str]) -> list[str]:
     """Return the names that are worth comparing with a word.
 
     These are the word's neighbors in two orders: the alphabetical order, and the alphabetical order
-    of the names read backwards. To compare a word with thousands of names is slow, and one file or
-    goal may have thousands of unknown words. A short list of names is returned whole.
+    of the names read backwards. If there are few names, all are returned. To compare a word with
+    thousands of names is slow, and one file or goal may have thousands of unknown words.
     """
     if len(names) <= _COMPARED:
         return names

@@ -60,7 +60,7 @@ class FieldLines:
 
 
 def nearest(field: str, known: Mapping[str, int]) -> int | None:
-    """Return the line of a field, by ``known``, which maps fields to lines.
+    """Return the line of a field from ``known``, which maps fields to lines.
 
     If the field is not known, return the line of the nearest known part that contains it. Return
     None if there is no such part.
@@ -81,7 +81,7 @@ def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) ->
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """Add the line of the field to each fault that the block raises.
+    """Add to each fault that the block raises the line of the fault's field.
 
     The fields of the faults must be fields of ``text``.
     """

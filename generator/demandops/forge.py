@@ -1,6 +1,6 @@
-"""Pull requests of proposals at a forge: GitHub, and Gitea or Forgejo.
+"""Pull requests for proposals, at a forge: GitHub, Gitea or Forgejo.
 
-This module knows pull requests and HTTP, but not demands or Git: the branch is already pushed.
+This module knows pull requests and HTTP, but not demands or Git. Its callers push the branch.
 GitLab needs no call, because it opens a merge request if the push has the right options
 (:mod:`demandops.staterepo.write.proposal_branch`).
 """
@@ -29,9 +29,9 @@ PullRequestState = Literal["open", "merged", "closed"]
 
 
 class ForgeError(DemandOpsError):
-    """Raised when a forge fails or refuses; ``status`` is its HTTP status, if it answered.
+    """Raised when a forge fails or refuses; ``status`` is the HTTP status, if it answered.
 
-    ``asks_to_wait``: the forge got too many calls. No message contains the token.
+    ``asks_to_wait`` says whether the forge got too many calls. No message contains the token.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class PullRequest:
 
 
 class Forge(ABC):
-    """A project on a forge. Every method raises ``ForgeError`` if the forge fails or refuses."""
+    """A project on a forge. Every method raises :class:`ForgeError` if a call fails."""
 
     NAME: ClassVar[str]
     HEADERS: ClassVar[dict[str, str]]
@@ -67,19 +67,19 @@ class Forge(ABC):
 
     @abstractmethod
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest pull request for a branch in any state, or ``None``."""
+        """Return the newest pull request for a branch, open or not; ``None`` if there is none."""
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Return whether ``data``, the forge's JSON for a pull request, says that it is merged.
+        """Return whether a pull request is merged, from ``data``, the forge's JSON about it.
 
         Raises KeyError or TypeError if ``data`` is not about a pull request.
         """
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the branch's pull request, in any state; open one if there is none.
+        """Return the branch's pull request, open or not; open one if there is none.
 
-        A branch gets only one pull request: if the pull request is closed, no other is opened.
+        A branch gets only one pull request: if that is closed, this method opens no other.
         """
         existing = self.find(branch, target)
         if existing is not None:
@@ -210,7 +210,7 @@ def _token(file: Path | None, forge: str) -> str:
     if file is None:
         raise ForgeError(
             f"proposals.forge is {forge}, but there is no token for it; set "
-            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds one"
+            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds the token"
         )
     try:
         token = read_secret(file).decode("latin-1").strip()

@@ -1,9 +1,9 @@
 """HTTP calls to other services: the only module that imports httpx.
 
-A call trusts the certificates of ``SSL_CERT_FILE``, else the system's. It uses the proxy that the
-usual environment variables name. It follows no redirect, because credentials must not reach another
-host. The answer's length and duration are limited. No error contains the URL or a header, because
-they may hold secrets.
+A call trusts the certificates in ``SSL_CERT_FILE``, or those of the system if that is not set. It
+uses the proxy that the usual environment variables name. It follows no redirect, because
+credentials must not reach another host. The answer's length and duration are limited. No error
+contains the URL or a header, because they may hold secrets.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class NoAnswer(DemandOpsError):
 class HttpAnswer:
     """An answer: its status, the status in words, and the body.
 
-    ``asks_to_wait``: the service got too many calls. Some services then answer 429, others (GitHub)
-    403 with headers that say so.
+    ``asks_to_wait`` says whether the service got too many calls. Some services then answer with
+    status 429, others (GitHub) with 403 and headers that say so.
     """
 
     status: int
@@ -70,7 +70,7 @@ def call(
     Raises:
         NoAnswer: if there is no answer, or if the answer is too long or too slow.
     """
-    import httpx  # noqa: PLC0415 - the import takes a tenth of a second, so do it only when used
+    import httpx  # noqa: PLC0415 - slow (a tenth of a second), so only on use
 
     headers = {"User-Agent": f"demandops/{__version__}", "Accept-Encoding": "identity", **headers}
     end = REAL.monotonic() + 2 * timeout
@@ -103,7 +103,7 @@ def call(
 
 
 def _trust(url: str) -> ssl.SSLContext:
-    """Return the certificates that a call trusts; none without TLS, as to load them is slow."""
+    """Return the certificates that a call trusts; none for plain HTTP, because loading is slow."""
     if url.startswith("http://"):
         return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     return ssl.create_default_context()

@@ -1,4 +1,4 @@
-"""The rules for ids, topic names and message types, and descriptions of other fields' patterns."""
+"""The rules for ids, topic names and message types, and words for the patterns of other fields."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def absolute_topic(topic: str) -> str:
 
 
 def control_character(text: str) -> str:
-    """Return the first invisible or bidirectional control character of a text.
+    """Return the name of a text's first control character, like ``U+202E``, or an empty text.
 
-    The result is its name, like ``U+202E``. It is empty if there is no such character.
+    Line separators, lone surrogates and characters that change the text's direction count too.
     """
-    if text.isprintable():  # all of these characters are unprintable
+    if text.isprintable():  # Python calls no such character printable
         return ""
     for char in text:
         if unicodedata.category(char) in _UNSEEN or char in _BIDI:
@@ -41,7 +41,7 @@ def control_character(text: str) -> str:
 
 
 def id_problem(value: str) -> str:
-    """Return the problem of an id, or an empty string.
+    """Return what is wrong with an id, or an empty string.
 
     An id may be nearly any text. It must not contain invisible characters or ``..``, and must not
     start or end with white space.
@@ -57,7 +57,8 @@ def id_problem(value: str) -> str:
     if not is_visible(value):
         char = next(char for char in value if not is_visible(char))
         return (
-            f"{quoted(value)} has the invisible character U+{ord(char):04X}; choose one without it"
+            f"{quoted(value)} has the invisible character U+{ord(char):04X}; "
+            "choose an id without it"
         )
     return ""
 
@@ -126,4 +127,4 @@ PATTERN_WORDS = {
         "a topic that begins with '/', such as /{instance}_objects"
     ),
 }
-"""Pattern of a field → description, for messages, of the texts that match the pattern."""
+"""Which texts match the regular expression of a field, in words for messages."""

@@ -9,7 +9,7 @@ from demandops.errors import InvalidInput
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
-    """Return (name, text) of a file; the name is the one for messages. ``-`` is standard input.
+    """Return a file's name, as messages give it, and its text. ``-`` is standard input.
 
     Raises:
         InvalidInput: if the file cannot be read or is not UTF-8.
@@ -41,9 +41,9 @@ def read_secret(path: Path, *, private: bool = False) -> bytes:
             problem = "may be read by everybody on this machine; run chmod o= on it"
         else:
             secret = path.read_bytes().rstrip(b"\r\n")
-            problem = "is empty; put the secret there"
+            problem = "is empty; write the secret into this file"
     except OSError as error:
-        problem = f"cannot be read: {error.strerror or error}; put the secret there"
+        problem = f"cannot be read: {error.strerror or error}; write the secret into this file"
     if not secret.strip():
         raise InvalidInput.at("", problem, file=str(path))
     return secret

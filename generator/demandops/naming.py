@@ -3,7 +3,7 @@
 A name depends only on the ids that it is made from. Two different ids never give the same object
 name: if an id must be shortened or changed to fit, a hash of the exact id is appended. Object names
 follow DNS-1123 and have at most 53 characters, Helm's limit for a release name. Topic names are
-made as the reference makes them, so the ids ``a/b`` and ``a-b`` both give ``a_b`` there.
+made as the reference makes them, so the ids ``a/b`` and ``a-b`` both give ``a_b`` in a topic name.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    If an id gives no valid name in this way, a hash is appended. ``extra`` distinguishes names with
-    the same id, for example those of two point clouds of one source. With ``extra``, the name also
-    contains a slug of ``extra`` and a hash. Results are cached, because each release asks for the
-    names of all its inputs.
+    If an id gives no valid name in this way, a hash is appended. ``extra`` distinguishes names that
+    are made from the same id, for example for two point clouds of one source. With ``extra``, the
+    name also contains a slug of ``extra`` and a hash. Results are cached, because each release asks
+    for the names of all its inputs.
     """
     plain = re.sub("[-/]", "_", id)
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):

@@ -26,12 +26,12 @@ Thread = threading.Thread
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STEADY_S = 2 * _LONGEST_PAUSE_S
-"""A thread that runs for this many seconds has recovered from its last failure."""
+"""A thread has recovered if it has run for this many seconds since its last failure."""
 _LONGEST_REASON = 300
 
 
 class Runtime:
-    """The runtime of this machine; a subclass overrides the methods that it replaces.
+    """Time, random numbers and threads of this machine; a test's subclass replaces them.
 
     ``unsound`` is the error because of which the process must end, or None. ``when_unsound`` is
     called after such an error.
@@ -55,7 +55,7 @@ class Runtime:
         time.sleep(seconds)
 
     def uniform(self, low: float, high: float) -> float:
-        """Return a random number in a range; not for security."""
+        """Return a random number in a range. It is not random enough for secrets."""
         return random.uniform(low, high)  # noqa: S311 - see above
 
     def fresh_id(self) -> str:
@@ -87,7 +87,7 @@ class Runtime:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Name of each thread that failed and has not recovered → the reason."""
+        """Why threads failed that have not recovered, by the name of the thread."""
         now = self.monotonic()
         known = sorted(self._failures.items())
         return {name: text for name, (text, at) in known if now - at < _STEADY_S}
@@ -95,7 +95,7 @@ class Runtime:
     def failed(self, name: str, error: Exception) -> None:
         """Record that the work of a thread failed, and log the error.
 
-        A failure that repeats the last one is logged for debugging only.
+        If the same failure repeats, it is logged at the level DEBUG only.
         """
         is_known = self.failures.get(name) == _reason(error)
         self._failures[name] = (_reason(error), self.monotonic())
@@ -114,8 +114,8 @@ class Runtime:
     def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
         """Start a thread that runs ``target``, and return the thread.
 
-        If ``target`` raises an error, the thread pauses and runs it again. The pause grows with
-        each error. After :class:`Unsound` the thread ends, because the process must end.
+        If ``target`` raises an error, the thread pauses and runs ``target`` again. The pause grows
+        with each error. After :class:`Unsound` the thread ends, because the process must end.
         """
         return self.start_thread(name, lambda: self._supervise(name, target))
 

@@ -33,13 +33,13 @@ DEFAULT_DEMAND_ACTION_NAME = "/demandops/demand"
 """The action that our own clients send goals to."""
 
 QUEUE_LIMIT = 10_000
-"""The number of demands that may be queued; a further demand is rejected."""
+"""How many demands may be queued; a further demand is rejected."""
 
 REQUESTER_QUEUE_LIMIT = 1_000
-"""The number of queued demands of one requester; a further demand is rejected."""
+"""How many demands of one requester may be queued; a further demand is rejected."""
 
 PROPOSAL_LIMIT = 100
-"""The number of demands of one requester that may await approval; a further one is refused."""
+"""How many demands of one requester may await approval; a further demand is refused."""
 
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose files are all rendered from ledger and configuration."""
@@ -77,7 +77,7 @@ def data_folder(name: str) -> Path:
 def documentation() -> Path | None:
     """Return the folder of the documentation's site, or None if it was not built.
 
-    A release has it inside the package; in a checkout ``make docs`` builds it.
+    The wheel of a published version contains the site. In a checkout, ``make docs`` builds it.
     """
     folders = (_PACKAGE / "_data" / "docs", _CHECKOUT / "build" / "site")
     return next((folder for folder in folders if (folder / "index.html").is_file()), None)
@@ -92,8 +92,8 @@ def forge_token_file() -> Path | None:
 def data_home(state_repo: str) -> Path:
     """Return the folder of the generator's journal and clone for one state repo.
 
-    It is inside ``DEMANDOPS_DATA_HOME`` or else ``$XDG_STATE_HOME/demandops``. Its name is a digest
-    of the state repo's address, because the address may contain a password.
+    It is inside ``DEMANDOPS_DATA_HOME`` or, if that is not set, ``$XDG_STATE_HOME/demandops``. Its
+    name is a digest of the state repo's address, because the address may contain a password.
     """
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())

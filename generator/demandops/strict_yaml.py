@@ -1,8 +1,8 @@
 """Strict reading and deterministic writing of YAML.
 
-The program reads every file with :func:`load`. Duplicate keys, anchors and further documents are
-errors. It writes every file with :func:`dump`. Strings are written so that YAML 1.1 and 1.2,
-PyYAML and Go's parsers read the same value.
+The program reads every file with :func:`load`, for which duplicate keys, anchors and further
+documents are errors. It writes every file with :func:`dump`, which writes strings so that YAML 1.1
+and 1.2, PyYAML and Go's parsers read the same value.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _REPRESENTER = yaml.representer.SafeRepresenter()
 
 @lru_cache(16_384)
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes. It is cached, because words repeat often."""
+    """Return the tag of a scalar without quotes. Results are cached, because words repeat often."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -71,7 +71,7 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""Tag → the function that returns a scalar's value. Values of other tags do not fit JSON."""
+"""The function that makes a scalar's value, by tag. Values of other tags do not fit JSON."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -79,7 +79,7 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a list's stand-in does not occur as the value of a field, but inside a text."""
+    """Raised if the stand-in of a list was read as something else than the value of a field."""
 
 
 class _Parser:
@@ -251,9 +251,9 @@ _LISTED = re.compile(
 )
 """Matches a field with a list of plain texts, as :func:`to_json` writes it."""
 _LONG = 200
-"""The length in characters from which the json module reads a list; PyYAML is 20 times slower."""
+"""The json module reads lists of at least this many characters, as it is 20 times faster."""
 _STAND_IN = "demandops-list"
-"""The prefix of stand-ins: words that replace long lists while PyYAML reads the other text."""
+"""The prefix of the words that replace long lists while PyYAML reads the rest of a text."""
 
 
 def _load_around_lists(text: str) -> list[Any]:
@@ -288,21 +288,21 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
     try:
         if len(text) > _MOST_KEPT:
             return _only_document(text)
-        return marshal.loads(_kept(text))  # noqa: S302 - bytes of our own
+        return marshal.loads(_kept(text))  # noqa: S302 - bytes of this process
     except InvalidInput as error:
         raise InvalidInput(faults_in(error, file)) from error.__cause__
 
 
 _MOST_KEPT = 10_000
-"""How many characters a text may have so that its value is kept."""
+"""How many characters a text may have for its value to be cached."""
 
 
 @lru_cache(1024)
 def _kept(text: str) -> bytes:
-    """Return the value of a text as bytes, from which a caller makes a copy of its own.
+    """Return the parsed value of a YAML text, serialized with marshal; results are cached.
 
-    Most files stay the same when a configuration is loaded again. A copy from bytes takes a
-    fiftieth of the time that PyYAML takes.
+    Each caller deserializes the bytes, and so gets a copy of its own. Most files are unchanged when
+    a configuration is loaded again, and deserializing takes a fiftieth of the time of parsing.
     """
     return marshal.dumps(_only_document(text))
 
@@ -346,7 +346,7 @@ def _block(value: Any, indent: str) -> str:  # noqa: ANN401
 
 
 def _item(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return the text of a list's item after the dash; the item's first line follows the dash."""
+    """Return what follows the dash of a list's item; the first line stands on the dash's line."""
     if isinstance(value, str):
         return f" {_scalar(value)}"
     inner = f"{indent}  "
@@ -371,12 +371,12 @@ def _scalar(text: str) -> str:
 
 
 def set_key(text: str, key: str, value: object) -> str:
-    """Return a file's text with one top-level key set; all else, also comments, stays the same.
+    """Return a file's text with one top-level key set; the rest stays, including comments.
 
     A plain value is replaced in place. A missing key is added at the end.
 
     Raises:
-        InvalidInput: if the file's form does not allow that.
+        InvalidInput: if the key cannot be set in the file as it is written.
     """
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -400,7 +400,7 @@ def set_key(text: str, key: str, value: object) -> str:
 
 
 def to_json(value: object) -> str:
-    """Return ``value`` as JSON that is also valid YAML; ``{{ … }}`` in a template gives this text.
+    """Return ``value`` as JSON that is also valid YAML. ``{{ … }}`` in a template writes this text.
 
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
     """

@@ -9,7 +9,7 @@ from typing import TypeAlias
 TopicKey: TypeAlias = "tuple[str, ...]"
 """The identity of a topic within its subject.
 
-For an application, it is role, topic and source. For a connection, it is the topic's name on the
+In an application, that is role, topic and source. In a connection, that is the topic's name on the
 source node.
 """
 

@@ -1,4 +1,4 @@
-"""The table of commands, which `--help` lists without an import of the commands' modules."""
+"""The table of commands, from which `--help` lists them without an import of their modules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HTTP calls to real servers on loopback: TLS trust, time-outs, and the text of errors."""
+"""HTTP calls to real servers on loopback: trust in certificates, time-outs, texts of errors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def call(url: str, timeout: float = 5.0) -> HttpAnswer:
 def speaking(
     *chunks: bytes, pause: float = 0.0, tls: ssl.SSLContext | None = None
 ) -> Iterator[str]:
-    """Serve one connection: send the chunks with a pause after each, then close it."""
+    """Serve one connection: send the chunks with a pause after each, then close the connection."""
 
     def speak() -> None:
         try:

@@ -29,7 +29,7 @@ SAME_NAME = {
 """The module names that may occur more than once, with the reason."""
 
 COMMANDS = PACKAGES[0] / "cli"
-"""The folder of the commands; a module in it has its command's name, which other folders may use.
+"""The folder of the commands. Its modules have the commands' names, which may occur elsewhere too.
 """
 
 

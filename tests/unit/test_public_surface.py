@@ -103,7 +103,7 @@ def files() -> Json:
 
 
 def fields_of_schema(schema: Json) -> Json:
-    """Return the names of the fields in each mapping of a schema, by the mapping's path."""
+    """Return the names of the fields of each mapping in a schema, by the path of the mapping."""
     found: dict[str, list[str]] = {}
     for parent, name in walk(schema, schema.get("$defs", {}), ""):
         names = found.setdefault(parent or "(top)", [])

@@ -1,4 +1,4 @@
-"""The launch files of the ROS package; no test can run them, because PyPI lacks ROS's launch."""
+"""The launch files of the ROS package. Tests cannot run them, because PyPI lacks ROS's launch."""
 
 from __future__ import annotations
 

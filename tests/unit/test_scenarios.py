@@ -1,4 +1,4 @@
-"""Run every scenario of ``tests/scenarios``; a scenario that checks nothing is refused."""
+"""Every scenario of ``tests/scenarios`` holds, and a scenario that checks nothing is refused."""
 
 from __future__ import annotations
 

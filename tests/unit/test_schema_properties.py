@@ -14,7 +14,7 @@ FILE = "templates/schemas/properties.yaml"
 
 
 def properties(name: str) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
-    """Yield name, schema and document of each property of a published schema."""
+    """Yield each property of a published schema: its name, its schema, and the whole document."""
     document = json.loads(schema.text(name))
     root = schema.SCHEMAS[name][0].__name__
     for model, part in {root: document, **document.get("$defs", {})}.items():

@@ -1,4 +1,4 @@
-"""Tables cut no word at any width; outside a terminal each row is one line."""
+"""Tables cut no word at any width. If the output is not a terminal, each row is one line."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_an_empty_table_says_so() -> None:
 @given(st.lists(st.tuples(WORDS, WORDS, st.lists(WORDS)), max_size=4), st.integers(1, 90))
 @examples(80)
 def test_no_word_is_ever_cut(rows: list[tuple[str, str, list[str]]], width: int) -> None:
-    """The first column always stays; other columns are left out if they do not fit beside it."""
+    """The first column is always shown. Other columns are left out if they do not fit."""
     columns = (Column("Name", wraps=True), Column("State", 1, wraps=True), Column("Since", 2))
     table = Table(columns, rows)
     shown = table.lines(width)

@@ -19,7 +19,7 @@ from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
-    """Raised when the operator's files give no usable access; its text contains no secret."""
+    """Raised when the operator's files give no usable access; the message contains no secret."""
 
 
 class ClusterAccess(FrozenModel):
@@ -62,7 +62,7 @@ class ClusterAccess(FrozenModel):
         Raises:
             ConfigException, OSError: from the library, if the kubeconfig cannot be used.
         """
-        from kubernetes import client, config  # noqa: PLC0415 - half a second; only when used
+        from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
         return client.CustomObjectsApi(
             config.new_client_from_config(str(self.kubeconfig), self.context)
@@ -70,9 +70,9 @@ class ClusterAccess(FrozenModel):
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
-    """Return the API of this process's cluster, with the rights of the pod's service account.
+    """Return the API of the cluster in which this process is a pod, without retries.
 
-    The API does not retry a call that fails.
+    Its calls have the rights of the pod's service account.
 
     Args:
         wanted_by: the option or command that needs the API, for the message.
@@ -80,7 +80,7 @@ def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no
     Raises:
         InvalidInput: if this process is not a pod, or its pod has no token.
     """
-    from kubernetes import client, config  # noqa: PLC0415 - half a second; only when used
+    from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
     settings = client.Configuration()
     settings.retries = False
@@ -104,7 +104,7 @@ def read(path: Path) -> AccessFile:
     """Return the content of the operator's file.
 
     Raises:
-        InvalidInput: with all faults.
+        InvalidInput: with all faults of the file and of the secrets that it names.
     """
     name, text = read_input(path)
     with located_in(text):

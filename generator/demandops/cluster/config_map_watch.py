@@ -1,4 +1,4 @@
-"""Watches one ConfigMap, and passes on its data at the start and after each change."""
+"""Watches one ConfigMap, and passes on its data: once at the start, and after each change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OnData = Callable[[Mapping[str, str]], object]
 
 
 class ConfigMapWatch:
-    """Reads and watches a ConfigMap; needs only the right to list and watch this one object."""
+    """Reads and watches a ConfigMap. It needs only the right to list and watch this object."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class ConfigMapWatch:
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
     def _read_and_watch(self) -> None:
-        from kubernetes import client, watch  # noqa: PLC0415 - half a second; only when used
+        from kubernetes import client, watch  # noqa: PLC0415 - slow (half a second), so only on use
 
         read = client.CoreV1Api(self._client).list_namespaced_config_map
         listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))

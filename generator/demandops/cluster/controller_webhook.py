@@ -77,8 +77,8 @@ def web_address(repo: str) -> str:
         host, path = parts.hostname or "", parts.path.removeprefix("/")
     if not host:
         raise NoAccess(
-            "the state repo's URL names no host, but Argo CD needs it to recognize the repo; write "
-            "https://HOST/PATH or ssh://USER@HOST/PATH in demandops.yaml: argocd.url"
+            "the state repo's URL names no host, but Argo CD needs a host to recognize the repo; "
+            "write https://HOST/PATH or ssh://USER@HOST/PATH in demandops.yaml: argocd.url"
         )
     return f"https://{host}/{path.removesuffix('.git')}"
 

@@ -1,9 +1,9 @@
-"""Leadership: of several generators for one state repo, the leader answers the ROS actions.
+"""Leadership: one of the generators of a state repo, the leader, answers the ROS actions.
 
 Any number of generators may write to a state repo, but only one node may serve an action's name. So
-the processes compete for a Kubernetes Lease. The holder of the Lease is the leader, and renews it;
-the others stand by. Nothing depends on the clocks of other machines: a process counts the time
-since it saw the Lease change.
+the processes compete for a Kubernetes Lease. The holder of the Lease is the leader, and renews it.
+The others stand by. Nothing depends on the clocks of other machines, because each process measures
+the time since it saw the Lease change.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ log = logging.getLogger("demandops")
 _LEASE_S = 15
 """How many seconds a Lease is valid if nobody renews it."""
 _RENEW_S = 10
-"""How many seconds a leader tries to renew its Lease. If that fails, its process ends."""
+"""The process of a leader ends if it has not renewed its Lease for this many seconds."""
 _CALL_S = 2
-"""How many seconds a call of the API may take. A renewal has two calls, and must end in time:
-``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
+"""How many seconds a call of the API may take. A renewal has two calls, and must end before the
+Lease does: ``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
 _PAUSE_S = 2.0
 _RELEASED_S = 1
 _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-9])?)")
@@ -83,7 +83,7 @@ class Leadership:
         self._thread = runtime.keep_running("leader-lease", self._run)
 
     def close(self) -> None:
-        """Stop competing; a leader releases the Lease, so that another process leads at once."""
+        """Stop competing. A leader releases the Lease, so that another process can lead at once."""
         self._closed.set()
         self._thread.join(2 * _CALL_S)
         if self.is_leader:
@@ -104,10 +104,13 @@ class Leadership:
                 self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
             self._closed.wait(_PAUSE_S)
-            self._require_renewed()  # a renewal that begins later could end too late
+            self._require_renewed()  # a renewal that begins now could end too late
 
     def _compete(self) -> None:
-        """Renew the Lease as the leader; else take it if it is free and this process may lead."""
+        """Renew the Lease as the leader, or become the leader if that is possible now.
+
+        This process becomes the leader if the Lease is free and the process may lead.
+        """
         lease = self._read()
         spec = lease.get("spec") or {}
         holder = spec.get("holderIdentity") or ""

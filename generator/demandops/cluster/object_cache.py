@@ -77,14 +77,14 @@ class ObjectCache:
         return ""
 
     def unknown_health(self, domain: ClusterDomain) -> Health | None:
-        """Return a health with the reason why a domain's objects are unknown; None if known."""
+        """Return a health that says why a domain's objects are unknown; None if they are known."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
         return Health("waiting", f"cannot be read: {reason}", f"cluster {self._name}")
 
     def read_once(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read objects once, without a watch; :meth:`why_unknown` gives the reason of a failure."""
+        """Read objects once, without a watch. If that fails, :meth:`why_unknown` says why."""
         selectors = list(wanted)
         for selector in selectors:
             try:
@@ -103,7 +103,8 @@ class ObjectCache:
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
         """Read the ``wanted`` objects now, one after the other.
 
-        Watches may lag behind each other, so the objects in the cache may be of different times.
+        Without this call, objects in the cache may be of different times, because watches may lag
+        behind each other.
 
         Raises:
             Exception: from the library, if the cluster does not answer.
@@ -112,12 +113,12 @@ class ObjectCache:
             self._read(selector)
 
     def pods(self, namespace: str, deployment: str) -> list[Any]:
-        """Return a Deployment's pods, read now.
+        """Read and return the pods of a Deployment.
 
         Raises:
             Exception: from the library, if the cluster does not answer.
         """
-        from kubernetes import client  # noqa: PLC0415 - half a second; only when used
+        from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
         labels = ((item.get("spec") or {}).get("selector") or {}).get("matchLabels") or {}
@@ -144,7 +145,7 @@ class ObjectCache:
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
     def _read_and_watch(self, selector: ObjectSelector) -> None:
-        from kubernetes import watch  # noqa: PLC0415 - half a second; only when used
+        from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
 
         version = self._read(selector)
         self._set_error(selector, "")
@@ -210,7 +211,7 @@ class ObjectCache:
 def _request(selector: ObjectSelector) -> dict[str, str]:
     """Return the arguments of an API call that lists or watches the selected objects.
 
-    A call for a single object needs fewer rights than one for a namespace.
+    A call for a single object needs fewer rights than a call for all objects of a namespace.
     """
     names = ("group", "version", "plural")
     request = {

@@ -12,7 +12,7 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class Orphan:
-    """A release's object on a cluster that has no such release, and the command that deletes it."""
+    """An object that is left on a cluster, although its release is gone."""
 
     cluster: str
     kind: str
@@ -26,7 +26,7 @@ class Orphan:
 
     @property
     def command(self) -> str:
-        """The command that deletes the object, with the ConfigMap of a connection end."""
+        """The command that deletes the object and, for a connection end, also its ConfigMap."""
         names = [f"{self.kind.lower()}/{self.name}"]
         names += [f"configmap/{self.name}"] if self.kind == "Deployment" else []
         return f"kubectl -n {self.namespace} delete --ignore-not-found {' '.join(names)}"
@@ -46,14 +46,14 @@ def orphans(
     caches: Mapping[str, ObjectCache],
     history: History,
 ) -> Iterator[Orphan]:
-    """Yield the orphans on clusters, sorted; skip domains that cannot be read.
+    """Yield the orphans on clusters, sorted by cluster, domain and object.
 
-    A domain that has not applied ``commit`` yet has none, because its controller may still remove
-    objects.
+    Domains that cannot be read are skipped. Domains that have not applied ``commit`` are skipped
+    too, because their controllers may still remove objects.
 
     Args:
         domains: the access domains on each cluster.
-        targets: all releases at the commit.
+        targets: all releases at ``commit``.
         commit: the newest commit.
         caches: the objects that were read from each cluster.
         history: the commits of the state repo.

@@ -3,9 +3,9 @@
 Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure,
 and the controller fetches at its next interval.
 
-Flux is woken only while it is idle. If kustomize-controller ends one reconciliation and begins the
-next at once, it may read the object's status of before (seen with 1.9). It then forgets what the
-last reconciliation created, so it never removes that.
+Flux is woken only while it is idle. If kustomize-controller begins a reconciliation right after
+another has ended, it may still read the status from before that other one (seen with 1.9). It then
+forgets which objects the other reconciliation created, and never removes them.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""The least number of seconds from a fetch, and from the end of what Flux does with it, to the next
-fetch. Two fetches within a second can make Flux's source-controller corrupt an artifact."""
+"""A fetch begins at least this many seconds after the last one, and after Flux has applied what the
+last one brought. Two fetches within a second can make source-controller corrupt an artifact."""
 _LONGEST_WAIT_S = 60.0
-"""After this many seconds, Flux is woken although it is not idle."""
+"""Flux is woken this many seconds after a push at the latest, even if it is not idle."""
 _REFRESH = "argocd.argoproj.io/refresh"
 
 
 ChangesSince = Callable[[str], tuple[str, list[str] | None]]
-"""Returns the newest published commit and, if known, the paths changed since the given commit."""
+"""Returns the newest published commit, and the paths changed since the given commit, if known."""
 
 
 @dataclass(eq=False)
 class _Wake:
-    """A call that makes the controller of one or more domains fetch; when it is due.
+    """A planned call that makes the controller of one or more access domains fetch.
 
     Times are seconds of the monotonic clock.
     """
@@ -56,13 +56,13 @@ class _Wake:
     cluster: str
     domains: tuple[AccessDomain, ...]
     pushed: float | None = None
-    """When the first push came that the controller has not been told of."""
+    """When the oldest push came that the controller has not been told of; None without one."""
     next_try: float = -inf
     pause: float = _FIRST_RETRY_S
     idle_from: float = -inf
     """Since when the controller is known to be idle; infinity while it is busy."""
     handled: dict[str, str] = field(default_factory=dict)
-    """Domain → the request that its source had handled before the last call."""
+    """For each domain, the last request that its GitRepository had handled before the last call."""
 
     @property
     def is_untried(self) -> bool:
@@ -71,7 +71,7 @@ class _Wake:
 
     @property
     def due(self) -> float:
-        """When to make the call; infinity if there is nothing to tell."""
+        """When to make the call; infinity if the controller has been told of every push."""
         if self.pushed is None:
             return inf
         free = min(self.idle_from + _SPACING_S, self.pushed + _LONGEST_WAIT_S)
@@ -81,7 +81,7 @@ class _Wake:
 class ReconcileTrigger:
     """Wakes clusters from its own thread.
 
-    If several pushes follow each other within a short time, it wakes the clusters once for all.
+    Pushes that come before a call is due share this call.
     """
 
     def __init__(
@@ -114,9 +114,9 @@ class ReconcileTrigger:
         self._changed.set()
 
     def close(self) -> None:
-        """Wake the clusters for the last push, if that is still due, and stop.
+        """Make the calls that are still due for the last push, and stop.
 
-        A Flux that stays busy for some seconds is left to its next interval.
+        If Flux stays busy for five seconds, it is not woken, and fetches at its next interval.
         """
         self._ends = self._runtime.monotonic() + _TIMEOUT_S
         self._changed.set()
@@ -162,7 +162,7 @@ class ReconcileTrigger:
     def _woken_together(self, cluster: str, config: Config) -> list[tuple[AccessDomain, ...]]:
         """Return the domains of a cluster, grouped by the call that wakes them.
 
-        A webhook wakes all domains by one call, the API each by a call of its own.
+        One call of a webhook wakes all domains. The API needs a call for each domain.
         """
         access, domains = self._clusters[cluster], _domains(cluster, config)
         argocd = config.repo_settings.gitops == "argocd"
@@ -177,7 +177,7 @@ class ReconcileTrigger:
             wake.idle_from = self._runtime.monotonic()
 
     def _is_busy(self, wake: _Wake) -> bool:
-        """Return whether Flux is busy with an earlier fetch; False if that cannot be read."""
+        """Return whether Flux is busy with an earlier fetch; False if its state is not known."""
         cache = self._caches.get(wake.cluster)
         if cache is None or cache.why_unknown(_followed(wake.domains)):
             return False
@@ -188,8 +188,11 @@ class ReconcileTrigger:
         )
 
     def _try(self, wake: _Wake) -> None:
-        """Make the call; if it fails, log that once and plan the next attempt, or none."""
-        assert self._config is not None  # noqa: S101 - only a push makes wakes
+        """Make the call. If it fails, plan another attempt, for about a minute in all.
+
+        Only the first failure is logged.
+        """
+        assert self._config is not None  # noqa: S101 - without a push there is no wake
         objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}
         wake.handled = {
             domain.name: Flux().handled_request(_on_cluster(wake, domain), objects)
@@ -204,8 +207,8 @@ class ReconcileTrigger:
             wake.handled = {}
             if wake.pause == _FIRST_RETRY_S:
                 log.warning(
-                    "cluster '%s' was not woken (%s); retrying for a minute, otherwise it "
-                    "fetches at its next interval",
+                    "cluster '%s' was not woken (%s); retrying for a minute; if that fails too, "
+                    "it fetches at its next interval",
                     wake.cluster,
                     _reason(error),
                 )
@@ -223,7 +226,7 @@ class ReconcileTrigger:
             commit, paths = self._changes_since(before)
             if paths is not None:
                 # Name a file in each domain's folder too: Argo CD refreshes only Applications
-                # with changed files, and only a refreshed one reports the new commit.
+                # with changed files, and only a refreshed Application reports the new commit.
                 paths = [path for path in paths if _concerns(path, name)]
                 folders = [domain_folder(name, domain) for domain in wake.domains]
                 paths += [f"{folder}/_domain.yaml" for folder in folders]
@@ -257,7 +260,7 @@ def _on_cluster(wake: _Wake, domain: AccessDomain) -> ClusterDomain:
 
 
 def _reason(error: Exception) -> str:
-    """Return why a cluster was not woken; the text has no URLs or secrets."""
+    """Return why a cluster was not woken, in a text without URLs and secrets."""
     told = isinstance(error, NoAccess | NoAnswer | InvalidInput)
     return str(error) if told else type(error).__name__
 
@@ -269,7 +272,7 @@ def _domains(cluster: str, config: Config) -> tuple[AccessDomain, ...]:
 def _concerns(path: str, cluster: str) -> bool:
     """Return whether a changed file may affect a cluster.
 
-    Files of the ledger and of other clusters do not.
+    Files of the ledger and of other clusters cannot.
     """
     first, _, rest = path.partition("/")
     return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"

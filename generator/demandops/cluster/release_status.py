@@ -88,7 +88,7 @@ def _is_among(paths: Collection[str], target: Target) -> bool:
 
 
 class _CachedHistory:
-    """Caches the results of a history, because all releases of a domain need the same ones."""
+    """Caches the answers of a history, because all releases of a domain ask the same questions."""
 
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)

@@ -1,4 +1,4 @@
-"""Follows releases on their clusters until they reach the requested level.
+"""Follows releases on their clusters until they are reconciled or healthy, as requested.
 
 One thread evaluates the rollouts whenever a watch reports a change. An unreachable cluster delays
 only its own rollouts.
@@ -61,7 +61,7 @@ class RolloutWatcher:
         history: History,
         runtime: Runtime = REAL,
     ) -> None:
-        """Make a watcher; the watches of a domain start with its first rollout.
+        """Make a watcher. It starts to watch an access domain with the first rollout there.
 
         Args:
             clusters: the access to each cluster; clusters without a kubeconfig are ignored.
@@ -98,13 +98,13 @@ class RolloutWatcher:
         Args:
             commit: the published commit.
             targets: the releases; :meth:`why_unreachable` must be empty for their domains.
-            level: the level that they have to reach.
-            timeout: seconds after which the future is resolved whatever the health.
+            level: what the releases have to reach, such as ``healthy``.
+            timeout: seconds after which the future is resolved, whatever the health is then.
             on_progress: called with each new state, from the status thread.
 
         Returns:
             A future of the health. It is resolved when the health reaches ``level``, or after the
-            timeout with the reason.
+            timeout. The health then gives the reason why ``level`` was not reached.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
@@ -154,7 +154,7 @@ class RolloutWatcher:
                 self._in_background(rollout, partial(self._time_out, health=health))
 
     def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
-        """Run work in a separate thread, because it queries a cluster, which may not answer."""
+        """Run ``work`` in a separate thread, because it calls a cluster, which may not answer."""
         rollout.busy = True
 
         def run() -> None:
@@ -173,10 +173,10 @@ class RolloutWatcher:
         rollout.confirmed = True
 
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
-        """Resolve a rollout whose timeout is over; add causes that are known to the reason.
+        """Resolve a rollout that has timed out, with a reason that is as exact as possible.
 
         If a Deployment is not available, the reason also says why its pods do not run. If the
-        controller is retrying, the reason also says why the last attempt failed.
+        controller is retrying, the reason also says why an earlier attempt failed.
         """
         failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:

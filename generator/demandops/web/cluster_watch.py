@@ -57,7 +57,7 @@ class ClusterWatch:
     def statuses(
         self, targets: Iterable[Target], commit: str, repository: StateRepository
     ) -> dict[str, ReleaseStatus]:
-        """Return release name → status, and start to watch the access domains of new releases."""
+        """Return the status of each release by name; start to watch access domains that are new."""
         wanted = list(targets)
         self._watch(target.domain for target in wanted)
         found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)

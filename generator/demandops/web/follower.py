@@ -1,4 +1,7 @@
-"""Follows the state repo; provides its newest situation, earlier ones, and the newest commits.
+"""Follows the state repo, and provides what the page shows.
+
+The page shows the newest situation, situations at earlier commits, and the newest commits. A
+situation is the state at a commit, with the reports of the clusters (:class:`Situation`).
 
 One thread fetches new commits and publishes each new situation. The threads that answer requests
 read the published situation.
@@ -35,9 +38,9 @@ MOST_COMMITS = 5_000
 _LOOK_S = 0.2
 """The pause in seconds between checks of a local repository; each check reads one file."""
 _MOST_OF_TIME = 4
-"""After a new situation, the follower pauses this many times as long as its computation took.
+"""The pause after a new situation, as a multiple of the time that its computation took.
 
-So the follower uses little processor time. A pause lasts at most one second.
+The pause keeps the load of the processor low. It lasts at most one second.
 """
 _MOST_COMMIT_STATES = 8
 
@@ -59,7 +62,8 @@ class Follower:
         Args:
             reader: the open state repo; :meth:`close` of the follower closes it.
             clusters: how to reach the clusters; a cluster without a kubeconfig is not watched.
-            interval: seconds between fetches from a remote; 0 fetches only after :meth:`wake`.
+            interval: seconds between fetches from a remote. With 0, the follower fetches only after
+                :meth:`wake` or a change on a cluster.
             progress: called while the ledger is loaded.
             runtime: provides the time and the threads.
 
@@ -99,7 +103,7 @@ class Follower:
         If ``revision`` is empty, return the newest situation.
 
         Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or its state is not valid.
+            InvalidInput, StateRepoError: if there is no such commit, or its state cannot be read.
         """
         newest = self.newest
         if not revision:
@@ -118,9 +122,9 @@ class Follower:
         return Situation(commit_state, newest.now, is_newest=False)
 
     def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
-        """Return the newest commit that changed a file, up to the commit of ``commit_state``.
+        """Return the newest commit that changed a file or folder; None if no commit did.
 
-        Return None if no commit changed the file.
+        Commits after that of ``commit_state`` do not count.
         """
         if path not in commit_state.last_changes:
             found = self.reader().log(commit_state.commit, path) if path else iter(())
@@ -128,7 +132,7 @@ class Follower:
         return commit_state.last_changes[path]
 
     def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
-        """Return the generated files that, as of a commit, a generator has yet to write or remove.
+        """Return the generated files that a generator has yet to write or remove after a commit.
 
         Return an empty set if the state repo cannot be read.
         """
@@ -140,7 +144,7 @@ class Follower:
         return commit_state.not_rendered
 
     def wake(self) -> None:
-        """Check for a new commit now; any thread may call it."""
+        """Have the follower check for a new commit now; any thread may call this method."""
         self._wake.set()
 
     def close(self) -> None:
@@ -176,7 +180,7 @@ class Follower:
             found = self._situation_at(commit_state)
         except DemandOpsError as error:
             found = replace(known, unread=one_line(str(error).replace("\n", "; ")))
-        except Exception as error:  # must not stop the ROS node in the same process
+        except Exception as error:  # a fault here must not stop the ROS node in the same process
             if not known.unread:
                 log.exception("the page cannot follow the state repo")
             found = replace(known, unread=f"a fault of the program: {one_line(repr(error))}")

@@ -32,8 +32,8 @@ class WebServer:
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows. The server closes the follower at its own end,
-                or if the server cannot start.
+            follower: provides what the page shows. It is closed together with the server, and also
+                if the server cannot start.
 
         Raises:
             InvalidInput: if the server cannot listen on the address.
@@ -79,9 +79,10 @@ class WebServer:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is closed if its client sends and reads nothing for ten seconds or more.
+    """A connection that is closed if its client does not complete a request or read an answer.
 
-    An unfinished answer, such as a stream of events, stays open as long as the client reads it.
+    The client has 10 to 20 seconds. The connection stays open while the server computes an answer,
+    and while the client reads one, such as a stream of events.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

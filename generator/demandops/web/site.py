@@ -1,7 +1,7 @@
 """The site: it renders views as pages, sends events, and sets headers that keep other sites out.
 
-Every address is read only, and no page loads anything from another host. Templates escape every
-value that they print, including characters that are not visible.
+Every address is read only, and no page loads anything from another host. Templates escape the HTML
+and the invisible characters in every value that they print.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ _DOCS_HEADERS = _HEADERS | {
         "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     )
 }
-"""Headers that also allow inline scripts and styles, which the documentation's pages contain.
+"""Headers of the documentation's pages, which contain inline scripts and styles.
 
-This is safe because the documentation contains no data of a state repo.
+Allowing them is safe, because the documentation contains no data of a state repo.
 """
 _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 _EARLIER_AT_ONCE = 4
-"""How many views of earlier commits are rendered at the same time.
+"""How many views of earlier commits may be rendered at the same time.
 
-Such a view may take seconds. The limit keeps these views from delaying views of the present.
+Such a view may take seconds. The limit keeps these views from delaying views of the newest commit.
 """
 
 
@@ -82,9 +82,10 @@ class Site:
         """Make the site.
 
         Args:
-            follower: follows the state repo to show.
-            hosts: the host names that requests may name; ``*`` allows any. This keeps another site
-                from reading the page through its visitors' browsers.
+            follower: follows the state repo that the page shows.
+            hosts: the names that the Host header of a request may have; ``*`` allows any name. A
+                list of names keeps another site from reading the page through the browsers of that
+                site's visitors (DNS rebinding).
             documentation: the folder of the built documentation; None if it is not built.
         """
         self._follower, self._has_docs = follower, documentation is not None
@@ -134,7 +135,7 @@ class Site:
             return self._page(asked, template, data)
         except DemandOpsError as error:
             return self._message(request, "Nothing to show", str(error), 404)
-        except Exception:  # must not stop the ROS node in the same process
+        except Exception:  # a fault here must not stop the ROS node in the same process
             log.exception("view %s of the page does not work", request.url.path)
             text = "a fault of the program; see its log"
             return self._message(request, "This view does not work", text, 500)
@@ -167,7 +168,7 @@ class Site:
 
 
 class _Events:
-    """Informs browsers of each new situation by server-sent events."""
+    """Tells browsers by server-sent events that the page's data has changed."""
 
     def __init__(self, follower: Follower) -> None:
         self._follower, self._listeners = follower, 0
@@ -200,7 +201,7 @@ class _Events:
 
 
 class _ClosedHeaders:
-    """Middleware that adds to every answer the headers that keep other sites out of the page."""
+    """Middleware that adds headers to every answer, so that other sites cannot use the page."""
 
     def __init__(self, application: ASGIApp) -> None:
         self._application = application

@@ -44,7 +44,7 @@ _UNKNOWN = ReleaseStatus(Health("waiting"))
 class Planned:
     """A planned release, and the claims that need it.
 
-    ``target`` names the object on the cluster whose health is the release's.
+    ``target`` names the Kubernetes object whose health counts as the release's health.
     """
 
     release: Release
@@ -56,9 +56,9 @@ class Planned:
 class ReusableRows:
     """The rows of a list, kept so that a later call need not make them again.
 
-    ``rows`` maps the id of an entry to the values of the entry, and the row made from them.
-    ``statuses`` are the statuses of releases for which all rows were made; None if the rows were
-    made for an earlier commit.
+    ``rows`` maps the id of each entry to the entry's values and to the row that was made from them.
+    ``statuses`` are the statuses of releases that the rows show; None if the rows were made for an
+    earlier commit.
     """
 
     statuses: object
@@ -69,7 +69,8 @@ class CommitState:
     """The state at one commit: what runs, and for whom.
 
     Most attributes are computed at their first use, and then kept. :meth:`take_over` takes the
-    unchanged releases and rows from an earlier commit state, so a new commit costs what it changes.
+    unchanged releases and rows from an earlier commit state, so that for a new commit only the
+    changed ones must be computed.
     """
 
     def __init__(
@@ -77,11 +78,11 @@ class CommitState:
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
         self.rows: dict[str, ReusableRows] = {}
-        """Name of a list → its rows, for the lists that were shown."""
+        """The rows of each list that was shown, by the list's name."""
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
         self.last_changes: dict[str, LogEntry | None] = {}
-        """File → the newest commit that changed it, or None, for files that were looked up."""
+        """The newest commit that changed each path that was looked up; None if no commit did."""
         self.not_rendered: frozenset[str] | None = None
         """The files that a generator has yet to write or remove; None until they are looked up."""
 
@@ -106,7 +107,7 @@ class CommitState:
         return without_suspended(self.state)
 
     def take_over(self, before: CommitState) -> None:
-        """Take the releases and rows of an earlier commit state; plan only those that may differ.
+        """Take the releases and rows of an earlier commit state; plan anew what may differ.
 
         Do nothing if the configuration or the overrides differ, because then everything may differ.
         """
@@ -120,7 +121,8 @@ class CommitState:
             *_services_with_other_replicas(old.ledger, new.ledger),
         }
         for one, other in ((change.before, change.after) for change in changes):
-            # other requesters rarely change a file, so `affected_keys` omits these releases
+            # the page shows requesters, but `affected_keys` omits a release whose file stays the
+            # same although its requesters changed
             if one and other and (one.requesters, one.partial) != (other.requesters, other.partial):
                 keys.update(keys_of_claims(self.active, [other]))
         known = before.planned | dict(self._with_other_claims(before, subjects))
@@ -135,7 +137,7 @@ class CommitState:
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield each release of ``before`` whose claims on ``subjects`` changed.
+        """Yield the planned releases of ``before`` whose claims on ``subjects`` have changed.
 
         The yielded values have the new claims.
         """
@@ -167,7 +169,7 @@ class CommitState:
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
-        """Key of a release → the planned release; None if an override denies the release."""
+        """The planned releases by key; the value is None if an override denies the release."""
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}
         return self._planned
@@ -185,13 +187,13 @@ class CommitState:
 
     @cached_property
     def denied(self) -> list[tuple[Release, Override]]:
-        """Each release that claims need but an override denies, and that override."""
+        """The releases that claims need but an override denies, each with this override."""
         keys = (key for key, one in self.planned.items() if one is None)
         return [found for key in keys if (found := denied_release(self.state, key))]
 
     @cached_property
     def releases(self) -> dict[str, Release]:
-        """Name → release, for all planned releases."""
+        """All planned releases by name."""
         return {release.name: release for release, _ in self.targets}
 
     def override_entries(self, now: datetime) -> list[Entry]:
@@ -206,12 +208,12 @@ class CommitState:
 
     @cached_property
     def claims_of_releases(self) -> dict[str, list[Claim]]:
-        """Name of a release → the claims that need it."""
+        """The claims that need each release, by the release's name."""
         return {one.target.name: one.claims for one in self._sorted}
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
-        """Id of a demand → the names of the releases that it needs."""
+        """The names of the releases that each demand needs, by the demand's id."""
         found: dict[str, list[str]] = {}
         for name, claims in self.claims_of_releases.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -220,7 +222,7 @@ class CommitState:
 
     @cached_property
     def claims_of_demands(self) -> dict[str, list[Claim]]:
-        """Id of a demand → its claims, sorted by subject."""
+        """The claims of each demand, sorted by subject, by the demand's id."""
         found: dict[str, list[Claim]] = {}
         for claim in self.state.ledger:
             found.setdefault(claim.demand, []).append(claim)
@@ -240,8 +242,8 @@ def _subjects_of(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
 def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
     """Return the subjects whose claims differ between two ledgers.
 
-    The function compares the identity of objects, which is fast: an unchanged subject has the same
-    object of claims in both ledgers.
+    The function compares only the identities of Python objects, which is fast. That suffices,
+    because both ledgers share the tuple of claims of an unchanged subject.
     """
     before = {id(claims): subject for subject, claims in old.claims.items()}
     after = {id(claims): subject for subject, claims in new.claims.items()}
@@ -250,7 +252,7 @@ def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
 
 
 def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services that must keep other numbers of replicas in ``new`` than in ``old``."""
+    """Yield the services whose record of replicas to keep differs between two ledgers."""
     before, after = old.kept.steps, new.kept.steps
     for instance in {*before, *after}:
         if before.get(instance) != after.get(instance):
@@ -262,9 +264,9 @@ class Situation:
     """The state at a commit, with the health of releases and the open proposals.
 
     ``statuses`` maps names of releases to their status; it is empty for an earlier commit.
-    ``watched`` names the clusters that are watched. ``old_bootstraps`` lists the clusters without
-    the current bootstrap file, ``orphans`` the objects on clusters that belong to no release.
-    ``unread`` is the reason why a newer state cannot be read, or empty.
+    ``watched`` names the clusters that the page watches. ``old_bootstraps`` lists the clusters
+    without the current bootstrap file, ``orphans`` the objects on clusters that belong to no
+    release. ``unread`` is the reason why a newer state cannot be read, or empty.
     """
 
     commit_state: CommitState
@@ -286,7 +288,9 @@ class Situation:
 class HealthChange:
     """A change of a release's health.
 
-    If the release becomes healthy, ``lasted_s`` is how many seconds it was unhealthy, if known.
+    ``before`` and ``after`` are words for a health (:mod:`~demandops.web.views.health_word`).
+    ``lasted_s`` says for how many seconds a release that became healthy had been unhealthy. It is
+    None if the release did not become healthy, or if the time is not known.
     """
 
     time: datetime

@@ -60,7 +60,7 @@ class ViewRequest:
         return self.params.get(name, "").strip()[:500]
 
     def page(self) -> int:
-        """Return the number of the requested page of a list; 1 without a valid number."""
+        """Return the number of the requested page of a list; 1 if the request gives none."""
         text = self.get("page")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 
@@ -186,4 +186,4 @@ VIEWS: Mapping[str, View] = {
     "/overrides": _overrides,
     "/rates": _rates,
 }
-"""Address → the function that returns the template and the data of a view."""
+"""The function of each address; it returns the template and the data of a view."""

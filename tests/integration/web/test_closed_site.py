@@ -1,4 +1,4 @@
-"""The site is read-only, and its answers forbid browsers whatever the page does not need."""
+"""The site is read-only, and its answers forbid browsers all that the page does not need."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""On the page, text from outside stays text, shows its invisible characters, and is no command."""
+"""Text from outside adds no HTML and no command to the page, and hides no characters there."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _assert_only_ours(page: Page) -> None:
 def test_a_branch_is_no_command_and_hides_nothing(
     state: GitRepo, follower: Follower, look: Look
 ) -> None:
-    """An approver pastes the command that the page shows, so a branch's name must not add to it."""
+    """An approver pastes the page's command, so a branch's name must not add another command."""
     branch = f"demand/x;$(touch${{IFS}}pwned)|'&{HIDDEN}"
     commit = git(state.path, "commit-tree", "main^{tree}", "-p", "main", "-m", f"{HIDDEN}Propose")
     message = f"Propose\n\n{PROPOSAL}: {HIDDEN}"

@@ -182,7 +182,7 @@ def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: F
     assert squares == len(state.config.nodes)
     few = fleet_map.picture(now, Filter("node=far7"), "")
     assert [node.id for node in few.nodes] == ["far7"] and few.only_lit
-    # too many nodes to draw alone: they are highlighted in the picture of the whole fleet
+    # the filter finds too many nodes to draw them alone, so the whole fleet is drawn
     many = fleet_map.picture(now, Filter("node:far"), "")
     assert many.is_dimmed and {node.id for node in many.nodes} == {
         f"far{number}" for number in range(1_000)

@@ -46,7 +46,7 @@ def application(
     health: str = "Healthy",
     resources: tuple[dict[str, str], ...] = (),
 ) -> dict[str, Any]:
-    """Return an Application; by default it was compared with its current source `wanted`."""
+    """Return an Application. If ``sync`` is set, it was compared with ``wanted`` by default."""
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}
     if sync:
@@ -58,7 +58,7 @@ def application(
 
 
 def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return the state of a sync operation."""
+    """Return an ``operationState``: that of a sync, by default of the domain's folder."""
     result = {"revision": revision, "source": more.pop("of", FOLDER)}
     result["resources"] = more.pop("resources", [])
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
@@ -84,7 +84,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
         (over(sync="Synced", at="c"), "reconciled", "", False),
         # the commit was compared, but not applied
         (over(sync="OutOfSync", at="b"), "waiting", "has not applied the commit yet", False),
-        # Synced, but with the path that it had before another bootstrap file was applied
+        # Synced, but the path is that of an older bootstrap file
         (over(sync="Synced", at="b", compared={**FOLDER, "path": "clusters/x"}), "waiting",
          "has not applied the commit yet", False),
         # Argo CD already compares a newer commit
@@ -131,7 +131,7 @@ BAD = condition("Progressing", "False", "timed out")
         (None, None, "reconciled", "does not exist yet", False),
         (application(NEW), None, "reconciled", "has not been compared yet", False),
         (application(NEW, sync="Synced", at="b"), None, "healthy", "", False),
-        # its health dates from before the change
+        # the reported health dates from before the change
         (application(NEW, sync="Synced", at="b", compared=OLD), None, "reconciled",
          "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
@@ -143,7 +143,7 @@ BAD = condition("Progressing", "False", "timed out")
          "its health is Degraded", True),
         (application(NEW, sync="Synced", at="b", health="Missing"), None, "reconciled",
          "its health is Missing", False),
-        # the health of its objects is more exact and comes sooner
+        # the health of the Deployments counts, because it is more exact and comes sooner
         (application(NEW, sync="Synced", at="b", resources=MADE), None, "reconciled",
          "does not exist yet", False),
         (application(NEW, sync="Synced", at="b", resources=MADE), deployment("x"), "healthy", "",
@@ -156,7 +156,7 @@ BAD = condition("Progressing", "False", "timed out")
                      ), None, "reconciled", "ComparisonError: no chart", True),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=NEW)), None, "reconciled", "denied", True),
-        # a failure of its previous spec counts only while Argo CD still retries that spec
+        # a failure of the previous spec counts only while Argo CD still retries that spec
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
                      of=OLD)), None, "reconciled", "denied", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "denied",
@@ -265,7 +265,7 @@ def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cl
 
 
 def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
-    """The generator may lack the right to read the other objects there."""
+    """The generator may lack the right to read other objects in Argo CD's namespace."""
     assert ARGOCD.objects_to_watch(PLACE)[0] == ObjectSelector(
         "Application", "argocd", "demandops-perception"
     )

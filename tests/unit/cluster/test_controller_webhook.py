@@ -41,7 +41,7 @@ def by_openssl(body: bytes) -> str:
 
 
 def test_the_signature_is_the_one_that_github_documents() -> None:
-    """Both controllers use GitHub's scheme; the values come from GitHub's documentation."""
+    """Flux and Argo CD use GitHub's scheme; the values come from GitHub's documentation."""
     documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
     assert controller_webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
 
@@ -67,7 +67,7 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
     event = json.loads(body)
     assert event["ref"] == "refs/heads/main" and event["after"] == "b" * 40
     (commit,) = event["commits"]
-    # the domain's folder is always refreshed; the ledger and other clusters are left out
+    # the event names a file of the domain's folder, but none of the ledger and other clusters
     assert commit["modified"] == [
         *changed[:1],
         "clusters/c-its/perception/_domain.yaml",
@@ -116,7 +116,7 @@ def test_a_refused_webhook_is_logged_and_no_redirection_followed(
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
     trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
-    assert len(hook.calls) in (1, 2)  # the close may cause a second one
+    assert len(hook.calls) in (1, 2)  # the close may cause a second call
     assert SECRET not in caplog.text and "/hook" not in caplog.text
 
 

@@ -26,7 +26,7 @@ from tests.kit.turns import Turns
 
 PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
 TAKES_OVER_S = 15 + 2
-"""How many seconds after its leader's last renewal a Lease has another leader at the latest.
+"""At most this many seconds after a leader's last renewal, another process leads.
 
 The Lease ends after 15 s, and the standbys poll it every 2 s.
 """
@@ -36,7 +36,7 @@ The Lease ends after 15 s, and the standbys poll it every 2 s.
 class Server:
     """A stand-in for an API server with one Lease.
 
-    ``trouble`` decides whether a call fails ``before`` or ``after`` its effect, or not at all.
+    ``trouble`` decides whether a call fails before or after its effect, or not at all (empty).
     ``takes`` decides how many seconds a call takes. ``ages`` lists the age of the Lease after each
     call, once for each process that leads at that time.
     """
@@ -219,7 +219,7 @@ def test_a_lease_that_cannot_be_read_is_told_once(
 def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
     server: Server, first_s: float, next_s: float
 ) -> None:
-    """The answer to the last renewal is slow; after it, reads succeed and writes fail."""
+    """The answer to the last renewal is slow. After that, reads succeed and writes fail."""
     one, calls = Process(server), count()
     server.turns.sleep(0.5)
     server.trouble = lambda: "before" if (number := next(calls)) > 1 and number % 2 else ""
@@ -231,7 +231,7 @@ def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
 
 @pytest.mark.parametrize("seed", range(4))
 def test_never_do_two_lead(tmp_path: Path, seed: int) -> None:
-    """At random, calls fail before or after their effect or take long, and processes are killed."""
+    """At random, calls take long, calls fail with or without effect, and processes are killed."""
     chance = random.Random(seed)
     with new_server(tmp_path, seed) as server:
         turns, away_until = server.turns, [0.0]

@@ -19,14 +19,14 @@ from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.kube_api import KubeApi, kube_api
 
 _LONG_ENOUGH_S = 0.2
-"""After this time the trigger's thread has seen what happened before."""
+"""After a wait of this length, the trigger's thread has seen what the test did before."""
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
 
 def trigger(
     case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
 ) -> None:
-    """Trigger the cluster of a golden case once; ``changed`` lists the paths that have changed."""
+    """Wake the cluster of a golden case once; ``changed`` lists the paths that have changed."""
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)
@@ -44,6 +44,7 @@ def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None
 
 SIGNED = "clusters: {a: {receiver: 'http://h/hook', secret_file: SECRET}}\n"
 NO_FILE = "cannot be read: No such file or directory"
+FILL = "write the secret into this file"
 OPEN = "SECRET may be read by everybody on this machine; run chmod o= on it"
 
 
@@ -53,9 +54,9 @@ OPEN = "SECRET may be read by everybody on this machine; run chmod o= on it"
         (None, None, 0, f"{NO_FILE}; check the path"),
         ("clusters: {a: {}}\n", None, 0, "clusters.a: needs a kubeconfig, a receiver or a webhook"),
         ("", None, 0, "clusters: is missing; add it"),
-        (SIGNED, None, 0, f"clusters.a.secret_file: SECRET {NO_FILE}; put the secret there"),
-        (SIGNED, "", 0o600, "clusters.a.secret_file: SECRET is empty; put the secret there"),
-        (SIGNED, " \r\n", 0o600, "clusters.a.secret_file: SECRET is empty; put the secret there"),
+        (SIGNED, None, 0, f"clusters.a.secret_file: SECRET {NO_FILE}; {FILL}"),
+        (SIGNED, "", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
+        (SIGNED, " \r\n", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
         (SIGNED, "x", 0o644, f"clusters.a.secret_file: {OPEN}"),
         ("clusters: {a: {kubeconfig: /k, secret_file: /s}}\n", None, 0,
          "clusters.a: has a secret_file but no URL; add a receiver or a webhook"),
@@ -155,11 +156,11 @@ def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(
     clock.pass_(30)
     waker(state.config)
     time.sleep(_LONG_ENOUGH_S)
-    assert len(api.patches) == 1  # half a minute later it is still busy with the first fetch
+    assert len(api.patches) == 1  # half a minute later Flux is still busy with the first fetch
     if step == "applied":
         apply(api, "b")
         time.sleep(_LONG_ENOUGH_S)
-        assert len(api.patches) == 1  # it has just become idle
+        assert len(api.patches) == 1  # Flux has just become idle
         clock.pass_(1)
     else:
         clock.pass_(30)

@@ -116,7 +116,10 @@ Write = Callable[[Path], object]
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda path: None, ": cannot be read: No such file or directory; put the secret there"),
+        (
+            lambda path: None,
+            ": cannot be read: No such file or directory; write the secret into this file",
+        ),
         (lambda path: path.write_text("two\nlines"), " must hold a token: one line of plain text"),
         (lambda path: path.write_bytes(b"\xff\xfe"), " must hold a token: one line of plain text"),
     ],

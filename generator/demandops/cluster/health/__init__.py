@@ -1,7 +1,7 @@
 """The health of releases, computed from a cluster's objects. Pure.
 
 Flux and Argo CD each have a reader. The reader is chosen for each :class:`ClusterDomain`, so a
-state repo may switch controllers while rollouts are followed.
+state repo may switch from one controller to the other while rollouts are followed.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The health of releases, from Argo CD's objects. Pure.
 
 Objects are plain data as the Kubernetes API returns them. The field names are those of Argo CD 3.2
-(argoproj.io/v1alpha1). The status lags behind the spec. So a status counts only if its
-``sync.comparedTo`` holds the source of the current spec.
+(argoproj.io/v1alpha1). The status of an Application lags behind its spec. So a status counts only
+if its ``sync.comparedTo`` holds the source of the current spec.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from demandops.cluster.health.release_health import (
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
-"""How many failed objects of a sync the reason of a health lists at most."""
+"""A reason lists at most this many objects on which a sync failed."""
 
 
 class ArgoCd(HealthReader):
@@ -33,7 +33,11 @@ class ArgoCd(HealthReader):
     service_kind = "Application"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the Application of the domain's folder, and all objects of its namespace."""
+        """Return the objects on which the health of a domain and of its releases depends.
+
+        These are the Application of the domain's folder, and all Applications and Deployments in
+        the domain's namespace.
+        """
         folder = ObjectSelector("Application", *_folder_application(domain))
         return folder, *self.objects_to_confirm(domain)
 
@@ -65,7 +69,7 @@ class ArgoCd(HealthReader):
         return next(iter(_applied_commits(app)), "") if app else ""
 
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        """Return whether the Application of the domain's folder has created an object."""
+        """Return whether the Application of the domain's folder has created ``item``."""
         annotations = item["metadata"].get("annotations") or {}
         tracked = f"{_folder_application(domain).name}:"
         return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
@@ -106,7 +110,7 @@ def _applied_commits(app: Object) -> list[str]:
     """Return the commits that an Application is known to have applied, the newest first.
 
     A Synced Application has applied the commit that it was compared with. If commits come fast, an
-    Application may never be Synced, so the last successful sync of all resources counts too.
+    Application may never be Synced, so the commit of its last successful full sync counts too.
     """
     source = (app.get("spec") or {}).get("source")
     sync, operation = _status(app, "sync"), _status(app, "operationState")
@@ -135,7 +139,7 @@ def _why_outdated(
     application = objects.get(("Application", *_folder_application(domain))) or {}
     folder = (application.get("spec") or {}).get("source") or {}
     if source.get("repoURL") != folder.get("repoURL"):
-        return ""  # the chart is in a registry; its version is in the source, compared above
+        return ""  # the chart is in a registry, and its version is part of the compared source
     revision = str(sync.get("revision", ""))
     path = str(source.get("path", ""))
     if history.includes(revision, commit) or history.unchanged(revision, commit, path):
@@ -202,9 +206,9 @@ def _sync_message(operation: Object) -> str:
 
 
 def _error(app: Object) -> str:
-    """Return the first condition of an Application that is an error, as text, or an empty text.
+    """Return the first error among the conditions of an Application, or an empty text.
 
-    The conditions that are not errors are warnings.
+    The other conditions are warnings.
     """
     for item in (app.get("status") or {}).get("conditions") or ():
         if str(item.get("type", "")).endswith("Error"):

@@ -39,7 +39,7 @@ class Flux(HealthReader):
     service_kind = "HelmRelease"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return all objects of the domain's namespace."""
+        """Return all objects of Flux, and all Deployments, in the domain's namespace."""
         kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
@@ -76,7 +76,7 @@ class Flux(HealthReader):
         return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        """Return whether the domain's Kustomization has created an object."""
+        """Return whether the domain's Kustomization has created ``item``."""
         labels = item["metadata"].get("labels") or {}
         return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
 
@@ -85,13 +85,15 @@ class Flux(HealthReader):
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
-        """Return whether a domain has handled its last fetch.
+        """Return whether Flux has finished all work of a domain's last fetch.
+
+        Flux is idle too if the domain's objects do not exist or are suspended.
 
         Args:
             domain: the domain.
             objects: the objects that are known.
-            before: what :meth:`handled_request` gave before the last request to fetch; None if
-                there was none.
+            before: what :meth:`handled_request` returned before the last request to fetch; None if
+                no request was made.
         """
         kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
         if kustomization is None or source is None:

@@ -1,4 +1,4 @@
-"""The health of releases for any GitOps controller; each controller adds its part. Pure."""
+"""The part of the health of releases that is the same for each GitOps controller. Pure."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Target:
 class Health:
     """The health of a domain or a release.
 
-    ``reason`` says why the next level is not reached, if possible in the controller's words.
+    ``reason`` says why the next state is not reached, if possible in the controller's words.
     ``object`` is the object that the reason comes from. ``failing`` says whether the reason is a
     failure.
     """
@@ -115,7 +115,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects that the health of a domain and its releases depends on."""
+        """Return the objects on which the health of a domain and of its releases depends."""
 
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
         """Return the objects to read again before a release counts as healthy.
@@ -147,7 +147,7 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a release at ``commit``, which the domain has applied already.
+        """Return the health of a release at ``commit``, which its domain has applied.
 
         A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
         gone.
@@ -180,7 +180,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        """Return whether the object that applies a domain's folder has created an object."""
+        """Return whether the object that applies a domain's folder has created ``item``."""
 
     def last_transition(self, target: Target, objects: Objects) -> str:
         """Return when the state of a release last changed; empty if the cluster does not say."""
@@ -251,7 +251,7 @@ def deployment_health(deployment: Object) -> Health:
 
 
 def why_unavailable(pods: Iterable[Any]) -> str:
-    """Return why pods do not run: a container waits, or no node fits; empty if unknown."""
+    """Return why pods do not run, as a container or the scheduler reports; empty if unknown."""
     for pod in pods:
         for container in pod.status.container_statuses or ():
             waiting = container.state.waiting if container.state else None

@@ -8,7 +8,7 @@ const field = document.getElementById("q");
 let shown = "";
 let asked = 0;
 
-// Replaces the content by the newest from the server; keeps focus, scroll and open details.
+// Replaces the content by the server's newest. Keeps the focus, scroll positions and open details.
 async function show(address, isQuiet) {
   const turn = ++asked;
   const answer = await fetch(address, { headers: { Accept: "text/html" } });
@@ -77,7 +77,7 @@ function follow(isAgain) {
   const events = new EventSource("/events");
   let first = !isAgain;
   events.addEventListener("change", () => {
-    // The first event has the version that the page shows. After a break it may be a newer one.
+    // The first event after the page was loaded brings no news. After a lost connection it may.
     if (!first) show(location.href, false).catch(() => say("not current: the server does not answer"));
     first = false;
     if (!live.textContent.startsWith("updated")) say("live");

@@ -21,9 +21,10 @@ from demandops.web.situation import Situation
 class Consequence:
     """What would change if a demand were released, and how to release it.
 
-    ``how`` says in words how to release it. ``file`` is a file for ``demandops request`` that does
-    so; it is empty if the demand has to be released otherwise. ``approval`` names the rules that
-    require a person's approval. ``refused`` is the reason why the generator would refuse, or empty.
+    ``how`` says in words how to release the demand. ``file`` is the text of a file for ``demandops
+    request`` that releases the demand; it is empty if no file can. ``approval`` names the rules
+    that require a person's approval. ``refused`` is the reason why the generator would refuse to
+    release the demand, or empty.
     """
 
     releases: tuple[ReleaseChange, ...]

@@ -17,7 +17,7 @@ _MOST_PARTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """The path of a view, and the parameters to show it with."""
+    """A link to a view: the path of the view, and its parameters."""
 
     path: str
     params: Mapping[str, str] = field(default_factory=dict)
@@ -49,12 +49,12 @@ class Cell:
 
     @property
     def shown(self) -> tuple[Part, ...]:
-        """The texts that the row shows: the first few."""
+        """The first texts of the cell, which the page shows."""
         return self.parts[:_MOST_PARTS]
 
     @property
     def more(self) -> int:
-        """The number of texts that the row leaves out."""
+        """The number of further texts, which the page leaves out."""
         return max(0, len(self.parts) - _MOST_PARTS)
 
     @property
@@ -78,14 +78,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """One row: its cells by column, and further texts by name that only filters search."""
+    """One row of a list: ``cells`` by column, and ``hidden`` texts that only filters search."""
 
     cells: Mapping[str, Cell]
     hidden: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
-        """Name of a column or hidden field → its texts; lower case, because filters ignore case."""
+        """The texts of each column and hidden field; lower case, because filters ignore case."""
         found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
         for key, texts in self.hidden.items():
             found[key] = (*found.get(key, ()), *texts)
@@ -119,7 +119,7 @@ class Table:
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
-    """Return a cell of these texts, without empty ones."""
+    """Return a cell with those of the texts that are not empty."""
     parts = (one if isinstance(one, Part) else Part(str(one)) for one in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 

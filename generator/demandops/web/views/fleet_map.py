@@ -96,7 +96,8 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
         now: the situation.
         wanted: the filter; services, connections and nodes that match are highlighted.
         layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
-            position, else ``cluster``. Without any position, ``place`` means ``cluster``.
+            position, and ``cluster`` otherwise. If no node has a position, the layout is always
+            ``cluster``.
     """
     config = now.commit_state.config
     nodes = list(config.nodes.values())
@@ -145,8 +146,9 @@ def _apart(
 ) -> tuple[list[_Drawn], list[_Drawn]]:
     """Return the parts to draw together, and the parts to draw one by one.
 
-    All parts are drawn one by one if they are at most ``most``. Otherwise only the special parts
-    are, or none if even these are more than ``most``.
+    If there are at most ``most`` parts, all are drawn one by one. If there are more, only the
+    special parts are drawn one by one. If there are more than ``most`` special parts, all parts are
+    drawn together.
     """
     if len(drawn) <= most:
         return [], drawn
@@ -170,7 +172,7 @@ def _square(card: NodeCard) -> str:
 def _lit_nodes(
     now: Situation, wanted: Filter, nodes: Iterable[Node], content: Mapping[str, _Content]
 ) -> set[str]:
-    """Return the ids of nodes that match, or that have a service or connection that matches."""
+    """Return the ids of nodes that match the filter themselves or by a service or connection."""
     if not wanted:
         return set()
     found = {id for id, each in content.items() if any(mark.is_lit for mark in each.marks)}

@@ -14,10 +14,10 @@ WORDS = {
     "unknown": "none",
     "healthy": "good",
 }
-"""Word for a health → its color on the page, from the worst to the best health."""
+"""The words for a health, each with its color on the page, from the worst to the best health."""
 
 RANKS = {word: float(place) for place, word in enumerate(WORDS)}
-"""Word → its index in ``WORDS``; a lower index means worse health."""
+"""The index of each word in ``WORDS``; a lower index means worse health."""
 
 
 def word_of(status: ReleaseStatus) -> str:
@@ -30,7 +30,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 
 def since_of(status: ReleaseStatus) -> datetime | None:
-    """Return the time of the last change of a release's state; None if the cluster has none."""
+    """Return when a release's state last changed; None if the cluster does not report it."""
     try:
         return datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
@@ -38,5 +38,5 @@ def since_of(status: ReleaseStatus) -> datetime | None:
 
 
 def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
-    """Return the word for the worst health of several releases; ``unknown`` without a release."""
+    """Return the word for the worst health of releases; ``unknown`` if there are no releases."""
     return min(map(word_of, statuses), key=RANKS.__getitem__, default="unknown")

@@ -24,10 +24,10 @@ Values: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """A kind of list: its name in addresses, its title, its columns and its entries.
+    """One of the lists: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values; it
-    is called again only if a value of the entry has changed.
+    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values. For
+    an entry whose values have not changed, ``row`` is not called again.
     """
 
     name: str
@@ -49,12 +49,12 @@ def demand_part(id: str) -> Part:
 
 
 def health_cell(word: str) -> Cell:
-    """Return the cell for a health word; cells are sorted from the worst to the best health."""
+    """Return the cell for a health word; its sort key puts the worst health first."""
     return cell(word, tone=WORDS[word], order=RANKS[word])
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return values as texts; each links to a view filtered by this value in the field ``key``."""
+    """Return a text for each value, with a link to the view filtered by ``key`` and the value."""
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 
@@ -95,7 +95,7 @@ def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
     ledger, carrying = now.commit_state.active.ledger, clients_of(now.commit_state)
     for id in ledger.subjects(SubjectKind.CONNECTION):
         claims, clients = ledger.connection_claims(id), carrying.get(id, [])
-        if claims:  # not all are suspended
+        if claims:  # at least one claim is not suspended
             yield id, (claims, clients, worst_word(map(now.status, clients)))
 
 
@@ -120,7 +120,7 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
 
 
 def clients_of(commit_state: CommitState) -> dict[str, list[str]]:
-    """Return id of a connection → the names of the releases that carry it."""
+    """Return the names of the releases that carry each connection, by the connection's id."""
     found: dict[str, list[str]] = {}
     for name, release in commit_state.releases.items():
         if not isinstance(release, ServiceRelease):
@@ -173,7 +173,7 @@ def _leases(now: Situation) -> Iterator[tuple[str, Values]]:
 
 def _lease(world: World, claim: Claim) -> Row:
     lease = claim.lease
-    assert lease is not None  # noqa: S101 - only such claims are listed
+    assert lease is not None  # noqa: S101 - only claims with a lease are listed
     return Row(
         {
             "ends": _time(lease.until),
@@ -269,7 +269,7 @@ LISTS = {
         ListKind(
             "leases",
             "Leases",
-            "Claims that end unless their requester renews them, next end first.",
+            "Claims that end unless their requester renews them. The first to end comes first.",
             _columns(
                 "ends|Ends",
                 "subject|Holds",

@@ -29,8 +29,9 @@ class ServiceMark:
 class NodeCard:
     """A node as it is drawn.
 
-    ``count`` is the number of all services. ``services`` lists the services that the card shows;
-    it is empty if there is no room. ``more`` counts the services that such a list leaves out.
+    ``count`` is the number of all services on the node. ``services`` lists the services that the
+    card shows; it is empty if the card is too small. ``more`` counts the services that do not fit
+    on a card that shows some.
     """
 
     id: str
@@ -68,9 +69,9 @@ class Box:
 def by_cluster(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
-    """Return id → card in its place, one box for each cluster, and the height of the map.
+    """Return the placed cards by node id, one box for each cluster, and the height of the map.
 
-    Each box has a group of rows of cards for each type of node.
+    The cards in a box are in rows, grouped by the type of the node.
     """
     clusters: dict[str, dict[str, list[NodeCard]]] = {}
     for node in sorted(nodes, key=lambda one: one.id):
@@ -121,10 +122,10 @@ def _box(
 def by_place(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], float]:
-    """Return id → card in its place, and the height of the map.
+    """Return the placed cards by node id, and the height of the map.
 
     A node that has a position is placed there, with north at the top. The nodes without a position
-    are in rows below.
+    follow in rows below.
     """
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]

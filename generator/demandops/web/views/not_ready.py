@@ -1,4 +1,4 @@
-"""The applications that are not ready, and the causes: since when they exist, who can fix them."""
+"""Which applications are not ready, for which causes, since when, and who can fix the causes."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def causes(
     Args:
         now: the situation.
         wanted: the filter.
-        last_change: returns the newest commit that changed a file.
+        last_change: returns the newest commit that changed a file or folder.
         pending: the generated files that a generator has yet to write or remove.
     """
     found = [
@@ -253,7 +253,7 @@ def _orphaned(left: Orphan) -> Cause:
         Part(left.object),
         f"runs on cluster '{left.cluster}', but belongs to no release",
         Remedy(f"an administrator of cluster {left.cluster}", "delete it", left.command),
-        told="its controller forgot that it had created it",
+        told="the GitOps controller no longer knows that it created this object",
     )
 
 
@@ -265,7 +265,7 @@ def _pending(commit_state: CommitState, paths: list[str]) -> Iterator[Cause]:
         f"{'waits' if len(paths) == 1 else 'wait'} for a generator to carry out a person's commit",
         Remedy(
             "the operator of the generator",
-            "start a generator; one that runs does it at its next fetch",
+            "start a generator; a running generator does it at its next fetch",
         ),
         told=", ".join(paths[:_MOST_LISTED]) + more,
         since=commit_state.entry.time,
@@ -278,8 +278,8 @@ def _waits(waiting: WaitingDemand) -> Cause:
         Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
         "waits for room on a node",
         Remedy(
-            "the generator, as soon as there is room; sooner if the nodes' operator adds room or a "
-            "requester releases something"
+            "the generator, as soon as a node has room; the nodes' operator can add room, or a "
+            "requester can release something"
         ),
         since=waiting.since,
         requesters=waiting.requesters,
@@ -288,7 +288,7 @@ def _waits(waiting: WaitingDemand) -> Cause:
 
 
 def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each group of unhealthy releases with one state, reason and cluster."""
+    """Yield a cause for each reason why releases on a cluster are not healthy."""
     together: dict[tuple[str, str, str, str], list[str]] = {}
     for name, release in now.commit_state.releases.items():
         status = now.status(name)
@@ -324,20 +324,20 @@ def _since(statuses: Iterable[ReleaseStatus]) -> datetime | None:
 
 
 def _why(kind: Kind, object: str, several: bool) -> str:
-    verbs = ("fail", "have", "start") if several else ("fails", "has", "starts")
+    verbs = ("fail", "have", "are") if several else ("fails", "has", "is")
     if object.startswith("cluster "):
         return "cannot be seen: the cluster does not answer"
     if kind == "failing":
         return verbs[0]
     if kind == "waiting":
         return f"{verbs[1]} not been applied by the cluster yet"
-    return f"{verbs[2]}, and did not become ready yet"
+    return f"{verbs[2]} starting and not ready yet"
 
 
 def _affected(commit_state: CommitState, names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Return the applications, requesters and demands that releases affect.
+    """Return the applications, requesters and demands that need the releases ``names``.
 
-    A connection affects the applications of the demands that hold it.
+    The applications that need a connection are those of the demands that hold the connection.
     """
     applications: dict[str, None] = {}
     claims = [claim for name in names for claim in commit_state.claims_of_releases[name]]

@@ -59,7 +59,7 @@ def plots(
 ) -> list[Plot]:
     """Return the plots of a span of time that ends at ``now``.
 
-    ``span`` is a key of ``SPANS``. Any other key means the time since the oldest commit.
+    ``span`` is a key of ``SPANS``. Any other value means the time since the oldest commit.
     """
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
@@ -76,14 +76,14 @@ def plots(
     return [
         make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
         make.counts(
-            "Demands released", _times(commits, _RELEASED), "commits that release or expire one"
+            "Demands released", _times(commits, _RELEASED), "commits that release or expire demands"
         ),
         make.counts(
             "People's commits",
             [one.entry.time for one in commits if not one.entry.by_generator],
             "commits that no generator made",
         ),
-        make.medians("From received to committed", waits, "median of the demands, whole seconds"),
+        make.medians("From received to committed", waits, "median (Git records whole seconds)"),
         make.medians(
             "Until healthy again",
             ready,

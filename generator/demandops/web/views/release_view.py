@@ -67,7 +67,7 @@ class Explained:
 
     @property
     def since(self) -> datetime | None:
-        """The time of the last change of the release's state; None if the cluster has none."""
+        """When the release's state last changed; None if the cluster does not report it."""
         return since_of(self.status)
 
     @property
@@ -114,8 +114,8 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
 def _others_stopped(commit_state: CommitState, release: Release) -> Iterable[str]:
     """Yield the names of the other releases that stop with ``release``.
 
-    The override to stop ``release`` denies its service on its node or, for a client of connections,
-    all its connections.
+    The override that stops a service denies this service on its node. The override that stops a
+    communication client denies all connections that the client carries.
     """
     for name, other in commit_state.releases.items():
         if name == release.name:

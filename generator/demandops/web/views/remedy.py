@@ -24,10 +24,10 @@ KINDS: dict[str, str] = {
     "waiting": "busy",
     "starting": "busy",
 }
-"""Kind of a cause → its color, in the order in which the view lists the kinds."""
+"""The color of each kind of cause, in the order in which the view lists the kinds."""
 
 LastChange = Callable[[str], "LogEntry | None"]
-"""A function that returns the newest commit that changed a file or folder; None without one."""
+"""A function that returns the newest commit that changed a file or folder, or None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +66,10 @@ def remedy_of(
     if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
-            who = f"the GitOps controller of cluster {cluster}, by itself; else its operator"
+            who = f"the GitOps controller of cluster {cluster} by itself; if not, its operator"
         return Remedy(who, "", command)
     if kind == "starting":
-        who = f"nobody yet; if it lasts, the operator of cluster {cluster}"
+        who = f"nobody yet; if this lasts, the operator of cluster {cluster}"
         return Remedy(who, "", command)
     if release.shaping.by:
         override = release.shaping.by[-1][0]
@@ -81,12 +81,12 @@ def remedy_of(
     if _ROOM.search(reason):
         return Remedy(
             f"the operator of node {release.node.id} in cluster {cluster}",
-            "give it room, or have the demand run on another node",
+            "make room for the release, or have the demand run on another node",
             command,
         )
     if _IMAGE.search(reason):
         return _of_images(release, config, command, last_change)
-    how = "look at its log" if _CRASH.search(reason) else ""
+    how = "look at the log of its container" if _CRASH.search(reason) else ""
     if not isinstance(release, ServiceRelease):
         return Remedy(f"the maintainer of the {release.type.word} client", how, command)
     where = f"appdefs/{release.service.folder}"
@@ -107,7 +107,7 @@ def _of_images(release: Release, config: Config, command: str, last_change: Last
 
 
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
-    """Return a text that names the people who last changed files or folders; empty without any."""
+    """Return a text that names the people who last changed files or folders, or an empty text."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
     return f" ({', '.join(people)} changed it last)" if people else ""

@@ -19,7 +19,7 @@ LANES = {
     "people": "People and generator",
     "health": "Health",
 }
-"""Name of a lane of the time line → its title, from top to bottom."""
+"""The title of each lane of the time line, from top to bottom, by the lane's name."""
 
 SPANS = {
     "15min": 900,
@@ -30,7 +30,7 @@ SPANS = {
     "30d": 30 * 86400,
     "all": 0,
 }
-"""Span of time that a person can choose → its seconds; 0 means all known events."""
+"""The spans of time that a person can choose, in seconds; 0 means all known events."""
 
 WIDTH = 1000
 _BINS = 60
@@ -43,7 +43,7 @@ _BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommi
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of the time line: a commit, or a change of health without a commit."""
+    """An event of the time line: a commit, or a change of a release's health."""
 
     lane: str
     time: datetime
@@ -124,7 +124,7 @@ def _of_health(change: HealthChange) -> Event:
 
 
 def matching(found: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    """Return the events that match; only those of a lane, unless ``lane`` is empty."""
+    """Return the events of ``lane`` (if empty, of all lanes) that match the filter ``wanted``."""
     return [
         one for one in found if lane in ("", one.lane) and (not wanted or wanted.matches(one.row()))
     ]
@@ -138,7 +138,8 @@ def strip(
     Args:
         found: the events, newest first.
         now: the time at the end of the line.
-        span: a key of ``SPANS``; any other value means the shortest span that has several events.
+        span: a key of ``SPANS``; any other value means the shortest span that has 20 events, or
+            three quarters of all events if that is less.
         chosen: the time and the id of the chosen commit; None if no earlier commit is chosen.
     """
     if span not in SPANS:
