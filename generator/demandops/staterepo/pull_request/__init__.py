@@ -1,1 +1,1 @@
-"""Checks of a pull request: a checked-out state repo that a person is about to merge."""
+"""Checks of pull requests: of checkouts of a state repo that people are about to merge."""
