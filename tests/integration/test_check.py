@@ -93,8 +93,9 @@ def test_a_chart_that_changed_without_a_new_version_is_caught(checkout: Path, ch
     code, _, errors = check()
     assert code == 1
     assert errors == (
-        f"error: {CHART}/Chart.yaml:5: version: is still 0.1.0, but values.yaml changed; raise it "
-        "here and at charts.object-fusion in registry/charts.yaml, or no cluster applies it\n"
+        f"error: {CHART}/Chart.yaml:5: version: is still 0.1.0, but values.yaml changed; raise "
+        "the version here and at charts.object-fusion in registry/charts.yaml, or no cluster "
+        "applies the change\n"
     )
 
 
