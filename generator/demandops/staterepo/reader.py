@@ -68,7 +68,7 @@ class Reader:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch and return the newest commit, which is the one that this reader then reads.
+        """Fetch and return the newest commit, and let this reader read that commit from now on.
 
         Raises:
             StateRepoError: if the state repo cannot be reached or read.

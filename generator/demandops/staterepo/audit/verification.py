@@ -68,7 +68,7 @@ class Verdict:
 class _Proof:
     """The rendered files of a commit.
 
-    For a later commit, :meth:`advance` renders only the releases again that its changes affect.
+    For a later commit, :meth:`advance` renders again only the releases that the commit affects.
     """
 
     def __init__(self, state: State, commit: Commit) -> None:
@@ -76,7 +76,10 @@ class _Proof:
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         self._held: dict[ReleaseKey, Release] = {}
-        """The releases whose files an override holds: the parent commit decides their text."""
+        """The releases whose files an override holds.
+
+        The text of such a file depends on the parent commit.
+        """
         base_files = manifests.base_files(state.config, state.engine)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)

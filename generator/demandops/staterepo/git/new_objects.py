@@ -48,7 +48,7 @@ Entries = dict[bytes, bytes]
 The name of a subfolder ends in a slash, so that sorting by name gives Git's order.
 """
 _REMEMBERED = 32
-"""How many folders to remember. Demands often change the folders again that were written last.
+"""How many folders to remember: the newest ones, because demands often change these again.
 
 A remembered folder never becomes outdated, because an id always means the same content.
 """

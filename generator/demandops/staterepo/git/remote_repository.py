@@ -94,7 +94,7 @@ _NO_CLONE = re.compile(
 )
 """Matches git's error if git cannot read the clone in which it runs.
 
-If git finds no remote in the clone's configuration, its error is about ``origin``.
+If git finds no remote in the clone's configuration, git's error is about ``origin``.
 """
 _NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
 """Matches git's error if git cannot read a file, here or on the server.

@@ -166,8 +166,9 @@ def is_readme(path: str) -> bool:
 
 
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Write a tree and return its id: ``base`` with the changes ``files``; None removes a file.
+    """Write a changed tree, and return the new tree's id.
 
+    The new tree is ``base`` with the texts of ``files`` instead of its own; None removes a file.
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
     """

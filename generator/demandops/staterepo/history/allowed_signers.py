@@ -51,7 +51,7 @@ def signature_of(commit: Commit) -> str:
 def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
     """Return a map from commit to fault.
 
-    It has each commit whose signature is required but missing or not valid.
+    The map has each commit whose signature is required but missing or not valid.
     """
     return {commit: one.fault for commit, one in checks(repo, commits).items() if one.fault}
 

@@ -1,8 +1,8 @@
 """Authors: who made the commits by people, and who runs this program.
 
 By a follow commit, the generator renders what people committed. The trailers of the follow commit
-name people's commits, and its author names their authors. A commit is by a person if no generator
-on any machine made it (:mod:`.commit_log`).
+name people's commits, and its author names these people. A commit is by a person if no generator on
+any machine made it (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple
     """Return a function that finds out which person's commit caused a fault in a file.
 
     The function gets the file's path and searches people's commits after ``known`` up to ``to``. It
-    returns id and author of the last commit that changed the file. If none changed the file, it
-    takes the last commit that changed any file which the generator reads. If there is no such
-    commit either, it returns None.
+    returns id and author of the last commit that changed the file. If no commit did so, it takes
+    the last commit that changed any file which the generator reads. If there is no such commit
+    either, it returns None.
     """
 
     @cache  # the commits are read only when needed: most problems are already in the report

@@ -63,7 +63,7 @@ class LogEntry:
 
 
 def time_of(commit: Commit) -> datetime:
-    """Return the committer's time, or the last second of the year 9999 if that is earlier."""
+    """Return the committer's time, but at most the last second of the year 9999."""
     return _time(commit.commit_time)
 
 

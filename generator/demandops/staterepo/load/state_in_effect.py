@@ -311,7 +311,7 @@ def _merged(one: Faults, other: Faults) -> Faults:
 def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
     """Return a map from subject to a placeholder fault.
 
-    It has each subject of which a claim file is in ``held_back``.
+    The map has each subject of which a claim file is in ``held_back``.
     """
     ledger = advance.snapshot.state.ledger
     return {

@@ -1,1 +1,1 @@
-"""Checks of pull requests: of checkouts of a state repo that people are about to merge."""
+"""Checks pull requests: reads a checkout of a state repo before a person merges the edit."""

@@ -211,7 +211,7 @@ class CommitBatch:
     ) -> _Followed:
         """Return the effect of people's changes, and start the leases of approved claims.
 
-        Such a lease starts only after the approval, because otherwise it could end before.
+        Such a lease starts only now, because otherwise it could end before the approval.
         """
         ledger, files = state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():

@@ -40,9 +40,10 @@ class BranchMoved(StateRepoError):
 
 
 def branch_name(name: str, operation: str) -> str:
-    """Return the name of the branch for a demand: a slug of ``name``, if any, and a digest.
+    """Return the branch name for a demand: a slug of ``name``, and a digest of the operation id.
 
-    The digest is that of the operation id, so that no other accepted goal gets the same branch.
+    Because of the digest, no other accepted goal gets the same branch name. A slug without any
+    character is left out.
     """
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
     digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
