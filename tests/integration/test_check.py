@@ -81,8 +81,8 @@ def test_a_changed_library_needs_new_versions_of_its_charts(checkout: Path, chec
     assert code == 1
     assert errors == "".join(
         f"error: {folder}/{chart}/Chart.yaml:5: version: is still 0.1.0, but {library}/values.yaml "
-        f"changed; raise it here and at charts.{chart} in registry/charts.yaml, or no cluster "
-        "applies it\n"
+        f"changed; raise the version here and at charts.{chart} in registry/charts.yaml, or no "
+        "cluster applies the change\n"
         for folder in ["appdefs/object-detection-fusion/charts"]
         for chart in ("object-detection", "object-fusion")
     )
@@ -93,8 +93,9 @@ def test_a_chart_that_changed_without_a_new_version_is_caught(checkout: Path, ch
     code, _, errors = check()
     assert code == 1
     assert errors == (
-        f"error: {CHART}/Chart.yaml:5: version: is still 0.1.0, but values.yaml changed; raise it "
-        "here and at charts.object-fusion in registry/charts.yaml, or no cluster applies it\n"
+        f"error: {CHART}/Chart.yaml:5: version: is still 0.1.0, but values.yaml changed; raise "
+        "the version here and at charts.object-fusion in registry/charts.yaml, or no cluster "
+        "applies the change\n"
     )
 
 
@@ -259,7 +260,7 @@ def test_a_first_bootstrap_is_told_and_not_printed(checkout: Path, check: Check)
     code, out, errors = check()
     assert code == 0
     assert (
-        "warning: bootstrap/c9.yaml: is new with the merge, and no controller applies it" in errors
+        "warning: bootstrap/c9.yaml: is new with the merge, but no controller applies it" in errors
     )
     assert "  write  bootstrap/c9.yaml (new, " in out
     assert "kind: Namespace" not in out
@@ -278,7 +279,7 @@ def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check
         "bootstrap/c-its.yaml",
     ]
     assert errors.splitlines()[-1] == (
-        "warning: bootstrap/c-its.yaml: changes with the merge, and no controller applies it; "
-        "afterwards, an administrator of cluster 'c-its' applies it: "
+        "warning: bootstrap/c-its.yaml: changes with the merge, but no controller applies it; "
+        "after the merge, an administrator of cluster 'c-its' must apply it: "
         "git show main:bootstrap/c-its.yaml | kubectl apply -f -"
     )

@@ -106,8 +106,9 @@ def test_a_release_that_is_held_keeps_the_controller_from_being_changed(
     ran = demandops("upgrade", "--state-repo", state.path, "--gitops", "argocd")
     assert (ran.code, ran.out, state.tip) == (1, "", before)
     assert ran.err == (
-        "error: overrides/race.yaml: hold: holds of-edge-object-detection-fusion-cf7e0180a8bb as "
-        "rendered for the other controller; remove the hold, and add it again after the upgrade\n"
+        "error: overrides/race.yaml: hold: keeps the file of "
+        "of-edge-object-detection-fusion-cf7e0180a8bb as rendered for the old controller; remove "
+        "the hold, and add it again after the upgrade\n"
     )
     state.commit({"overrides/race.yaml": None})
     assert demandops("upgrade", "--state-repo", state.path, "--gitops", "argocd").code == 0

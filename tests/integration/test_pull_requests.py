@@ -202,11 +202,11 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     assert errors.splitlines() == [
         "error: .demandops/report.yaml: is written by the generator, which undoes the edit; "
         "revert it",
-        f"error: {EDGE}/extra.yaml: is in a generated folder, where files without a demand are "
-        "removed; delete it and use `demandops request`",
+        f"error: {EDGE}/extra.yaml: is in a generated folder, from which the generator removes "
+        "what no demand needs; delete it, and demand what you need with `demandops request`",
         f"error: {DETECTION}: {LOST}{stopped.format('od-edge-station00.yaml')}",
         f"error: {CLIENT}: {LOST}{stopped.format(Path(CLIENT).name)}",
-        "error: ledger/notes.yaml: is not the path of a claim, so the generator removes it; "
+        "error: ledger/notes.yaml: is not the path of a claim, so the generator removes the file; "
         "delete it",
     ]
     assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out

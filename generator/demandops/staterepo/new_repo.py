@@ -34,7 +34,7 @@ def init(  # noqa: PLR0913 - what a state repo begins with
 
     Args:
         target: the folder of the state repo; it must be empty or not exist.
-        bare: make a bare repository, which the generator can use in place.
+        bare: whether to make a bare repository, which the generator can use in place.
         gitops: the GitOps controller, ``flux`` or ``argocd``.
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
@@ -77,7 +77,7 @@ def _write(
     repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
     repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
     repo.config["receive.fsckObjects"] = True  # refuse objects that libgit2 cannot read
-    repo.config["gc.auto"] = 0  # the generator joins the packs in the background
+    repo.config["gc.auto"] = 0  # because the generator joins the packs in the background
     objects = NewObjects(repo)
     tree = trees.write(objects, None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."

@@ -68,7 +68,7 @@ class Reader:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch and return the newest commit; read from this commit from now on.
+        """Fetch and return the newest commit, and let this reader read that commit from now on.
 
         Raises:
             StateRepoError: if the state repo cannot be reached or read.
@@ -130,7 +130,8 @@ class Reader:
     def snapshot_after(self, before: Snapshot) -> Snapshot:
         """Return :meth:`last_valid_snapshot` of the newest commit.
 
-        ``before`` is an earlier snapshot. If possible, only what changed since then is read.
+        ``before`` is an earlier snapshot. If possible, only the changes since this snapshot are
+        read.
         """
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
@@ -138,7 +139,7 @@ class Reader:
         return state_in_effect.state_after(self._objects, before, self._tip)
 
     def problems(self, revision: str | None = None) -> tuple[problem_report.Problem, ...]:
-        """Return the problems that the generator reports at a commit, each with its line."""
+        """Return the problems that the generator reports at a commit, located by line."""
         read = self.file_reader(revision)
         lines = FieldLines(read)
         return tuple(
@@ -176,7 +177,10 @@ class Reader:
         return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        """Return a function that reads the files of a commit: path → text, None if missing."""
+        """Return a function that gets a path and returns the file's text at a commit.
+
+        The function returns None if the commit has no such file.
+        """
         tree = self._tree(revision)
         return lambda path: trees.read_text(tree, path)
 
@@ -209,7 +213,7 @@ class Reader:
         return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
-        """Return the ids of A and B if ``spec`` is ``A..B``; None and the id of REV for ``REV``."""
+        """Return the ids of A and B for ``A..B``, or None and the id of REV for ``REV``."""
         first, dots, last = spec.partition("..")
         if not dots:
             return None, self.commit(first)
@@ -283,7 +287,10 @@ class Reader:
         return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
     def restoration(self, to: str, **more: object) -> Restoration:
-        """Return the request to roll back to the commit ``to``; ``more`` are its other fields."""
+        """Return the request to roll back to the commit ``to``.
+
+        ``more`` are the other fields of the request.
+        """
         return ledger_files.restoration(self._objects, to, **more)
 
     def operator(self) -> Person:
@@ -306,7 +313,7 @@ def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
 
 @contextmanager
 def opened_offline(address: str) -> Iterator[Reader | None]:
-    """Yield a reader that does not use the network; None for a URL that was never cloned."""
+    """Yield a reader that does not use the network, or None for a URL that was never cloned."""
     if not is_url(address):
         with opened(address) as found:
             yield found

@@ -24,7 +24,7 @@ _FIRST_STEP = (
 
 
 def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True) -> dict[str, str]:
-    """Return path → text of a new state repo.
+    """Return the files of a new state repo, as path → text.
 
     Args:
         gitops: the GitOps controller, ``flux`` or ``argocd``.
@@ -51,7 +51,7 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 
 def files_of_library(folder: str) -> dict[str, str]:
-    """Return path → text of the library chart that ``init`` puts into ``folder``.
+    """Return the files of the library chart that ``init`` puts into ``folder``, as path → text.
 
     Other charts depend on a library chart.
     """

@@ -181,7 +181,7 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return path → new text of the ledger files whose format this program changes."""
+    """Return the ledger files that this program writes in another format, as path → new text."""
     written = {}
     for path, text in files.items():
         new = text
@@ -203,8 +203,8 @@ def _refuse_held(state: State) -> None:
     faults = [
         fault(
             "hold",
-            f"holds {release.name} as rendered for the other controller; remove the hold, and add "
-            "it again after the upgrade",
+            f"keeps the file of {release.name} as rendered for the old controller; remove the "
+            "hold, and add it again after the upgrade",
         ).within(override.path)
         for release in planned_releases(state).values()
         if isinstance(release, ServiceRelease) and release.shaping.held
@@ -226,11 +226,11 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
             text = strict_yaml.set_key(text, "gitops", gitops)
         section = getattr(repository, gitops)
         if section is None:
-            # both controllers fetch the same repo, so the configured one names its URL
+            # both controllers fetch the same repo, so the URL of the configured controller fits
             known = getattr(repository, repository.gitops)
             text = strict_yaml.set_key(text, gitops, {"url": request.url or known.url})
         elif request.url not in (None, section.url):
-            message = f"is {section.url} already; change it there, or leave out --url"
+            message = f"is {section.url} already; change it in this file, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", message)])
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None

@@ -1,4 +1,4 @@
-"""Fixtures: a clock, a Git server with faults, and a person named Petra, who makes all commits."""
+"""Fixtures: a clock, a Git server with faults, and a person named Petra."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +13,7 @@ from tests.kit.repo import Person
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """In every test, the author of the commits is Petra."""
+    """In every test, Petra is the author of the commits that git makes for a person."""
 
 
 @pytest.fixture
@@ -37,7 +37,10 @@ def http(server: Server) -> str:
 
 @pytest.fixture
 def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
-    """Petra, who approves demands: all demands need approval, and generators check for it often."""
+    """Petra, who may approve demands.
+
+    The policy requires approval for all demands, and generators often check for decisions.
+    """
     monkeypatch.setattr(check_timer, "CHECK_LOCAL_S", 0.05)
     monkeypatch.setattr(check_timer, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")

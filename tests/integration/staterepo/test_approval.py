@@ -50,7 +50,7 @@ def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_
     assert [stage for stage, _ in proposed.told] == ["admitted", "booked", "proposed", "pushed"]
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert rig.restart(address) is True
-    assert rig.tip(bare) == commit.id, "a merge that fits needs no further commit"
+    assert rig.tip(bare) == commit.id, "a fast-forward merge must need no further commit"
 
 
 Way = Callable[[Person, str], None]

@@ -1,4 +1,7 @@
-"""Demands that come together are one push with a commit for each; one alone is pushed at once."""
+"""Demands that come together get a commit each, and one push for all.
+
+A demand that comes alone is pushed without delay.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""While a file of people is not valid, the other files that people merge take effect.
+"""While a file is not valid, the other files that people merge take effect.
 
 A broken file holds back the other files of its commit, but no file of another commit. After a
 restart the same files are in effect, and every commit verifies by its trailers.
@@ -159,7 +159,7 @@ def test_a_broken_claim_holds_back_no_configuration(
 def test_a_node_in_use_that_is_taken_away_stays_while_something_is_broken(
     bare: Path, person: Person
 ) -> None:
-    """The removal of the node is held back as a whole; the broken file stays replaced."""
+    """The removal of the node is held back as a whole, and the broken file stays without effect."""
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
         person.change({"overrides/broken.yaml": BROKEN})

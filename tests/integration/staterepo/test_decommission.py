@@ -23,7 +23,7 @@ def of(generator: Generator, subject: str) -> list[str]:
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     url: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
-    """A generator runs meanwhile; its polls find both commits."""
+    """A generator runs meanwhile, and fetches the commits of the command and of the person."""
     person = Person(bare, tmp_path / "person")
     with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))
@@ -135,7 +135,7 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(bare: Path, deman
     with rig.running(bare) as generator:
         assert of(generator, "edge/fusion-1") == []
         assert of(generator, "edge/fusion-2") == []
-        rig.book(generator, goal(1))  # it may demand again
+        rig.book(generator, goal(1))  # user1 may demand again
         assert of(generator, "edge/fusion-1") == ["station00 user1"]
         rig.book(generator, leave(1))
     rig.assert_sound(bare)

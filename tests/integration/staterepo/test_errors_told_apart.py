@@ -183,7 +183,7 @@ def _commit_by_hand(
 
 
 def _with_entry_in_overrides(bare: Path, name: bytes, blob: pygit2.Oid) -> pygit2.Oid:
-    """Return main's tree, in which ``overrides/`` has only this entry."""
+    """Return main's tree, but with only one entry in ``overrides/``: ``blob`` as ``name``."""
     repo = pygit2.Repository(str(bare))
     tree = repo.TreeBuilder(repo[tip(bare)].peel(pygit2.Tree))
     made = repo.write(pygit2.enums.ObjectType.TREE, b"100644 %s\0%s" % (name, blob.raw))

@@ -104,9 +104,9 @@ CHANGES = {
     "moved-node": ("http", _move_node, lambda text: "garage" in text),
     "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
-"""For each change by name: a kind of address, the change, and a check of the result.
+"""Name of a change → kind of address, function that makes the change, and check of the result.
 
-One kind of address for each is enough, because the result does not depend on it.
+Each change is tested with one kind of address, because the result does not depend on the address.
 """
 
 
@@ -366,7 +366,7 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, ba
             lambda: generator.remote_status.unreachable, "the remote is known to be away"
         )
         tickets = [generator.submit(goal(number)) for number in range(500)]
-        # the worker may move some into its batch, so the last demand may find room
+        # the worker may take demands from the queue into its batch, so the last may find room
         rig.wait_until(lambda: any(one.future.done() for one in tickets), "a demand is refused")
         refused = next(one for one in tickets if one.future.done())
         with pytest.raises(QueueFull, match=r"waiting already for the state repo: .*503"):
@@ -431,7 +431,7 @@ def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
     rig.assert_sound(bare)
 
 
-# # ---- what the command line reports ----
+# ---- what the command line reports ----
 
 
 def test_views_go_on_while_something_is_not_valid_and_say_so(

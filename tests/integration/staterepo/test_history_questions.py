@@ -1,4 +1,7 @@
-"""The code that reads clusters asks of real Git which commit is later, and what differs."""
+"""A repository answers which of two commits is later, and what differs between them.
+
+The code that reads clusters asks this. The tests use real Git repositories.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""After a kill at any time and a restart, each acknowledged demand is there, and counts once."""
+"""After a kill at any time and a restart, each acknowledged demand is booked, and counts once."""
 
 from __future__ import annotations
 
@@ -50,8 +50,9 @@ def test_killed_at_random_moments_loses_and_doubles_nothing(
             open_ = [(name, made) for name, made in client if name not in acknowledged]
             if last:  # finish the begun demands, and a few more
                 open_ = open_[:2]
-            # The operation id again, or a new one as from a restarted client. A leave keeps its id:
-            # with a new one it is no repeat if its requester has joined something since
+            # A join is sent again with the same operation id, or with a new one as by a restarted
+            # client. A leave keeps its id, because with a new id it does not count as a repeat if
+            # its requester has joined something since
             # (docs/decisions/0023-a-shutdown-takes-holds.md).
             again = "" if random.random() < 0.5 else f"-try{turn}"
             lanes.append(
@@ -94,10 +95,10 @@ def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
 
 
 POINTS = [
-    ("committed", "a commit object stands that no branch knows", False),
-    ("publishing", "all commits of the batch stand, none is published", False),
-    ("published", "the remote has it, the journal does not know", True),
-    ("unanswered", "the journal knows, the requester does not", True),
+    ("committed", "a commit object exists, but no branch has it", False),
+    ("publishing", "all commits of the batch exist, but none is published", False),
+    ("published", "the remote has the commits, but the journal does not say so", True),
+    ("unanswered", "the journal says that the demands are done, but nobody is told", True),
 ]
 
 
@@ -143,7 +144,7 @@ def test_a_demand_that_was_taken_up_again_is_not_taken_up_a_third_time(
 def test_a_leave_that_is_sent_again_after_its_answer_was_lost_spares_a_later_join(
     drivers: Drivers, url: str, bare: Path, point: str
 ) -> None:
-    """Only the history knows the leave, because its process ended."""
+    """Only the history shows the leave, because the process that booked it has ended."""
     opening, lanes = demand("join-1", goal(1)), [[demand("leave-1", leave(1))]]
     drivers.start(url, lanes, opening=opening, die_at=point).listen()
     assert rig.operations(bare) == ["op-join-1", "op-leave-1"]
@@ -227,7 +228,7 @@ def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_repla
 def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
     drivers: Drivers, bare: Path
 ) -> None:
-    """After the release, nothing contradicts the join; before it, the join was refused."""
+    """Before the release, the join was refused. After the release, nothing contradicts the join."""
     elsewhere = goal(1)
     elsewhere["apps"][0]["header"]["node_id"] = "cloud"
     lanes = [[demand("join-elsewhere", elsewhere)], [demand("leave-1", leave(1))]]
@@ -292,7 +293,8 @@ def test_a_lock_left_in_the_clone_by_a_killed_generator_does_not_stop_the_next_o
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
     tracking = next(data_home.glob("*/slot-0/clone.git/refs/remotes/origin"))
-    (tracking / "main.lock").touch()  # no living process: the slot itself is locked
+    # a dead process left this lock, because a living process would have locked the slot
+    (tracking / "main.lock").touch()
 
     with rig.running(url) as generator:
         rig.book(generator, goal(2))
@@ -313,7 +315,7 @@ def test_a_clone_cut_off_half_way_is_made_anew(url: str, bare: Path, data_home: 
     rig.assert_sound(bare)
 
 
-# # ---- journals of dead processes ----
+# ---- journals of dead processes ----
 
 
 def _leave_pending(url: str, bare: Path, numbers: list[int]) -> None:

@@ -47,7 +47,7 @@ def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory)
 
 
 def put(demand: str, lease: Any = 60, who: str = "vehicle00", **more: Any) -> rig.Goal:
-    """Return a demand for an application; its connection is derived from the application."""
+    """Return a demand for an application; the generator derives the connection that it needs."""
     return goals.put(demand, who, "station00", **({} if lease is None else {"lease": lease}) | more)
 
 
@@ -205,7 +205,7 @@ def test_two_generators_release_once(
     caplog.set_level(logging.INFO, logger="demandops")
     with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
         rig.book(first, put("d"))
-        rig.book(second, put("other", None))  # now it knows 'd'
+        rig.book(second, put("other", None))  # now the second one knows 'd'
         assert held(second, "d")
         clock.pass_(60)
         wait_until_gone(first, "d")

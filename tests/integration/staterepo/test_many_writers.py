@@ -27,7 +27,10 @@ SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
 LANES = 4
 """The number of requesters at each generator; each waits for an answer before it sends again."""
 CUTS = 0.01
-"""The share of HTTP requests that are cut before the server handles them; as many are cut after."""
+"""The probability that an HTTP request is cut before the server handles it.
+
+With the same probability, it is cut before the answer.
+"""
 PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
 
@@ -113,7 +116,7 @@ def test_many_writers_end_where_one_would(
     with capsys.disabled():
         _print(told, person, took, cut)
     _assert_one_would_have_done_the_same(bare, lanes, told, person)
-    assert cut, "no connection was cut, so nothing was tried"
+    assert cut, "no connection was cut, so the test has tested nothing"
 
 
 def _begin_to_cut(server: git_over_http.Server) -> None:

@@ -57,8 +57,8 @@ EITHER = pytest.mark.parametrize(
 )
 """In one case, the generator runs during the change and uses a remote.
 
-In the other case, it is stopped meanwhile and uses the repo in place. The other two combinations
-are left out, because address and run do not depend on each other.
+In the other case, the generator is stopped during the change and uses the repo in place. The other
+two combinations are left out, because the two conditions do not affect each other.
 """
 
 
@@ -71,8 +71,8 @@ def _around(
 ) -> str:
     """Book demands before and after a person's change; return the person's commit.
 
-    If ``running``, the generator runs during the change. Otherwise it stops before and starts
-    after.
+    If ``running``, the generator runs during the change. Otherwise the generator stops before the
+    change, and starts again after the change.
     """
     if running:
         with rig.running(address) as generator:
@@ -211,7 +211,7 @@ def test_an_inventory_change_is_applied_once_a_removed_node_is_released(
 def test_a_generated_file_that_a_person_edited_is_put_right_with_the_next_commit(
     url: str, bare: Path, person: Person
 ) -> None:
-    """`demandops check` warns of such an edit; every commit verifies nevertheless."""
+    """`demandops check` refuses the edit. If it is merged nevertheless, every commit verifies."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         paths = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/").splitlines()
@@ -340,7 +340,7 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
 def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Against the stale clone, neither demand needs a push, but the remote has changed since."""
+    """By the stale clone, neither demand needs a push, but the remote has got a commit since."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)

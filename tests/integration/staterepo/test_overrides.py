@@ -1,6 +1,7 @@
-"""Overrides that a person merges while a generator runs take effect, last, and end again.
+"""Overrides that a person merges while a generator runs apply until they end.
 
-The next demand finds what was merged before it. At the end of each test every commit verifies.
+The generator applies what a person has merged before it books the next demand. At the end of each
+test, every commit verifies.
 """
 
 from __future__ import annotations
@@ -164,7 +165,7 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     held = file(bare, path)
     assert held.startswith("# override overrides/frozen.yaml: hold; priority 0; owner petra")
     assert body(bare, path) == before
-    (late,) = rig.book(generator, rig.goal(6))  # it adds an input
+    (late,) = rig.book(generator, rig.goal(6))  # adds an input to the held fusion
     assert late.warnings[-1] == (
         f"{fusion} is held by overrides/frozen.yaml; its changes wait until the hold ends"
     )
@@ -235,7 +236,7 @@ def test_a_kept_application_runs_until_a_demand_takes_over_or_the_override_goes(
     assert commit.all("Requester") == ["user1", "station00"]
     books = rig.books(bare)
     assert books["services"]["od-edge-station00"]["requesters"] == ["petra"]
-    assert books["connections"] == {}, "it keeps applications, not connections"
+    assert books["connections"] == {}, "the override keeps applications, not connections"
     assert len(rig.claims(bare, "override:lasting")) == 1
     assert "override overrides/lasting.yaml: keep;" in file(bare, DETECTION)
     with pytest.raises(Refused):

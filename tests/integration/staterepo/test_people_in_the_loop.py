@@ -24,7 +24,10 @@ from tests.kit.rig import Person
 
 FURTHER = int(os.environ.get("DEMANDOPS_LOAD_FURTHER", "24"))
 INTERVAL_S = 0.5
-"""The generator's fetch interval in seconds; no test checks times, but `make load` prints them."""
+"""The generator's fetch interval in seconds.
+
+No test checks how long a change takes, but `make load` prints it.
+"""
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 FUSION = f"{EDGE}/of-edge-fusion-1-118f66a66700.yaml"
@@ -49,7 +52,7 @@ class Engineer:
 
     def sees(self, what: str, files: dict[str, str | None], honoured: Callable[[], bool]) -> None:
         """Merge a change and wait until `honoured` returns true, although no demand comes."""
-        assert not honoured(), f"{what}: it is so already"
+        assert not honoured(), f"{what}: in effect before the change already"
         made = self.person.change(files, what)
         began = time.monotonic()
         rig.wait_until(honoured, what)
@@ -115,7 +118,7 @@ def test_what_the_platform_engineer_merges_is_honoured_and_stays_so(
         story(bare, engineer)
         _demand_on(generator)
         for what, honoured in engineer.kept.items():
-            assert honoured(), f"{what}: in force no more after {FURTHER} demands"
+            assert honoured(), f"{what}: no longer in effect after {FURTHER} demands"
         engineer.sees(
             "the broken override mended",
             {"overrides/broken.yaml": BROKEN.replace("many", "3")},

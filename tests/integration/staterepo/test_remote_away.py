@@ -1,4 +1,4 @@
-"""Demands wait while the remote is away; if the remote denies a push, its demands are refused."""
+"""Demands wait while the remote is away, and fail if the remote denies their push."""
 
 from __future__ import annotations
 
@@ -133,7 +133,10 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
 def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_its_commits(
     url: str, bare: Path
 ) -> None:
-    """The ledger that contradicts ``moved`` is never published, so it must not cause a refusal."""
+    """``moved`` contradicts another demand of its batch, but the batch is never published.
+
+    So the contradiction must not be the reason why ``moved`` fails.
+    """
     gate = Gate()
     hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
     moved = goal(7)
@@ -202,13 +205,13 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
             "git@edge: Permission denied (publickey); give git credentials for it: a credential "
             "helper, ~/.netrc or an SSH key",
         ),
-        (  # the server ends in the middle of its answer, of which git complains last
+        (  # the server ends in the middle of its answer, and git complains of that last
             "printf '000eversion 2\\n'\n"
             "echo \"warning: unable to access 'config': Input/output error\" >&2\n"
             "echo 'fatal: unknown error occurred while reading the configuration files' >&2",
             "warning: unable to access 'config': Input/output error",
         ),
-        (  # its disk did not give it the reference, and it names none
+        (  # the server could not read the reference from its disk, and names a null id
             f"echo 'fatal: git upload-pack: not our ref {'0' * 40}' >&2",
             f"fatal: git upload-pack: not our ref {'0' * 40}; the server cannot read the branch: "
             "check its disk, and who may read its files",
@@ -255,7 +258,7 @@ def test_a_stale_lock_at_the_remote_is_told_in_the_log_and_survived(
         ticket = generator.submit(goal(1))
         rig.wait_until(
             lambda: any(r.levelname in ("WARNING", "ERROR") for r in caplog.records),
-            "a warning that the push fails",
+            "a warning tells that the push fails",
         )
         lock.unlink()
         assert rig.receipt(ticket).outcome == "booked"

@@ -1,4 +1,4 @@
-"""Rollbacks while other generators write, in place and by URL, and one that a crash interrupts."""
+"""Rollbacks while another generator writes, and a rollback that a crash interrupts."""
 
 from __future__ import annotations
 

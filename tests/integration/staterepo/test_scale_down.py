@@ -1,4 +1,4 @@
-"""A commit removes replicas later, on a real repository, whichever generator runs."""
+"""Replicas that no demand needs are removed by a later commit, whichever generator then runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ RELEASE = "of-edge-fusion"
 
 @pytest.fixture(scope="session")
 def bare_template(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bare state repo whose fusion has a replica for each source and keeps it for a time."""
+    """A bare state repo in which a fusion has a replica for each source.
+
+    The fusion keeps a replica for ten minutes after the last demand that needed it.
+    """
     folder = tmp_path_factory.mktemp("kept") / "state.git"
     bare = Path(shutil.copytree(bare_template, folder))
     text = skeleton()[APPDEF].replace("prefix: of\n", f"prefix: of\n    scaling: {SCALING}\n")

@@ -81,7 +81,7 @@ def test_two_processes_on_one_machine_lose_and_double_nothing(
     runs = []
     for who in (0, 1):
         demands = [demand(name, made) for name, made in _demands(who)]
-        # a leave is in the lane of its join, after it
+        # a leave comes after its join, in the same lane
         lanes: list[list[dict[str, object]]] = [[], [], []]
         for item in demands:
             lanes[int(item["name"].rpartition("-")[2]) // 2 % 3].append(item)

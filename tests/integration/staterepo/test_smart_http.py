@@ -60,9 +60,10 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
 def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """The server takes a push with a release; the join repeated before it made no commit.
+    """The server takes a push with a release. Before the release comes a repeated join.
 
-    If the generator decided both again, it would book the join.
+    The repeated join changes nothing, so it has no commit. If the generator decided join and
+    release again, it would book the join.
     """
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
@@ -124,7 +125,7 @@ def test_closing_does_not_wait_for_a_server_that_never_answers(
         try:
             published = stopped.result(8)
         except TimeoutError:
-            pytest.fail("8 s after close(timeout=0.5) the generator still waits for the server")
+            pytest.fail("8 s after stop(timeout=0.5) the generator still waits for the server")
     finally:
         server.faults.hang.set()
         server.faults.hang = None

@@ -98,7 +98,7 @@ def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
     assert made in [value.split()[0] for c in rig.commits(bare) for value in c.all("Caused-By")]
 
 
-# # ---- manual claims ----
+# ---- manual claims ----
 
 
 def with_rules(bare: Path, **quotas: int) -> str:

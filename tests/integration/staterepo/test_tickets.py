@@ -27,7 +27,7 @@ from tests.kit.goals import put
 from tests.kit.limits import files_end_at
 from tests.kit.rig import Drivers, Gate, Stages, demand, goal
 
-# # ---- withdrawals ----
+# ---- withdrawals ----
 
 
 def test_a_demand_that_waits_can_be_taken_back_and_leaves_no_trace(
@@ -270,7 +270,7 @@ def test_demands_are_counted_while_others_come_and_go(bare: Path) -> None:
 
 
 def test_a_caller_that_cancels_its_future_stops_nobody_else(bare: Path) -> None:
-    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` cancels it at a time-out."""
+    """`asyncio.wait_for(asyncio.wrap_future(ticket.future), …)` cancels the future on time-out."""
     gate = Gate()
     with rig.running(bare) as generator:
         first = generator.submit(goal(1), listener=gate)

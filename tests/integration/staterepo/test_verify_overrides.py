@@ -1,4 +1,4 @@
-"""Under overrides, `verify` goes from commit to commit and gives the verdicts of `--whole`."""
+"""With overrides, `verify` goes from commit to commit, and agrees with `verify --whole`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def verdicts(bare: Path) -> dict[str, Verdict]:
 
 
 def forged(bare: Path, person: Person, generator: Generator, change: Callable[[], str]) -> Verdict:
-    """Make a commit that is not the generator's, between demands; return the verdict on it."""
+    """Make a forged commit between two demands, and return the verdict on the forged commit."""
     rig.book(generator, rig.goal(2))
     made = change()
     found = verdicts(bare)[made]

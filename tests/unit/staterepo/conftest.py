@@ -1,4 +1,4 @@
-"""Fixtures: decisions on goals in memory, which tests then write to a repository."""
+"""Fixtures: a repo in memory that decides on goals, and an empty Git repository."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
 
 class Desk(MemoryRepo):
-    """A repo in memory, with short calls for joins to an application and leaves from it."""
+    """A repo in memory, with short methods that send a join or a leave for one application."""
 
     def join(
         self,
@@ -46,4 +46,4 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """In every test, the author of the commits is a person named Petra."""
+    """In every test, Petra is the author of the commits that git makes."""

@@ -39,7 +39,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def text(path: Path) -> bytes:
-    """A journal as a kill leaves it: two demands are pending, one is done, one is proposed."""
+    """A journal as a kill leaves it: ``b`` is done, ``a`` is pending, and ``c`` is proposed."""
     journal = Journal(path)
     journal.append([entry("a"), entry("b")])
     journal.append([entry("c")])

@@ -46,7 +46,10 @@ def file_trees(draw: st.DrawFn) -> Files:
 
 @st.composite
 def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
-    """Return random removals, also of missing files, and texts of files that fit into one tree."""
+    """Return random removals of files and random texts of files.
+
+    Some removed files do not exist. The files with texts fit into one tree.
+    """
     known = st.sampled_from(sorted(files)) if files else PATHS
     removed = draw(st.lists(known | PATHS, max_size=4))
     made: dict[str, str | None] = {

@@ -1,1 +1,1 @@
-"""The audit: checks of the signatures of commits, and of their files."""
+"""The audit: checks the signature of each commit, and the files that the commit changed."""

@@ -1,4 +1,4 @@
-"""Adds the check of the commit's signature to each verdict."""
+"""Checks the signatures of verified commits, and adds the results to the verdicts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from demandops.staterepo.history.commit_log import entry_of
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts, with the result of the check of each commit's signature.
+    """Return the verdicts, each with what the check of the commit's signature found.
 
     If a required signature is missing or not valid, ``holds`` becomes false.
     """

@@ -36,7 +36,7 @@ _RECORDS = tuple(
         kept_replicas.REPLICAS_ROOT,
     )
 )
-"""The ledger's folders of records. A record is not a claim."""
+"""The folders of the ledger that have records, such as recent shutdowns, instead of claims."""
 _REWRITING = ("follow", "upgrade")
 """Operations that may rewrite a claim, to start its lease or to change its schema."""
 _ENDING = ("follow", "upgrade", "expire-override")

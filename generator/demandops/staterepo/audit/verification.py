@@ -1,12 +1,13 @@
 """Verifies commits: renders their generated files again, and compares them with the committed ones.
 
 A commit is verified whole or by differences. To verify a commit whole, the program loads and
-renders everything. The first and the last commit are verified whole.
+renders everything. It does so for the first and the last commit, and for each commit that records
+invalid files.
 
 To verify a commit by differences, the program starts from the commit that it verified before. It
 assumes that equal object ids mean equal files, and that plans and rendered files depend only on
 their input. It does not rely on the generator's choice of the affected releases. Instead, it plans
-and renders each release again if any input of its plan changed
+and renders a release again if any input of the release's plan changed
 (:mod:`demandops.plan.views.traced_plan`), and compares every file that differs in Git.
 """
 
@@ -65,14 +66,20 @@ class Verdict:
 
 
 class _Proof:
-    """The rendered files of a commit; :meth:`advance` keeps those that a later commit needs too."""
+    """The rendered files of a commit.
+
+    For a later commit, :meth:`advance` renders again only the releases that the commit affects.
+    """
 
     def __init__(self, state: State, commit: Commit) -> None:
         self.state, self._commit = state, commit
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         self._held: dict[ReleaseKey, Release] = {}
-        """The releases whose files an override holds. Their text depends on the parent commit."""
+        """The releases whose files an override holds.
+
+        The text of such a file depends on the parent commit.
+        """
         base_files = manifests.base_files(state.config, state.engine)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
@@ -81,8 +88,8 @@ class _Proof:
     def can_advance_to(self, commit: Commit) -> bool:
         """Return whether :meth:`advance` may be called with a later commit.
 
-        It may not if the configuration, the markers of ended overrides or the problem report
-        differ. Such a commit needs a new proof.
+        The later commit needs a new proof instead if the configuration, the markers of ended
+        overrides or the problem report differ.
         """
         roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
         return not trees.differ(self._commit.tree, commit.tree, roots)
@@ -114,7 +121,7 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Plan and render the affected releases, and render again those with an override ``hold``.
+        """Plan and render the affected releases, and each release whose file an override holds.
 
         The affected releases are those of the claims in ``changes`` and of the instances ``kept``.
         """
@@ -177,9 +184,9 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
                     proof = _Proof(_loaded(repo, entry), commit)
                 differing = proof.differing()
         except _Unreadable as error:
-            why = f"a file was not valid then: {error}"
+            why = f"a file was not valid at this commit: {error}"
             yield replace(verdict, skipped=why, holds=not verdict.touched)
-        except InvalidInput as error:  # a fault, because the generator rendered the commit
+        except InvalidInput as error:  # the generator could render the commit, so this is a fault
             yield replace(verdict, holds=False, fault=str(error.faults[0]))
         except StateRepoError as error:
             yield replace(verdict, holds=False, fault=str(error))

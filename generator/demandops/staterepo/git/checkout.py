@@ -53,7 +53,9 @@ class Checkout(LocalRepository):
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Raise PushDenied, because the program only reads checkouts."""
-        raise PushDenied(f"{self.address} is a checkout, which commands only read; name its remote")
+        raise PushDenied(
+            f"{self.address} is a checkout, which commands only read; name its remote instead"
+        )
 
 
 class LastFetch(LocalRepository):

@@ -61,7 +61,7 @@ class LocalRepository(StateRepository):
     def renew_if_damaged(self) -> bool:
         """Check the repository with git; return False, or raise StateRepoError if it is damaged.
 
-        A repository on this disk has no remote to clone again from.
+        A repository on this disk has no remote from which it could be cloned again.
         """
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
@@ -105,7 +105,10 @@ class LocalRepository(StateRepository):
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Move the branch to ``commit``; return False if it is no longer at ``expected``."""
+        """Move main to ``commit`` and return True.
+
+        Return False if main is no longer at ``expected``, or if another writer locks main.
+        """
         reference = self.objects.references[MAIN]
         if reference.target != expected:
             return False
@@ -121,11 +124,11 @@ class LocalRepository(StateRepository):
             self._break_stale_lock()
             if self._lock_seen is None and self.tip() == expected:
                 raise Unavailable(f"{self.address} cannot be written: {error}") from None
-            return False  # another writer holds the lock or was first: evaluate again
+            return False  # another writer holds the lock or was first; the caller tries again
         return True
 
     def write_anew(self, since: str) -> None:
-        """Write the branch and the commits after ``since`` to new files, and sync these files."""
+        """Write main and its commits after ``since`` to new files, and sync these files."""
         branch = Path(self.objects.path) / MAIN
         lock = branch.with_name(f"{branch.name}.lock")
         try:

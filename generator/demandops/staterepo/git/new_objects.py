@@ -1,8 +1,8 @@
 """New objects of a state repo: kept in memory, then written to the disk as one pack.
 
 A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each. The
-pack has every new object that its commits need. It repeats an object that the repository already
-has as a loose object, because that one may not be on the disk yet, or git may soon prune it.
+pack has every new object that the commits need, even if the repository already has the object as a
+loose object. The loose object may not be on the disk yet, or git may soon prune it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from demandops.staterepo.git.pack_file import write_pack
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 _LAST = 0
-"""The lowest priority of an object source. Most objects that are read are in other sources."""
+"""The priority of this source of objects: the lowest, because most reads need other sources."""
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
@@ -45,21 +45,22 @@ _FOLDER = b"40000"
 Entries = dict[bytes, bytes]
 """Name → raw entry, for each entry of a folder.
 
-The name of a subfolder ends in a slash, because Git sorts it so.
+The name of a subfolder ends in a slash, so that sorting by name gives Git's order.
 """
 _REMEMBERED = 32
-"""How many folders to remember: those written last, because demands often change them again.
+"""How many folders to remember: the newest ones, because demands often change these again.
 
 A remembered folder never becomes outdated, because an id always means the same content.
 """
 
 
 class NewObjects(pygit2.OdbBackend):
-    """Objects that are in memory but not in a pack yet; the repository reads them like others."""
+    """Objects that are in memory and not in a pack yet. The repository can read them."""
 
     def __init__(self, repo: Repository) -> None:
         super().__init__()
-        # Python cannot see that libgit2 refers to this object: a strong reference would leak both
+        # a strong reference would leak the repository and this object: Python does not know that
+        # libgit2 refers to this object, so it could not free the cycle
         self._repo = weakref.ref(repo)
         self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
         self._folders: dict[Oid, Entries] = {}
@@ -67,7 +68,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository. This object has a weak reference to it; every writer has a strong one."""
+        """The repository. Its writer keeps it open, because this reference to it is weak."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - its writer has a strong reference
         return repo
@@ -104,7 +105,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def packed(self, commit: Oid) -> Iterator[None]:
-        """Write the new objects that a commit needs to one synced pack, then run the block.
+        """Write a synced pack with all new objects that a commit needs, then run the block.
 
         While the block runs, git's housekeeping does not remove the pack, although no reference
         leads to its commits yet.
@@ -120,10 +121,10 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
-        """Write the objects that ``commit`` has and ``since`` lacks again, to a new synced pack.
+        """Write a new synced pack with the objects that ``commit`` has and ``since`` lacks.
 
-        An earlier sync may have failed. Then the objects can be read, but may not be durable.
-        While the block runs, git's housekeeping does not remove the pack.
+        The repository has these objects, but they may not be durable, because an earlier sync may
+        have failed. While the block runs, git's housekeeping does not remove the pack.
         """
         with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n^{since}\n")):
             yield
@@ -170,7 +171,7 @@ class NewObjects(pygit2.OdbBackend):
     def _copy_to_pack(self, folder: str, revisions: str) -> Path:
         """Have git write the objects that ``revisions`` selects to a synced pack in ``folder``.
 
-        Return the pack's path. Git checks the objects, because it does not copy packed bytes.
+        Return the pack's path. Git packs each object anew, so it reads and checks each object.
         """
         done = subprocess.run(
             ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
@@ -224,7 +225,7 @@ class NewObjects(pygit2.OdbBackend):
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return the type, content and id of a new object; shortened ids are not found."""
+        """Return the type, content and id of a new object. A shortened id finds nothing."""
         kind, data = self._known[oid]
         return kind, data, oid
 
@@ -253,7 +254,7 @@ def _folder_until_done(parent: str) -> Iterator[str]:
     try:
         yield folder
     finally:
-        with suppress(OSError):  # rmtree does not ignore all errors of the folder itself
+        with suppress(OSError):  # for the folder itself, rmtree raises some errors nevertheless
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -274,7 +275,7 @@ def _locked(folder: Path, how: int) -> Iterator[None]:
 def _pack_in(folder: str) -> Path:
     """Return the path of the only pack in a folder.
 
-    Raises OSError if the folder cannot be read. :meth:`Path.glob` would not raise.
+    Raises OSError if the folder cannot be read. :meth:`Path.glob` would hide this error.
     """
     (pack,) = [path for path in Path(folder).iterdir() if path.suffix == ".pack"]
     return pack

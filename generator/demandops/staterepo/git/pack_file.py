@@ -1,7 +1,7 @@
 """Writes and syncs a pack and its index in Git's format.
 
-Each object is compressed and stored whole, not as a delta. To search for deltas would take longer
-than the rest of a demand's commit. Git's housekeeping makes deltas later.
+Each object is compressed and stored whole, not as a delta, because the search for deltas would take
+longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 _LEVEL = 1
 """The level of compression. A pack is short-lived, so speed counts more than size."""
 _SHORT_OFFSETS = 1 << 31
-"""An index keeps offsets from this value on in a separate table."""
+"""An index has a separate table for offsets of at least this value."""
 
 
 class Packed(NamedTuple):
@@ -56,7 +56,8 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
 def _header(kind: int, size: int) -> bytes:
     """Return the header of an object in a pack: its type and size.
 
-    The first byte has the type and four bits of the size. Each further byte has seven bits.
+    The first byte has the type and four bits of the size. Each further byte has seven bits of the
+    size.
     """
     first, size = kind << 4 | size & 0xF, size >> 4
     header = bytearray()

@@ -94,10 +94,13 @@ _NO_CLONE = re.compile(
 )
 """Matches git's error if git cannot read the clone in which it runs.
 
-If git finds no remote in the clone's configuration, its error is about ``origin``.
+If git finds no remote in the clone's configuration, git's error is about ``origin``.
 """
 _NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
-"""Matches git's error if git cannot read a file, here or on the server. A URL does not match."""
+"""Matches git's error if git cannot read a file, here or on the server.
+
+Git's error about a URL that it cannot reach does not match.
+"""
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
@@ -108,7 +111,7 @@ HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
 HAS_TOKEN = re.compile(
     r"^https?://(gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-zA-Z]*\d)[a-zA-Z0-9]{32,}@)", re.I
 )
-"""Matches a URL whose user name is a token. Other user names are normal: some forges need one."""
+"""Matches a URL whose user name is a token. Others are allowed, because some forges need one."""
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
@@ -120,7 +123,7 @@ def without_secrets(text: str) -> str:
 
 
 class RemoteRepository(StateRepository):
-    """A bare clone of a remote; git runs with the user's configuration."""
+    """A state repo behind a URL, in a bare clone. Git runs with the user's configuration."""
 
     always_current = False
     main_reference = _REMOTE_MAIN
@@ -212,8 +215,8 @@ class RemoteRepository(StateRepository):
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Fetch, and return the remote's tip; raise RemoteAway if the remote cannot be reached.
 
-        Raises FetchInterrupted as soon as ``urgent`` returns true, because a demand must not wait
-        for the remote.
+        Raises FetchInterrupted as soon as ``urgent`` returns true, so that a demand need not wait
+        for the fetch.
         """
         self._fetch(self._git, urgent)
         return self.tip()
@@ -244,7 +247,7 @@ class RemoteRepository(StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        """Return name → commit of the remote's references that match ``patterns``.
+        """Return the remote's references that match ``patterns``, as name → commit.
 
         Raises RemoteAway if the remote cannot be reached.
         """
@@ -277,7 +280,10 @@ class RemoteRepository(StateRepository):
         return f"{out}\n{err}"
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return the error to raise for a failed push; ``PushDenied`` if a retry would fail too."""
+        """Return the error to raise for a failed push.
+
+        The error is ``PushDenied`` if a further attempt would fail too.
+        """
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()
@@ -422,6 +428,6 @@ def _reason(text: str) -> str:
 
 
 def _without_open_quote(line: str) -> str:
-    """Return a line without the quote that GitPython puts after the last one."""
+    """Return a line without the quote that GitPython puts at the end of git's output."""
     line = line.strip(' "')
     return line.removesuffix("'") if line.count("'") % 2 else line

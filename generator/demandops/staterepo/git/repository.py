@@ -1,7 +1,7 @@
 """The base class of state repos: Git objects, and a tip that only moves forward.
 
-A state repo is on this disk or behind a URL. For each of the two there is a subclass;
-:mod:`demandops.staterepo.git.open_repository` chooses it.
+A state repo is on this disk or behind a URL. Each of the two has a subclass, and
+:mod:`demandops.staterepo.git.open_repository` chooses between them.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ENVIRONMENT = {
 
 
 class Unavailable(StateRepoError):
-    """Raised when the state repo cannot be written now; the journal keeps the demands."""
+    """Raised when the state repo cannot be written now. The journal keeps the demands meanwhile."""
 
 
 class RemoteAway(Unavailable):
@@ -109,7 +109,7 @@ class StateRepository(ABC):
     runtime: Runtime = REAL
     """The clock, randomness and threads of the code that writes to the state repo."""
     always_current: bool
-    """Whether :meth:`tip` is never out of date. True for a repository on this disk."""
+    """Whether :meth:`tip` is always the newest commit, as in a repository on this disk."""
     _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
     """The reference of main, or of its remote-tracking branch."""
@@ -149,9 +149,9 @@ class StateRepository(ABC):
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or descends from it; false if either is unknown.
+        """Return whether ``commit`` is ``other`` or descends from ``other``.
 
-        Any thread may call this.
+        Return false if either commit is unknown here. Any thread may call this method.
         """
         if commit == other:
             return True
@@ -163,7 +163,7 @@ class StateRepository(ABC):
     def unchanged(self, commit: str, other: str, path: str) -> bool:
         """Return whether ``path`` exists and is equal in two commits.
 
-        False if either commit is unknown here.
+        Return false if either commit is unknown here.
         """
         found = self._trees(commit, other)
         if found is None:
@@ -173,7 +173,10 @@ class StateRepository(ABC):
         return trees.entry(found[0], path) is not None and not trees.differ(*found, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        """Return the paths in which two commits differ; None if either is unknown here."""
+        """Return the paths of the files that differ between two commits, sorted.
+
+        Return None if either commit is unknown here.
+        """
         found = self._trees(since, commit)
         return None if found is None else sorted(path for path, _ in trees.differences(*found))
 
@@ -197,7 +200,7 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git join the packs in the background, unless an earlier call still does so."""
+        """Have git join the packs in the background, unless an earlier run of git still does."""
         if self._tidying is not None and self._tidying.poll() is None:
             return
         self._tidying = subprocess.Popen(

@@ -11,7 +11,7 @@ _listeners: list[Callable[[str], None]] = []
 
 
 def listen(listener: Callable[[str], None]) -> None:
-    """Register the listener, instead of an earlier one.
+    """Register a listener in place of an earlier one.
 
     A slow run of git calls the listener each second with a text about what git does, and with an
     empty text when git has ended.

@@ -114,12 +114,12 @@ def is_file(found: Object) -> bool:
 
 
 def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
-    """Return path → text of every file at or below the paths ``roots``."""
+    """Return all files at or below the paths ``roots``, as path → text."""
     return {path: text_of(blob) for path, blob in blobs(tree, roots)}
 
 
 def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
-    """Return whether any file or folder of ``paths`` differs between two trees."""
+    """Return whether the file or folder at any of ``paths`` differs between two trees."""
     return any(entry_id(one, path) != entry_id(other, path) for path in paths)
 
 
@@ -161,13 +161,14 @@ def _differences_at(
 
 
 def is_readme(path: str) -> bool:
-    """Return whether a path is a README's, which people may put next to generated files."""
+    """Return whether a file is a README, which people may put next to generated files."""
     return path.rsplit("/", 1)[-1] == "README.md"
 
 
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Write a tree that is ``base`` with ``files`` changed (None removes a file); return its id.
+    """Write a changed tree, and return the new tree's id.
 
+    The new tree is ``base`` with the texts of ``files`` instead of its own; None removes a file.
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
     """

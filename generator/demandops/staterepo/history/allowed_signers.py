@@ -39,7 +39,7 @@ A result stays true, because a commit, its signature and its parent never change
 
 
 def are_listed(repo: Repository, commit: Oid) -> bool:
-    """Return whether a commit lists the keys that may sign."""
+    """Return whether the files of a commit include the list of the keys that may sign."""
     return trees.entry(trees.commit_of(repo, commit).tree, ALLOWED_SIGNERS) is not None
 
 
@@ -49,12 +49,18 @@ def signature_of(commit: Commit) -> str:
 
 
 def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
-    """Return commit → fault of each commit whose required signature is missing or not valid."""
+    """Return a map from commit to fault.
+
+    The map has each commit whose signature is required but missing or not valid.
+    """
     return {commit: one.fault for commit, one in checks(repo, commits).items() if one.fault}
 
 
 def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
-    """Check the signature of each commit whose parent lists the allowed keys: commit → result."""
+    """Check the signatures of commits, and return a map from commit to result.
+
+    A commit is checked only if its parent lists the allowed keys.
+    """
     signatures, found = dict[str, str](), dict[str, Check]()
     lists: dict[str, list[str]] = {}
     for commit in commits:
@@ -93,7 +99,7 @@ def _fault(signature: str, state: str) -> str:
 def _check_with_git(
     repo: Repository, allowed: str, commits: list[str]
 ) -> Iterable[tuple[str, str, str]]:
-    """Return for each commit its id, git's letter for its signature, and the signer.
+    """Return (id, git's letter for the signature, signer) for each commit.
 
     ``allowed`` is the text of the list of keys.
     """

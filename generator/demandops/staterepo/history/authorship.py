@@ -1,8 +1,8 @@
 """Authors: who made the commits by people, and who runs this program.
 
-A follow commit is a commit of the generator that renders what people committed. It names their
-commits, and has their authors as its author. A commit is by a person if no generator on any machine
-made it (:mod:`.commit_log`).
+By a follow commit, the generator renders what people committed. The trailers of the follow commit
+name people's commits, and its author names these people. A commit is by a person if no generator on
+any machine made it (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Person(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether git knows the address; if not, the address was made from the login."""
+        """Whether git named the address. If not, the address was made from the login."""
         return not self.email.endswith(_NO_ADDRESS)
 
     def __str__(self) -> str:
@@ -51,11 +51,12 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return a function that finds the commit by a person that caused a fault in a file.
+    """Return a function that finds out which person's commit caused a fault in a file.
 
-    The function gets the file's path, and returns id and author of the last commit by a person that
-    changed the file. It searches the commits after ``known`` up to ``to``. If none of them changed
-    the file, it returns the last commit by a person that changed any file, else None.
+    The function gets the file's path and searches people's commits after ``known`` up to ``to``. It
+    returns id and author of the last commit that changed the file. If no commit did so, it takes
+    the last commit that changed any file which the generator reads. If there is no such commit
+    either, it returns None.
     """
 
     @cache  # the commits are read only when needed: most problems are already in the report
@@ -106,7 +107,11 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
 
 
 def operator(folder: str | None = None) -> Person:
-    """Return the person who runs this program, from git's configuration or else the login."""
+    """Return the person who runs this program.
+
+    Name and address come from git's environment variables, else from git's configuration, else from
+    the login.
+    """
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry

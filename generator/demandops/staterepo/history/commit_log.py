@@ -47,7 +47,7 @@ class LogEntry:
     trailers: dict[str, list[str]]
     why: str = ""
     by_generator: bool = False
-    """Whether the generator is the committer; then the files should match the ledger.
+    """Whether the generator is the committer. If so, generated files should match the ledger.
 
     The trailers alone do not prove this, because anybody may write them. The value is False for a
     commit of a proposal: a person merges the proposal, perhaps onto other changes, so the
@@ -63,7 +63,7 @@ class LogEntry:
 
 
 def time_of(commit: Commit) -> datetime:
-    """Return the committer's time; a time after the year 9999 becomes its last second."""
+    """Return the committer's time, but at most the last second of the year 9999."""
     return _time(commit.commit_time)
 
 
@@ -84,8 +84,8 @@ def _text(raw: bytes) -> str:
 def entry_of(commit: Commit) -> LogEntry:
     """Return the log entry of a commit.
 
-    If a person made the commit, its trailers and its reason are left out, unless it merges a
-    proposal.
+    If a person made the commit, the entry has no trailers and no reason, unless the commit merges
+    a proposal.
     """
     text = message_format.parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
@@ -111,14 +111,18 @@ def is_by_generator(repo: Repository, commit: Commit) -> bool:
 def commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield the commits up to ``tip``, without those up to ``after``; newest first."""
+    """Yield each commit that ``tip`` includes and ``after`` does not, with its log entry.
+
+    The newest commit comes first.
+    """
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     if after is not None:
         hidden = commit_of(repo, after).id
         walker.hide(hidden)
         found = list(walker)
         if any(len(commit.parent_ids) > 1 for commit in found):
-            # with merges, libgit2 orders by the commits' times, which a wrong clock may have set
+            # with merges, libgit2 goes by the commits' times and may yield commits up to ``after``
+            # if a wrong clock has set the times
             known = {commit.id for commit in repo.walk(hidden)}
             found = [commit for commit in found if commit.id not in known]
         return ((commit, entry_of(commit)) for commit in found)
@@ -141,7 +145,7 @@ def _with_checked_signatures(
 ) -> list[tuple[Commit, LogEntry]]:
     """Return what :func:`commits` yields, with the signatures of the generator's commits checked.
 
-    ``LogEntry.by_generator`` is false if the commit lacks a valid signature that is required.
+    ``LogEntry.by_generator`` is false if a required signature is missing or not valid.
     """
     found = list(commits(repo, tip, after))
     faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
@@ -159,7 +163,7 @@ def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
 
 
 Settled = Literal["unchanged", "waiting", "released", "refused"]
-"""The outcome of a demand that gets no commit of its own; the next commit records it."""
+"""The outcome of a demand that gets no commit of its own. The next commit records the outcome."""
 _Outcome = Literal["changed", Settled]
 
 
@@ -183,11 +187,11 @@ class RecordedOutcome:
 
 
 def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
-    """Return operation id → outcome of every demand that is recorded in a commit after ``base``.
+    """Return a map from operation id to outcome, for every demand that a later commit records.
 
-    A person's merge of a proposal may keep the proposal's trailers; any other commit by a person
-    records no demand. If ``base`` is unknown, because the remote was made anew, the whole history
-    is read.
+    Later commits are those up to ``tip`` that ``base`` does not include. If ``base`` is not in the
+    history of ``tip``, for example because the remote was made anew, the whole history is read. A
+    commit by a person records a demand only if it keeps the trailers of a merged proposal.
     """
     if str(tip) == base:
         return {}
@@ -206,11 +210,11 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
 
 
 def recent_operations(repo: Repository, tip: str | Oid, most: int) -> dict[str, str]:
-    """Return operation id → the commit before the one that records it, oldest first.
+    """Return a map from operation id to the parent of the commit that records the operation.
 
-    Only the last ``most`` commits along the first parents are read. Signatures are not checked, so
-    :func:`operations_since` must confirm a found id; the commit before is its ``base``. It is
-    empty for the first commit.
+    The oldest operation comes first. Only the last ``most`` commits along the first parents are
+    read. Signatures are not checked, so a caller must confirm an id by :func:`operations_since`,
+    with the parent as ``base``. If the recording commit has no parent, the map has an empty text.
     """
     found: dict[str, str] = {}
     with suppress(pygit2.GitError, KeyError):  # an older commit is damaged or missing
@@ -298,7 +302,7 @@ def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
 
 
 def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
-    """Return the paths of releases that commits removed, newest first."""
+    """Return the paths of the release files that commits removed, the last removal first."""
     options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 

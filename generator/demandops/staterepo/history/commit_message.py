@@ -59,9 +59,10 @@ def generator_signature(time: datetime) -> pygit2.Signature:
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
-    """Return the requesters as the author, at the time when the demand was received.
+    """Return the author of a demand's commit: the requesters.
 
-    The author of a rollback or a decommission is the person who ran the command.
+    The author of a rollback or a decommission is the person who ran the command. The author's time
+    is the time when the demand was received.
     """
     request = decision.request
     if isinstance(request, Restoration):
@@ -194,7 +195,10 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
 
 
 def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
-    """Return the trailers that only a rollback, a drain or a decommission has, else none."""
+    """Return the further trailers of a rollback, a drain or a decommission.
+
+    Any other operation has none.
+    """
     request = decision.request
     if isinstance(request, Restoration):
         return [("Restores", request.to), ("Reason", request.reason)]
@@ -259,7 +263,8 @@ def of_override_end(
 ) -> str:
     """Return the message of the commit that ends an expired override.
 
-    ``keys`` names the claims that the end changes: those of demands and of ``keep`` overrides.
+    ``keys`` are the keys of the claims that change because the override ends. They are claims of
+    demands and of ``keep`` overrides.
     """
     why = (
         f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
@@ -312,7 +317,10 @@ def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
-    """Return a trailer for each demand of these claims; an override's claim has no demand."""
+    """Return a trailer for each demand that has one of these claims.
+
+    A claim that an override adds gets no trailer.
+    """
     demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
     return [("Demand-Id", demand) for demand in sorted(demands)]
 

@@ -24,7 +24,7 @@ _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-"""Matches a quoted value. It contains an escape, because only such values are quoted."""
+"""Matches a quoted value. Each has an escape, because a value that needs none is not quoted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +54,10 @@ def parse(message: str) -> MessageText:
 
 
 def _trailers(message: str) -> dict[str, list[str]]:
-    """Return key → values of the trailers: the lines ``Key: value`` of the last paragraph.
+    """Return a map from key to values of the trailers.
 
-    If the paragraph has any other line, return no trailers.
+    The trailers are the lines ``Key: value`` of the last paragraph. If this paragraph has any
+    other line, the message has no trailers.
     """
     trailers: dict[str, list[str]] = {}
     head, _, last = message.rstrip("\n").rpartition("\n\n")

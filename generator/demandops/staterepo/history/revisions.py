@@ -1,7 +1,7 @@
 """Points in history as people write them: a revision that Git knows, or a time.
 
-A time means the newest commit along the first parents whose committer time is not later. A time
-without a zone is UTC, like all times that the program prints.
+A time means the newest commit along the first parents that was committed at or before this time.
+A time without a zone is UTC, like all times that the program prints.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ def _precision(text: str) -> timedelta:
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     """Return the commit that a revision or a time names, or raise StateRepoError.
 
-    It tries the name of a branch or tag first, then a time, then any other revision.
+    A text is first looked up as the name of a branch or tag, then as a time, then as any other
+    revision.
     """
     named = _found(repo.lookup_reference_dwim, text)
     if named is not None:
@@ -87,9 +88,9 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
 
 
 def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    """Return the newest commit along the first parents that is not later than ``at``.
+    """Return the newest commit along the first parents that was committed at or before ``at``.
 
-    Raises StateRepoError if there is none.
+    Raises StateRepoError if all commits are later.
     """
     latest = int(at.timestamp())
     for commit in commit_log.first_parents(repo, tip):

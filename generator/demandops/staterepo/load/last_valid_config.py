@@ -1,9 +1,9 @@
 """The configuration at a commit, with the last valid versions of invalid files.
 
-If a file is invalid, its last valid version is in effect. A commit applies whole or not at all, so
-this is also true for all files of each commit that changed the file. It is also true for the other
-files of the same application definition. All other changes apply. If the result is still not valid,
-no change applies.
+If a file is invalid, its last valid version is in effect. The same holds for the files that apply
+only together with the invalid file. These are all files of each commit that changed it, because a
+commit applies whole or not at all, and the other files of its application definition. All other
+changes apply. If the result is still not valid, no change applies.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ class ConfigSource:
     replacements: Replacements = field(default_factory=dict)
 
     def files(self, repo: Repository) -> dict[str, Oid]:
-        """Return path → blob of every file in effect."""
+        """Return the blob of every file in effect, by path."""
         tree = trees.commit_of(repo, self.commit).tree
         files = {path: blob.id for path, blob in trees.blobs(tree, CONFIG_ROOTS)}
         wanted = {**files, **self.replacements}
         return {path: blob for path, blob in wanted.items() if blob is not None}
 
     def texts(self, repo: Repository) -> dict[str, str]:
-        """Return path → text of every file in effect."""
+        """Return the text of every file in effect, by path."""
         return {path: trees.text_of(repo[blob]) for path, blob in self.files(repo).items()}
 
 
@@ -73,17 +73,17 @@ def config_at(tree: Tree) -> Config:
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:
-    """Return path → text of the files that mark overrides as ended."""
+    """Return the files that mark overrides as ended, as path → text."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return name → end time of each ended override."""
+    """Return the end time of each ended override, by the override's name."""
     return ended_override_file.read(end_markers_at(tree))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
-    """Raise StateRepoError if generators of another render version write this repo.
+    """Raise StateRepoError if the state repo needs a generator of another render version.
 
     Generators of two render versions would undo each other's changes.
     """
@@ -122,7 +122,8 @@ def load_last_valid_config(
         before: the source of the configuration that was in effect before ``to``.
         last_valid_commit: the newest commit where all files were valid.
         to: the commit to load.
-        load: returns the configuration of path → text, or raises ``InvalidInput``.
+        load: gets files as path → text, and returns their configuration or raises
+            ``InvalidInput``.
     """
     known, source = before.files(repo), ConfigSource(to)
     files = source.files(repo)
@@ -155,7 +156,7 @@ def _with_files_merged_together(
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}
         for commit, _ in commit_log.commits(repo, to, last_valid_commit)
-        if commit.parents  # a merge changes all files of its branch
+        if commit.parents  # compared with its first parent, a merge changes all files of a branch
     ]
     known = {
         path for commit in (to, last_valid_commit) for path in ConfigSource(commit).files(repo)

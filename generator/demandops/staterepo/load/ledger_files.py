@@ -1,4 +1,4 @@
-"""The claim files of a commit: reading them, and which of them differ between two commits."""
+"""Reads the claim files of a commit, and finds the claim files that differ between commits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ class ClaimFiles:
 
 
 def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
-    """Return the claims in files, given as (path, text); other files than claims are skipped."""
+    """Return the claims in files, which are given as (path, text).
+
+    Files that are not claim files are skipped.
+    """
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
         if claim_file.kind_of(path) is None:
@@ -79,11 +82,11 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
 def last_valid_claims(
     repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
-    """Return path → the claim that the generator last wrote, without manual edits.
+    """Return a map from path to the claim that the generator last wrote, without manual edits.
 
     The claim is None if the generator wrote none, or removed it. ``last_valid_commit`` is the
-    newest commit with only valid files. If the generator has not changed the file since, the claim
-    at this commit is returned.
+    newest commit with only valid files. If the generator has not changed a file since this commit,
+    the map has the claim at this commit.
     """
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
@@ -100,7 +103,7 @@ def last_valid_claims(
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
     """Return the lease that a claim had on main before its proposal was merged.
 
-    None if the claim did not exist then, or had no lease.
+    Return None if the claim did not exist then, or had no lease.
     """
     for commit in commit_log.first_parents(repo, to):
         claim = valid_claim_at(commit.tree, path)
@@ -112,7 +115,7 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
 ) -> list[ClaimChange]:
-    """Return the changes of claims by people, compared with what the generator last wrote.
+    """Return people's changes to claims, compared with the claims that the generator last wrote.
 
     Args:
         repo: the repository.
@@ -136,8 +139,8 @@ def claims_by_people(
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     """Return the request to roll back to the ledger of the commit ``to``.
 
-    ``more`` are the other fields of the request. Raises InvalidInput with every fault of the
-    commit's claim files.
+    ``more`` are the other fields of the request. Raises InvalidInput if claim files of the commit
+    are not valid, with all their faults.
     """
     commit = trees.commit_of(repo, to)
     found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())

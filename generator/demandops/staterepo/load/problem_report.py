@@ -53,8 +53,9 @@ def with_origins(
 ) -> tuple[Problem, ...]:
     """Return a problem for each fault.
 
-    A known problem keeps its commit and author. ``origin`` finds those of a new problem, but only
-    of those that :func:`write` lists: the others would be sought again for each demand.
+    A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds them,
+    unless :func:`write` leaves the problem out of the report. A problem that is not in the report
+    counts as new again at each demand, so its commit would be searched each time.
     """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     found = sorted({(fault.file, fault.field, fault.message) for fault in faults})

@@ -62,7 +62,10 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a commit on top of this one; ``state`` is its state."""
+        """Return the snapshot of a commit that is made on top of this one.
+
+        ``state`` is the state at the new commit.
+        """
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
@@ -89,7 +92,7 @@ def load(
 
     Raises:
         InvalidInput: files of the configuration or the ledger are not valid.
-        StateRepoError: Git does not know the revision, or it is not of a state repo.
+        StateRepoError: Git does not know the revision, or the commit is not of a state repo.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
@@ -124,8 +127,8 @@ def advance(
 ) -> Advance:
     """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
 
-    Only files that differ are read. Invalid changes are not applied; the new snapshot's problems
-    list them.
+    Only files that differ are read. Invalid changes are not applied. They are in ``problems`` of
+    the new snapshot.
 
     Args:
         repo: the repository.
@@ -204,11 +207,11 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether all releases must be rendered, because generated files may be outdated.
+    """Return whether all releases must be rendered again, because generated files may be outdated.
 
-    If a generator made the newest commit, generated files match the ledger, so the result is false.
-    Otherwise people may have edited the files, or undone what another generator committed since
-    ``before``.
+    If a generator made the newest commit, the generated files match the ledger, so the result is
+    false. If a person made the newest commit, people may have edited the generated files, or undone
+    what another generator committed since ``before``.
     """
     people = list(commit_log.person_commits(repo, to, before))
     if not people or people[0].id != to:
@@ -226,7 +229,7 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
 _judged: dict[object, LastValidConfig] = {}
 """Arguments → result of the newest calls of :func:`_last_valid_config`.
 
-So an invalid file is judged only once, and not again for each demand.
+With these results, an invalid file is judged only once, and not again for each demand.
 """
 _MOST_JUDGED = 8
 
@@ -257,9 +260,9 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration in ``files`` (path → text).
+    """Return the configuration in ``files`` (path → text), after a trial.
 
-    If it differs from the configuration of ``state``, also render sample demands with it. Raises
+    If the configuration differs from that of ``state``, sample demands are rendered with it. Raises
     InvalidInput if the files are not valid, or the samples cannot be rendered.
     """
     if ROOT_FILE not in files:
@@ -273,8 +276,8 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 class ReadAhead:
     """Remembers the last advance, so that the next attempt to publish reads only newer commits.
 
-    If each attempt read all commits since the published snapshot, faster writers could always
-    publish first.
+    If each attempt read all commits since the published snapshot, faster writers could publish
+    first every time.
     """
 
     def __init__(self) -> None:

@@ -9,8 +9,8 @@ generator.
 
 People's changes that cannot be planned are not applied (quarantine). A claim may be refused, or it
 may be impossible to plan, for example because it names an unknown node. Then its file stays as it
-is, and its last valid version is in effect. If the new configuration is the reason, the old
-configuration stays in effect.
+is, and the last valid version of the file is in effect. If the new configuration is the reason, the
+old configuration stays in effect.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
 def state_at(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at a commit: the last recorded state with later changes by people.
+    """Return the state in effect at a commit: the last recorded state, with people's later changes.
 
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
@@ -81,7 +81,7 @@ def state_at(
 
 
 def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
-    """Return the state in effect at ``to``: the earlier state ``start`` with changes by people."""
+    """Return the state in effect at ``to``: the state ``start``, with people's later changes."""
     if start.commit == to:
         return start
     commit, advance = trees.commit_of(repo, to), snapshots.advance(repo, start, to)
@@ -107,7 +107,7 @@ def start_at(
     if record.first("In-Force"):
         try:
             return recorded_state(repo, record, progress)
-        except (InvalidInput, StateRepoError) as error:  # no generator wrote this record
+        except (InvalidInput, StateRepoError) as error:  # the record is not from a generator
             faults.append(error)
     for ancestor in commit_log.first_parents(repo, record.commit):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in snapshots.ROOTS)
@@ -213,7 +213,7 @@ class Judgement:
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
         """Return the state in effect with the old configuration, and the accepted changes.
 
-        ``faults`` are why the new configuration is refused.
+        ``faults`` are the reasons why the new configuration is refused.
         """
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
@@ -309,7 +309,10 @@ def _merged(one: Faults, other: Faults) -> Faults:
 
 
 def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
-    """Return a placeholder fault for each subject that has a claim file in ``held_back``."""
+    """Return a map from subject to a placeholder fault.
+
+    The map has each subject of which a claim file is in ``held_back``.
+    """
     ledger = advance.snapshot.state.ledger
     return {
         subject: (_TO_CHECK,)
@@ -321,7 +324,10 @@ def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
 def _located_in_claim_files(
     faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
 ) -> list[Fault]:
-    """Return the faults of a subject; those in no claim file get the path of a changed claim."""
+    """Return the faults of a subject, each located in a claim file.
+
+    If a fault is not in a claim file, it gets the path of a changed claim of the subject.
+    """
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
     paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]

@@ -1,1 +1,1 @@
-"""Checks of a pull request: a checked-out state repo that a person is about to merge."""
+"""Checks pull requests: reads a checkout of a state repo before a person merges the edit."""

@@ -31,17 +31,26 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The commit that an edit started from; ``state`` is None if no commit was ever valid."""
+    """The commit that an edit started from, and its files.
+
+    ``state`` is the state in effect at this commit, or None if there never was a valid state.
+    """
 
     commit: str
     files: Mapping[str, str]
     state: State | None
     valid: bool
-    """Whether the commit's files are valid; if not, ``state`` is from an earlier commit."""
+    """Whether all files of the commit are valid.
+
+    If a file is not valid, ``state`` has its last valid version.
+    """
     newer: int = 0
     """How many commits the merge target has that the checkout lacks."""
     merged: Mapping[str, str] = field(default_factory=dict)
-    """The generated files of the merge target, if ``newer`` is not 0; else empty."""
+    """The merge target's generated files, if the target has commits that the checkout lacks.
+
+    Otherwise it is empty.
+    """
 
     def releases(self) -> dict[ReleaseKey, Release]:
         """Return the releases of ``state``."""
@@ -49,7 +58,7 @@ class Base:
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return path → text of the state repo's files, and a fault for each symbolic link."""
+    """Return the state repo's files as path → text, and a fault for each symbolic link."""
     if not (folder / "demandops.yaml").is_file():
         if (folder / "HEAD").is_file():
             raise StateRepoError(
@@ -131,7 +140,7 @@ def _started_from(repo: Repository, target: str) -> Commit:
 
 
 def author_of(folder: Path) -> str:
-    """Return the author of the newest commit, or an empty text."""
+    """Return the name of the author of the checked-out commit, or an empty text."""
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)

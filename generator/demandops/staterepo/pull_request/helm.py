@@ -1,6 +1,6 @@
 """Runs the program ``helm`` on charts, and reads kinds of objects or faults from its output.
 
-Helm gets a home folder of its own. It has no access to a cluster or to chart repositories.
+Helm gets a home folder of its own, and has no access to a cluster or to chart repositories.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
 def parsed_lint(out: str, chart: str) -> Report:
     """Return the faults and warnings in the output of ``helm lint``.
 
-    The path of each begins with ``chart``, the name of the chart's folder.
+    The path of each fault begins with ``chart``, the name of the chart's folder.
     """
     found: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
     for entry in re.split(r"\n(?=\[|\n)", out):
@@ -115,7 +115,7 @@ def parsed_lint(out: str, chart: str) -> Report:
 
 
 def parsed_error(err: str, chart: str) -> Fault:
-    """Return helm's error message as a fault, with the template and line that it names."""
+    """Return helm's error message as a fault, located at the template and line that helm names."""
     text = err.partition("Error: ")[2] or err
     return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
 

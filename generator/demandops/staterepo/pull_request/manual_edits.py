@@ -1,7 +1,8 @@
 """Manual edits to generated files, and overrides that would have the same effect.
 
 The check refuses manual edits, because the generator's next commit would silently undo them. An
-override has a lasting effect. In a suggested override, a person must only write the reason.
+override has a lasting effect, so the check suggests one where it can. A person then has to write
+only the reason into the suggested override.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ class Suggestion:
     """A suggested override that replaces the manual edit of a generated file.
 
     ``instead_of`` is the path of the edited file. ``file`` is the path of the override, ``text``
-    its content. ``not_covered`` lists the parts of the edit that the override does not make.
-    ``other_releases`` lists other releases that need the same override.
+    its content. ``not_covered`` lists the parts of the edit that the override leaves out.
+    ``other_releases`` lists the other releases to which the override also applies.
     """
 
     instead_of: str
@@ -111,16 +112,16 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
     if suggestion is not None:
         left = suggestion.not_covered
         listed = ", ".join(left[:_MOST_LEFT]) + (", …" if len(left) > _MOST_LEFT else "")
-        unchanged = f" (no override changes {listed})" if left else ""
+        unchanged = f" (this override does not change {listed})" if left else ""
         return f"{_LOST}, and merge {suggestion.file} as shown{unchanged}"
     if path.startswith(f"{NOTES_ROOT}/"):
         return "is written by the generator, which undoes the edit; revert it"
     if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:
-        return "is not the path of a claim, so the generator removes it; delete it"
+        return "is not the path of a claim, so the generator removes the file; delete it"
     if added:
         return (
-            "is in a generated folder, where files without a demand are removed; delete it and use "
-            "`demandops request`"
+            "is in a generated folder, from which the generator removes what no demand needs; "
+            "delete it, and demand what you need with `demandops request`"
         )
     return f"{_LOST}, and change {_source_of(path)} instead"
 
@@ -139,7 +140,10 @@ def _source_of(path: str) -> str:
 def _effects(
     before: str, after: str | None, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the override effects that replace an edit, and the fields that no override changes."""
+    """Return the override effects that replace an edit.
+
+    The second value lists the edited fields that these effects do not change.
+    """
     if after is None:
         return {"deny": True}, []
     try:
@@ -174,7 +178,7 @@ def _used(effects: dict[str, Any]) -> list[str]:
 def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
     """Return the selector of an override for a release.
 
-    For an end of a connection, ``whole`` selects the other end too.
+    If the release is one end of a connection, ``whole`` makes the override select both ends.
     """
     if isinstance(release, ServiceRelease):
         selected = {"applications": list(release.applications), "services": [release.key.service]}
@@ -186,7 +190,10 @@ def _selector(release: Release, whole: bool) -> dict[str, list[str]]:
 def _service_effects(
     old: list[Any], new: list[Any], release: ServiceRelease, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return :func:`_effects` of an edit of a HelmRelease (Flux) or an Application (Argo CD)."""
+    """Return what :func:`_effects` returns for an edit of a service's file.
+
+    The file has a HelmRelease (Flux) or an Application (Argo CD).
+    """
     effects, not_covered = dict[str, Any](), list[str]()
     place_of_values = _VALUES.get(old[0].get("kind"), ())
     before, after = (
@@ -238,7 +245,7 @@ def _move_images(
     config: Config,
     moved: dict[str, dict[str, str]],
 ) -> None:
-    """Move the changes of images in the registry from ``patch`` to ``moved``.
+    """Move changes from ``patch`` to ``moved`` if they change an image that the registry lists.
 
     ``patch`` is a merge patch of ``values``. ``moved`` maps an image's name to the new tag, digest
     or repository.
@@ -264,9 +271,9 @@ def _move_images(
 def _client_effects(
     old: list[Any], new: list[Any], config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return :func:`_effects` of an edit of plain manifests, as communication clients have.
+    """Return what :func:`_effects` returns for an edit of a communication client's file.
 
-    An override can change only the images in such manifests.
+    The file has plain manifests, in which an override can change only the images.
     """
     images, not_covered = dict[str, dict[str, str]](), list[str]()
     by_reference = {image.reference(): (name, image) for name, image in config.images.items()}

@@ -1,8 +1,9 @@
 """The check of a pull request: whether an edit can be merged, and the effect of the merge.
 
-All files must be valid and render, generated files must not have manual edits, and a changed chart
-must have a new version, because Flux and Argo CD compare only versions. The edit is compared with
-the commit that it started from. The result also previews desired state and bookkeeping.
+All files must be valid, and the generator must be able to render the desired state. Generated files
+must not have manual edits. A changed chart must have a new version, because Flux and Argo CD
+compare only versions. The edit is compared with the commit that it started from. The result also
+shows how the merge would change desired state and bookkeeping.
 """
 
 from __future__ import annotations
@@ -54,8 +55,9 @@ class CheckResult:
     ``base`` is the commit that the checkout is compared with, if any. If ``base_valid`` is False,
     that commit has files that are not valid, and their last valid versions are compared instead.
     ``preview`` and ``bookkeeping`` show what the merge changes. Both are None if a file of the
-    checkout is not valid; ``bookkeeping`` is also None if nothing can be compared. ``newer`` counts
-    the commits that the merge target has and the checkout lacks. ``warnings`` are likely mistakes.
+    checkout is not valid. ``bookkeeping`` is also None if the bookkeeping of ``base`` is not known.
+    ``newer`` counts the commits that the merge target has and the checkout lacks. ``warnings``
+    point out likely mistakes and what a person has to do after the merge.
     """
 
     faults: tuple[Fault, ...]
@@ -82,8 +84,8 @@ def check(
         folder: a checked-out state repo, or its files without Git.
         base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
             with the common ancestor of HEAD and the merge target.
-        now: the time of the check, by default the current time. Overrides that ended before do
-            not apply.
+        now: the time of the check, by default the current time. Overrides that ended before this
+            time do not apply.
         require_helm: whether a missing helm is a fault.
 
     Raises:
@@ -111,7 +113,8 @@ def check(
     except InvalidInput as error:
         faults += error.faults
     else:
-        # a proposal or an upgrade changes files as the generator would, so it is no manual edit
+        # a proposal or an upgrade has files as the generator renders them, so they are no manual
+        # edits
         edited = [
             path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
         ]
@@ -161,7 +164,7 @@ def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
 
 
 def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
-    """Yield a warning for each topic that an application will not get any more after the merge."""
+    """Yield a warning for each topic that an application lacks only after the merge."""
     old = start.state if start else None
     known = {(one.application, one.reason) for one in missing_inputs(old)} if old else set()
     for one in missing_inputs(state):
@@ -183,7 +186,7 @@ class _Edit:
 
     @property
     def before(self) -> Mapping[str, str]:
-        """The files before the edit."""
+        """The files before the edit, or the edited files if nothing can be compared."""
         return self.start.files if self.start else self.files
 
     @property
@@ -202,10 +205,10 @@ class _Edit:
         }
 
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        """Return path → text of the generated files before the merge.
+        """Return the generated files before the merge, as path → text.
 
-        These are the files before the edit, except where the merge target already has the text
-        that ``wanted`` has. Then this text counts as the text before the merge.
+        These are the files before the edit. But if a file of the merge target already equals the
+        file in ``wanted``, this text is returned, because then the merge does not change the file.
         """
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
@@ -251,7 +254,7 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield the faults for which the generator would refuse claims that the edit writes.
+        """Yield the reasons why the generator would refuse claims.
 
         Only claims that the edit adds or changes are checked.
         """
@@ -264,7 +267,7 @@ class _Edit:
             )
 
     def rendered(self, state: State) -> dict[str, str]:
-        """Return path → text of every generated file; raise InvalidInput with all faults."""
+        """Return every generated file as path → text, or raise InvalidInput with all faults."""
         try:
             return rendered_files(state, self.generated)
         except InvalidInput as error:
@@ -272,15 +275,15 @@ class _Edit:
             raise InvalidInput(found or error.faults) from None
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
-        """Yield a warning for each bootstrap file that a person has to apply to its cluster."""
+        """Yield a warning for each bootstrap file that a person must apply after the merge."""
         before = self.before_merge(wanted)
         for path, text in sorted(wanted.items()):
             if path.startswith(f"{BOOTSTRAP_ROOT}/") and before.get(path) != text:
                 cluster = path.removeprefix(f"{BOOTSTRAP_ROOT}/").removesuffix(".yaml")
                 change = "changes" if path in before else "is new"
                 message = (
-                    f"{change} with the merge, and no controller applies it; afterwards, an "
-                    f"administrator of cluster '{cluster}' applies it: "
+                    f"{change} with the merge, but no controller applies it; after the merge, an "
+                    f"administrator of cluster '{cluster}' must apply it: "
                     f"git show main:{path} | kubectl apply -f -"
                 )
                 yield fault("", message).within(path)
@@ -304,9 +307,9 @@ class _Edit:
                 first = changed[0].removeprefix(prefixes[0])
                 yield fault(
                     "version",
-                    f"is still {source.version}, but {first} changed; raise it here and at "
-                    f"charts.{name} in {config.file_of(CHARTS_FILE, name)}, or no cluster "
-                    "applies it",
+                    f"is still {source.version}, but {first} changed; raise the version here and "
+                    f"at charts.{name} in {config.file_of(CHARTS_FILE, name)}, or no cluster "
+                    "applies the change",
                 ).within(metadata)
 
 

@@ -53,7 +53,7 @@ def render_charts(
     """Lint and render the charts of a checkout, and return the result.
 
     Args:
-        folder: the checkout; its configuration is valid.
+        folder: the checkout, whose configuration must be valid.
         state: the state after the merge.
         changed: the paths that the edit changes, or None if that is unknown.
         wanted: the paths of the generated files that the merge changes.
@@ -76,9 +76,9 @@ def render_charts(
 
 
 def _links(folder: str, names: list[str]) -> list[str]:
-    """Return those of ``names`` that are symbolic links, which must not be copied.
+    """Return the names of the symbolic links in a folder.
 
-    Helm would follow the links out of the checkout.
+    They must not be copied, because helm would follow them out of the checkout.
     """
     return [name for name in names if Path(folder, name).is_symlink()]
 
@@ -97,7 +97,7 @@ def _concerned(
 
 
 class _Run:
-    """Collects the results of helm; helm runs in a scratch folder with a copy of ``appdefs/``."""
+    """Runs helm in a scratch folder with a copy of ``appdefs/``, and collects the results."""
 
     def __init__(self, helm: Helm, scratch: Path, state: State) -> None:
         self._helm, self._scratch, self._state = helm, scratch, state
@@ -121,14 +121,14 @@ class _Run:
         )
 
     def render(self, release: ServiceRelease, *, example: bool = False) -> None:
-        """Render the chart of a release or an example; lint the chart before its first release."""
+        """Render the chart of a release or an example; lint each chart once, before it renders."""
         name, folder = release.service.chart, release.chart.folder
         if folder is None:
             self._not_rendered[name] = "it is in a registry"
             return
         try:
             values = json.dumps(values_of(release, self._state.config, self._state.engine))
-        except InvalidInput:  # an override holds the release's file, with other values
+        except InvalidInput:  # only if an override holds the release's file, with older values
             return
         if folder not in self._sound:
             self._sound[folder] = self._prepare(name, folder) and self._lint(folder, values)
@@ -156,7 +156,7 @@ class _Run:
                 if schema.endswith("/values.schema.json"):
                     try:
                         values_validator.validator(self._files[schema], schema)
-                    except InvalidInput as error:  # helm would fetch what the schema refers to
+                    except InvalidInput as error:  # helm would fetch what a schema refers to
                         self._faults.update(dict.fromkeys(error.faults))
                         return False
         if reason := self._place_libraries(folder):
@@ -192,8 +192,8 @@ class _Run:
     def _add(self, report: Report, folder: str) -> None:
         """Add the faults and warnings of a report to the result.
 
-        Paths in the report start with the name of the chart's folder. In the result, they are paths
-        in the checkout.
+        A path in the report starts with the name of the chart's folder. In the result, the path
+        starts at the top of the checkout.
         """
         above = folder.rpartition("/")[0]
         libraries = {
@@ -209,7 +209,7 @@ class _Run:
                 into[one.within(path)] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
-        """Return whether the rules of a release's domain allow an application that has its service.
+        """Return whether the domain's rules allow an application that has the release's service.
 
         A domain without rules allows every application.
         """
@@ -228,7 +228,7 @@ class _Run:
                 file = self._state.config.file_of(DOMAINS_FILE, domain.name)
                 message = (
                     f"renders a {kind}, which is not among the kinds of access domain "
-                    f"'{domain.name}', so its cluster would refuse it; add it to kinds in {file}, "
-                    "or leave it out"
+                    f"'{domain.name}', so the domain's cluster would refuse the object; add the "
+                    f"kind to kinds in {file}, or leave the object out"
                 )
                 yield fault("", message).within(str(release.chart.folder))

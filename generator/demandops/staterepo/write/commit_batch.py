@@ -58,9 +58,9 @@ _PAUSE_S = 0.02
 
 
 _Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
-"""The effect of people's changes: snapshot, changed files, and keys of changed claims.
+"""The effect of people's changes: snapshot, changed files, and keys of claims.
 
-The claims are those that overrides may have changed.
+The keys are those of the claims that overrides may have changed.
 """
 
 
@@ -209,9 +209,9 @@ class CommitBatch:
         keys: Iterable[ClaimKey],
         now: datetime,
     ) -> _Followed:
-        """Return the effect of people's changes; start the leases of the claims they approved.
+        """Return the effect of people's changes, and start the leases of approved claims.
 
-        Such a lease starts only after the approval. Otherwise it could end before the approval.
+        Such a lease starts only now, because otherwise it could end before the approval.
         """
         ledger, files = state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
@@ -226,9 +226,9 @@ class CommitBatch:
         return snapshot, replace(change, files=files), tuple(keys)
 
     def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
-        """Return path → text of the problem report if it changed, else an empty mapping.
+        """Return the problem report as path → text if it changed, else an empty mapping.
 
-        The text is None if there are no problems any more.
+        The text is None if there are no problems any more, so that the report is removed.
         """
         current = self.read(problem_report.PATH)
         origin = authorship.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
@@ -328,8 +328,7 @@ class CommitBatch:
             except signing.SigningFailed:
                 raise
             except (OSError, pygit2.GitError, KeyError, StateRepoError):
-                # a concurrent `git gc` may remove the folder of a new loose object, or pack an
-                # object while it is read
+                # a concurrent `git gc` may move an object to another file while it is read
                 if attempt == _ATTEMPTS:
                     raise
                 self._repository.runtime.sleep(_PAUSE_S * attempt)

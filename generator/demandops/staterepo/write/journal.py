@@ -1,8 +1,8 @@
-"""The journal: a file with every accepted demand that is not yet published, so a crash loses none.
+"""The journal: a file with all accepted, unpublished demands, so that a crash loses none of them.
 
 The journal has one JSON line for each demand received and one for each demand done. A demand is
 written and fsynced before it is evaluated. After a restart, demands that are not done are evaluated
-again; their operation ids show whether a commit was already published.
+again. Their operation ids show which of them already have a published commit.
 
 The last key of a line is a digest of the line and of the previous line's digest. So a reader
 detects a changed, missing or moved line (docs/decisions/0020-journal.md). Journals of the first
@@ -173,7 +173,7 @@ class Journal:
                 self._rewrite()
 
     def _rewrite(self) -> None:
-        """Replace the file by one with the pending demands only."""
+        """Replace the file by one that has only the pending demands."""
         text, chain = _sealed([entry.record() for entry in self.pending.values()], "")
         if text:
             fresh = self._path.with_suffix(".new")
@@ -214,15 +214,18 @@ class Journal:
 
 
 def read(path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands of a journal's file, by operation id; see :func:`parse`."""
+    """Return the pending demands in a journal's file, by operation id.
+
+    Raises DamagedJournal like :func:`parse`.
+    """
     return parse(path.read_bytes() if path.exists() else b"", path)
 
 
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal.
 
-    An incomplete last line is dropped: a crash interrupted its writing, so its demand was never
-    acknowledged.
+    An incomplete last line is dropped. A crash interrupted the write, so the line's demand was
+    never acknowledged.
     """
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None

@@ -48,7 +48,10 @@ class Author:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A published commit, its branch, and the address of its merge request, or an empty text."""
+    """A published commit and its branch.
+
+    ``link`` is the address of the branch's merge request, or empty.
+    """
 
     commit: str
     branch: str

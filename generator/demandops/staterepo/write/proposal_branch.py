@@ -1,8 +1,8 @@
 """Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
 
-The generator rebuilds a branch on each newer main, and deletes the branch in the end. It does
-neither if somebody else has moved the branch. This module knows nothing of forges except GitLab's
-push options.
+The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
+branch in the end. It does neither if somebody else has moved the branch. This module knows nothing
+of forges except GitLab's push options.
 """
 
 from __future__ import annotations
@@ -40,7 +40,11 @@ class BranchMoved(StateRepoError):
 
 
 def branch_name(name: str, operation: str) -> str:
-    """Return the name of the branch for a demand; it is readable, and unique to the operation."""
+    """Return the branch name for a demand: a slug of ``name``, and a digest of the operation id.
+
+    Because of the digest, no other accepted goal gets the same branch name. A slug without any
+    character is left out.
+    """
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
     digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
     return f"{PREFIX}{slug}-{digest}" if slug else f"{PREFIX}{digest}"
@@ -48,7 +52,7 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The commit of main, and branch → commit of the proposals' branches."""
+    """The commit at the head of main, and those of the proposals' branches by branch name."""
 
     main: str
     branches: dict[str, str]
@@ -75,7 +79,7 @@ class ProposalBranches:
     def exists(self, branch: str) -> bool:
         """Return whether ``branch`` exists, or raise RemoteAway.
 
-        Its name need not begin with ``demand/``.
+        The branch's name need not begin with ``demand/``.
         """
         reference = f"{_HEADS}{branch}"
         if self._remote is None:
@@ -154,7 +158,7 @@ class ProposalBranches:
     def is_up_to_date(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether ``commit`` merges into ``tip`` cleanly, and changes only ``files``.
+        """Return whether a proposal merges into main cleanly, and changes exactly ``files``.
 
         Args:
             tip: the current commit of main.

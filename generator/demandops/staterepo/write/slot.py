@@ -1,4 +1,4 @@
-"""Slots: each process that serves a state repo has one, a folder for its journal and clone."""
+"""Slots: folders for the journal and the clone of each process that uses a state repo."""
 
 from __future__ import annotations
 
@@ -56,8 +56,9 @@ class Slot:
     def _adopt_orphans(self, root: Path) -> None:
         """Take over the journals of dead processes.
 
-        Each entry is written to this process's journal before the old journal is removed. A crash
-        in between leaves the entry in both. It still counts once, by its operation id.
+        Each entry is written to this process's journal before the old journal is removed. If a
+        crash in between leaves the entry in both journals, the entry still counts once, because its
+        operation id is the same.
         """
         for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
             lock = _lock(journal.parent) if journal.parent != self.folder else None
@@ -76,8 +77,8 @@ class Slot:
 class FoundJournal:
     """A journal on this machine, and its demands that are not done.
 
-    ``damage`` is the error of reading the journal, or empty; ``set_aside`` is the file's new path
-    if it was renamed.
+    ``damage`` is the error of reading the journal, or empty. ``set_aside`` is the file's new path
+    if the file was renamed.
     """
 
     file: Path
@@ -87,9 +88,9 @@ class FoundJournal:
 
 
 def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:
-    """Yield the journals of a data folder that have demands or are damaged.
+    """Yield the journals in a data folder that have demands or are damaged.
 
-    Damaged journals are renamed if ``set_aside``, unless a running process uses them.
+    If ``set_aside``, each damaged journal is renamed, unless a running process uses it.
     """
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:
