@@ -303,7 +303,7 @@ class TestRequest:
             (index, "refused", None) for index in range(3)
         ]
         told = [[(each["field"], each["message"]) for each in row["faults"]] for row in rows]
-        other = [("", "not booked because another request of this call does not parse")]
+        other = [("", "not booked, because another request of the same command cannot be parsed")]
         assert told == [other, [("id", "must be text, not 5; put it in quotes")], other]
 
     def test_a_file_that_does_not_parse_books_nothing_at_all(

@@ -105,8 +105,8 @@ def test_the_first_call_proposes_a_map_and_books_nothing(migration: Migration) -
         "  mqtt-connection-station00-edge: station00/edge\n"
         "  mqtt-connection-vehicle02-edge: vehicle02/edge\n"
         "  mqtt-connection-vehicle03-edge: vehicle03/edge\n"
-        "The reference does not record these ids. Compare each with what your clients send, fill "
-        "in what is empty, then run the same command with --dry-run.\n"
+        "The reference does not record these ids, so compare each with the id that your clients "
+        "send. Fill in the empty fields of the map. Then run the same command with --dry-run.\n"
     )
     assert migration.run("--dry-run").code == 0
     assert tip(migration.repo) == before
@@ -219,7 +219,7 @@ def test_an_import_that_finds_no_demands_fails(migration: Migration) -> None:
     assert (refused.code, refused.err) == (
         1,
         "error: nothing to import: "
-        "the given files name no requester of an application or a connection\n",
+        "no file or resource names a requester of an application or of a connection\n",
     )
     assert "nothing to import: give FILE or --cluster" in migration.run(files="no such file").err
 
@@ -246,7 +246,10 @@ def test_resources_are_read_from_a_cluster(migration: Migration, tmp_path: Path)
         unknown = migration.run(*where, "other", files="bookkeeping")
     assert migration.run().code == 0
     assert yaml.safe_load(by_files) == yaml.safe_load(migration.map.read_text())
-    assert "--cluster: 'other' has no kubeconfig in --clusters; known: c-its" in unknown.err
+    assert (
+        "--cluster: 'other' has no kubeconfig in the file of --clusters; "
+        "clusters that have one: c-its"
+    ) in unknown.err
     away = migration.run(*where, "c-its", files="bookkeeping")
     assert away.code == 1
     assert away.err.startswith("error: cluster c-its: cannot be read: ")
