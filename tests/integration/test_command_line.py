@@ -120,8 +120,9 @@ class TestInit:
         ran = demandops("init", tmp_path / "state", "--gitops", "argocd")
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            "error: --gitops argocd needs --url, because all its manifests name the URL from which "
-            "the clusters fetch the state repo: --url https://HOST/PATH or git@HOST:PATH\n"
+            "error: --gitops argocd needs --url, because all manifests for Argo CD name the URL "
+            "from which the clusters fetch the state repo: --url https://HOST/PATH or "
+            "--url git@HOST:PATH\n"
         )
         assert not (tmp_path / "state").exists()
 
@@ -787,7 +788,7 @@ class TestUsage:
         assert (ran.code, ran.out) == (3, "")
         assert ran.err == (
             "error: a fault of demandops itself: RuntimeError: boom\n"
-            "please report it with the output of the same command after `demandops -v`\n"
+            "please report it, with what the same command prints if it is run as `demandops -v …`\n"
         )
 
     def test_the_process_ends_with_the_code(self, state: Any, data_home: Path) -> None:

@@ -231,7 +231,7 @@ class TestWhichStateRepo:
         monkeypatch.chdir(clone)
         before = fleet.tip
         ran = demandops("request", "-", stdin=yaml.safe_dump(perception(id="more")))
-        assert (ran.code, ran.err) == (0, "to see it in this checkout: git pull\n")
+        assert (ran.code, ran.err) == (0, "to see the new commit in this checkout: git pull\n")
         assert git(fleet, "rev-parse", "main~1") == before
         more = yaml.safe_dump(perception(id="again"))
         told = demandops("request", "-", "--state-repo", fleet.path, stdin=more)
