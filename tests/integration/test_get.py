@@ -113,7 +113,9 @@ def test_a_lease_that_is_over_and_not_booked_yet(
     ran = demandops("get", "demands", *where)
     assert told in ran.out
     assert word in ran.out.splitlines()[1].split()
-    overdue = "which is over: waits for a generator" in demandops("why", *where).out
+    overdue = (
+        "which has passed; a generator has yet to release the claim" in demandops("why", *where).out
+    )
     assert overdue == (word == "overdue")
 
 
@@ -335,7 +337,7 @@ class TestStatus:
         )
         ran = demandops("status", "--state-repo", fleet.path, "--clusters", file)
         assert ran.err == (
-            "warning: --clusters: no release runs on a cluster 'c-itz'; did you mean 'c-its'?\n"
+            "warning: --clusters: the inventory has no cluster 'c-itz'; did you mean 'c-its'?\n"
         )
         assert ran.code == 0
 

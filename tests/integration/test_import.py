@@ -162,17 +162,18 @@ def test_a_broker_and_a_topic_that_only_the_cluster_knows_are_told(migration: Mi
     told = [line for line in migration.run().err.splitlines() if "vehicle02" in line]
     assert told == [
         "warning: mqtt-connection-vehicle02-edge: its broker service-mqtt-broker-edge:1993 is not "
-        "in inventory/brokers.yaml; add it there, or leave it to the program to choose one",
+        "in inventory/brokers.yaml; add the broker there, or leave the field empty, so that the "
+        "program chooses one",
         "warning: mqtt-connection-vehicle02-edge: earlier requests also listed "
-        "/vehicles/vehicle02/ego_data; its clients may still carry these topics, so add to the map "
-        "those that are needed",
+        "/vehicles/vehicle02/ego_data; the connection's clients may still carry these topics, so "
+        "add the needed ones to the map",
     ]
 
 
 NO_VERSION = "is not a number; the keys of requests are the versions of the resource"
 UNKNOWN = (
-    "is no file of the reference; give its operators' bookkeeping and versioning files, and its "
-    "custom resources as `kubectl get -o yaml` prints them"
+    "is no file of the reference; give the bookkeeping and versioning files of the reference's "
+    "operators, and its custom resources as `kubectl get -o yaml` prints them"
 )
 
 
@@ -181,8 +182,8 @@ UNKNOWN = (
     [
         (
             "",
-            "is empty: an operator was stopped while it wrote the file; leave the file out, or "
-            "list in it who holds each resource, such as "
+            "is empty, because an operator was stopped while it wrote the file; leave the file "
+            "out, or list in it who holds each resource, such as "
             "'mqtt-connection-vehicle00-edge: [vehicle00]'",
         ),
         ("[]", UNKNOWN),
@@ -190,7 +191,7 @@ UNKNOWN = (
         ("od-a: 1", f"od-a: {UNKNOWN}"),
         (
             "kind: Pod",
-            "kind: 'Pod' is not a kind of the reference: MqttConnection, ObjectDetection, "
+            "kind: 'Pod' is no kind of the reference; known: MqttConnection, ObjectDetection, "
             "ObjectFusion",
         ),
         ("od-a: {'1x': {}}", f"od-a.1x: {NO_VERSION}"),
