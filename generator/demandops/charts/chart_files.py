@@ -45,7 +45,7 @@ def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
-    """Return a chart's folder, and then the folders of all libraries that it or they depend on."""
+    """Return the folders of a chart and of all libraries that it needs, directly or indirectly."""
     found = [folder]
     for one in found:
         for dependency in dependencies(one, files):

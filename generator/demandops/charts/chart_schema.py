@@ -23,7 +23,7 @@ def composed(
 
     Args:
         title: the schema's title.
-        own: the properties that the chart adds to the library's or replaces, by name.
+        own: the properties that the chart adds to those of the library or replaces, by name.
         values: the text of the chart's ``values.yaml``, which describes its values.
         library: the schema of the library.
         shared: the text of the library's ``values.yaml``.
@@ -54,7 +54,7 @@ def composed(
 
 
 def own_properties(schema: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the properties of a chart's schema that the library's schema lacks or has otherwise.
+    """Return those properties of a chart's schema that the library lacks or defines differently.
 
     The result maps names to properties. Descriptions are ignored and left out.
     """

@@ -138,7 +138,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return as JSON data what a release is, and where it runs: from the cluster to the node."""
+    """Return as JSON data what a release is, and its cluster, access domain and node."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,

@@ -102,7 +102,7 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the command that the arguments name; return its name, the command and the rest."""
+        """Import the named command; return its name, the command, and its other arguments."""
         name, command, rest = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             slow_git.listen(show_slow)
@@ -142,7 +142,9 @@ def run(args: list[str] | None = None) -> int:
         error.show()
         return ExitCode.WRONG_USAGE
     except click.Abort:
-        errors.print("\ninterrupted" if sys.stderr.isatty() else "interrupted")  # below ^C
+        errors.print(
+            "\ninterrupted" if sys.stderr.isatty() else "interrupted"
+        )  # the terminal has shown ^C
         return ExitCode.INTERRUPTED
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")

@@ -1,4 +1,4 @@
-"""Tables of all commands: plain columns that fit the terminal without cutting a word.
+"""The tables that commands print: plain columns that fit the terminal without cutting a word.
 
 On a terminal, text wraps between words. If not all columns fit, the least important ones are left
 out. If the output is no terminal, each row is one line with every column, so that programs like awk
@@ -27,7 +27,7 @@ Cell = str | Sequence[str]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: its title, and whether a narrow table leaves it out.
+    """A column: its title, and how soon a narrow table leaves it out.
 
     Columns get room in the order of ``rank``, from low to high. A column of rank 0 is never left
     out. ``wraps`` is true if the cells contain text that may wrap between words.

@@ -188,7 +188,7 @@ class ReferenceFiles:
     books: dict[str, Counter[Hold]] = field(default_factory=dict)
     versions: dict[str, dict[int, Request]] = field(default_factory=dict)
     booked: set[str] = field(default_factory=set)
-    """The prefixes of the resources whose bookkeeping was given, even if it is empty."""
+    """The prefixes of the resources whose bookkeeping file was given, even an empty file."""
 
     def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
         """Return a map from name to spec, for the resources with a spec of this class."""

@@ -17,9 +17,10 @@ from demandops.migration.reference_files import Hold, Request
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """Requesters that hold the same topics of a resource, once each.
+    """Requesters that hold the same topics of a resource, each topic once.
 
-    ``version`` orders joins over all resources; 0 means unknown.
+    ``version`` is the version of the resource after the join, or 0 if it is not known. It orders
+    the joins of all resources.
     """
 
     version: int
@@ -31,12 +32,12 @@ def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join
     """Return the joins whose holds add up to ``book``, oldest first.
 
     First, the requests are undone, from the newest back to the request that created the resource.
-    Then only the holds of this first request are left. After that, the undone requests are applied
-    again, the oldest first, and each join stays separate.
+    Then only the holds of the creating request are left. After that, the undone requests are
+    applied again, the oldest first, and each join stays separate.
 
     Args:
         book: the bookkeeping: how many times each hold counts.
-        requests: the requests by version, in order; they may be incomplete.
+        requests: the requests by version, the oldest first; some may be missing.
     """
     left, undone, created = Counter(book), list[tuple[int, Request]](), 0
     for version, request in reversed([*requests.items()]):
@@ -92,7 +93,7 @@ def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
 def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
     """Return the bookkeeping after these requests.
 
-    It is right only if the operator did not change a request after it recorded the request.
+    The result is right only if the operator did not change the requests after recording them.
     """
     book = Counter[Hold]()
     for request in requests.values():

@@ -74,8 +74,8 @@ def approve(
     """Approve a proposed demand: merge its branch in your own name.
 
     The generator then answers the demand and removes the branch. If main has changed the same
-    files since the proposal was made, the command merges nothing. Then wait until a running
-    generator has made the branch anew, and approve it again.
+    files since the proposal was made, the command merges nothing. In this case, wait until a
+    running generator has made the branch anew, and then approve the proposal again.
 
     \b
     Examples:

@@ -115,10 +115,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return the reference's custom resources in a cluster, as one pair of origin and data.
-
-    The pair is in a list, like the documents of files.
-    """
+    """Return a list with one pair: the cluster as text, and the reference's custom resources."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

@@ -180,7 +180,7 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 
 
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
-    """Publish the edit; return its commit, branch and link.
+    """Publish the edit; return its commit, its branch, and the link of its merge request.
 
     With ``propose``, the commit goes to a branch with a merge request, otherwise to main.
     """
@@ -272,7 +272,7 @@ def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     """
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
-    found += [f"  {verb} {claim.subject} of {claim.demand}" for claim in entry.claims]
+    found += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
     return found or ["  affects nothing now"]
 
 

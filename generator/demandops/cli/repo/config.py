@@ -69,7 +69,11 @@ def list_contexts(output: str) -> None:
 @config.command("set")
 @_name
 @click.option("--state-repo", metavar="URL_OR_DIR", help="The state repo.")
-@click.option("--clusters", metavar="FILE", help="How to reach the clusters (docs/status.md).")
+@click.option(
+    "--clusters",
+    metavar="FILE",
+    help="The file that says how to reach the clusters (docs/status.md).",
+)
 @click.option("--signing-key", metavar="FILE", help="The key that signs commits (docs/audit.md).")
 def set_context(
     name: str, state_repo: str | None, clusters: str | None, signing_key: str | None

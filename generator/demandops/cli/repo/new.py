@@ -205,7 +205,9 @@ def policy(
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
 @click.option("--keep", is_flag=True, help="Keep services running without a demand.")
-@click.option("--replicas", type=click.IntRange(min=0), metavar="N", help="Set the replicas.")
+@click.option(
+    "--replicas", type=click.IntRange(min=0), metavar="N", help="Set the number of replicas."
+)
 @directory_option
 @output_option
 def override(  # noqa: PLR0913 - as many as options
@@ -251,7 +253,10 @@ def override(  # noqa: PLR0913 - as many as options
 @new.command()
 @click.argument("name")
 @click.option(
-    "--repository", required=True, metavar="HOST/PATH", help="The image's name with its registry."
+    "--repository",
+    required=True,
+    metavar="HOST/PATH",
+    help="The image's repository in a container registry, such as ghcr.io/me/cam.",
 )
 @click.option(
     "--state-repo",

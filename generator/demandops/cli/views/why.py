@@ -56,7 +56,7 @@ _MOST_CARRIED_OUT = 5
 @click.option(
     "--kind",
     type=click.Choice(KINDS),
-    help="What the name means, if it could mean several things.",
+    help="The kind of the object, if several objects have the name.",
 )
 @click.option(
     "-n",
@@ -65,7 +65,7 @@ _MOST_CARRIED_OUT = 5
     type=click.IntRange(0),
     default=10,
     show_default=True,
-    help="List at most this many of the commits that changed it.",
+    help="List at most this many of the commits that changed the object.",
 )
 @output_option
 def why(
@@ -96,7 +96,7 @@ def why(
 def _answer(
     repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int
 ) -> dict[str, Any]:
-    """Return the explanation as JSON data, with at most ``most`` commits that changed the match."""
+    """Return the explanation as JSON data, with at most ``most`` of the object's changes."""
     answer: dict[str, Any] = {
         "commit": str(snapshot.commit),
         "kind": match.kind,
@@ -273,7 +273,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
     """Return the commits that started, changed and stopped the object of ``match``."""
-    if match.kind in ("node", "requester"):  # `demandops log` lists the commits of both
+    if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
         return _history(repo, repo.history(match.path, str(snapshot.commit), most))
