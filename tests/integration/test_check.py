@@ -111,7 +111,7 @@ def test_a_chart_that_changed_with_a_new_version_is_fine_and_shows_what_follows(
     assert out == (
         f"REPO: all files are valid and every release renders\n{NO_HELM}"
         "\n"
-        "what merging would do since BASE:\n"
+        "what merging would do, compared with BASE:\n"
         "\n"
         "the generator will write or remove 2 files:\n"
         "  remove clusters/c-its/perception/_charts/object-fusion-0.1.0.yaml\n"

@@ -120,8 +120,9 @@ class TestInit:
         ran = demandops("init", tmp_path / "state", "--gitops", "argocd")
         assert (ran.code, ran.out) == (1, "")
         assert ran.err == (
-            "error: --gitops argocd needs --url, because all its manifests name the URL from which "
-            "the clusters fetch the state repo: --url https://HOST/PATH or git@HOST:PATH\n"
+            "error: --gitops argocd needs --url, because all manifests for Argo CD name the URL "
+            "from which the clusters fetch the state repo: --url https://HOST/PATH or "
+            "--url git@HOST:PATH\n"
         )
         assert not (tmp_path / "state").exists()
 
@@ -303,7 +304,7 @@ class TestRequest:
             (index, "refused", None) for index in range(3)
         ]
         told = [[(each["field"], each["message"]) for each in row["faults"]] for row in rows]
-        other = [("", "not booked because another request of this call does not parse")]
+        other = [("", "not booked, because another request of the same command cannot be parsed")]
         assert told == [other, [("id", "must be text, not 5; put it in quotes")], other]
 
     def test_a_file_that_does_not_parse_books_nothing_at_all(
@@ -787,7 +788,7 @@ class TestUsage:
         assert (ran.code, ran.out) == (3, "")
         assert ran.err == (
             "error: a fault of demandops itself: RuntimeError: boom\n"
-            "please report it with the output of the same command after `demandops -v`\n"
+            "please report it, with what the same command prints if it is run as `demandops -v …`\n"
         )
 
     def test_the_process_ends_with_the_code(self, state: Any, data_home: Path) -> None:

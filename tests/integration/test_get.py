@@ -113,7 +113,9 @@ def test_a_lease_that_is_over_and_not_booked_yet(
     ran = demandops("get", "demands", *where)
     assert told in ran.out
     assert word in ran.out.splitlines()[1].split()
-    overdue = "which is over: waits for a generator" in demandops("why", *where).out
+    overdue = (
+        "which has passed; a generator has yet to release the claim" in demandops("why", *where).out
+    )
     assert overdue == (word == "overdue")
 
 
@@ -231,7 +233,7 @@ class TestWhichStateRepo:
         monkeypatch.chdir(clone)
         before = fleet.tip
         ran = demandops("request", "-", stdin=yaml.safe_dump(perception(id="more")))
-        assert (ran.code, ran.err) == (0, "to see it in this checkout: git pull\n")
+        assert (ran.code, ran.err) == (0, "to see the new commit in this checkout: git pull\n")
         assert git(fleet, "rev-parse", "main~1") == before
         more = yaml.safe_dump(perception(id="again"))
         told = demandops("request", "-", "--state-repo", fleet.path, stdin=more)
@@ -335,7 +337,7 @@ class TestStatus:
         )
         ran = demandops("status", "--state-repo", fleet.path, "--clusters", file)
         assert ran.err == (
-            "warning: --clusters: no release runs on a cluster 'c-itz'; did you mean 'c-its'?\n"
+            "warning: --clusters: the inventory has no cluster 'c-itz'; did you mean 'c-its'?\n"
         )
         assert ran.code == 0
 

@@ -105,8 +105,8 @@ def test_the_first_call_proposes_a_map_and_books_nothing(migration: Migration) -
         "  mqtt-connection-station00-edge: station00/edge\n"
         "  mqtt-connection-vehicle02-edge: vehicle02/edge\n"
         "  mqtt-connection-vehicle03-edge: vehicle03/edge\n"
-        "The reference does not record these ids. Compare each with what your clients send, fill "
-        "in what is empty, then run the same command with --dry-run.\n"
+        "The reference does not record these ids, so compare each with the id that your clients "
+        "send. Fill in the empty fields of the map. Then run the same command with --dry-run.\n"
     )
     assert migration.run("--dry-run").code == 0
     assert tip(migration.repo) == before
@@ -162,17 +162,18 @@ def test_a_broker_and_a_topic_that_only_the_cluster_knows_are_told(migration: Mi
     told = [line for line in migration.run().err.splitlines() if "vehicle02" in line]
     assert told == [
         "warning: mqtt-connection-vehicle02-edge: its broker service-mqtt-broker-edge:1993 is not "
-        "in inventory/brokers.yaml; add it there, or leave it to the program to choose one",
+        "in inventory/brokers.yaml; add the broker there, or leave the field empty, so that the "
+        "program chooses one",
         "warning: mqtt-connection-vehicle02-edge: earlier requests also listed "
-        "/vehicles/vehicle02/ego_data; its clients may still carry these topics, so add to the map "
-        "those that are needed",
+        "/vehicles/vehicle02/ego_data; the connection's clients may still carry these topics, so "
+        "add the needed ones to the map",
     ]
 
 
 NO_VERSION = "is not a number; the keys of requests are the versions of the resource"
 UNKNOWN = (
-    "is no file of the reference; give its operators' bookkeeping and versioning files, and its "
-    "custom resources as `kubectl get -o yaml` prints them"
+    "is no file of the reference; give the bookkeeping and versioning files of the reference's "
+    "operators, and its custom resources as `kubectl get -o yaml` prints them"
 )
 
 
@@ -181,8 +182,8 @@ UNKNOWN = (
     [
         (
             "",
-            "is empty: an operator was stopped while it wrote the file; leave the file out, or "
-            "list in it who holds each resource, such as "
+            "is empty, because an operator was stopped while it wrote the file; leave the file "
+            "out, or list in it who holds each resource, such as "
             "'mqtt-connection-vehicle00-edge: [vehicle00]'",
         ),
         ("[]", UNKNOWN),
@@ -190,7 +191,7 @@ UNKNOWN = (
         ("od-a: 1", f"od-a: {UNKNOWN}"),
         (
             "kind: Pod",
-            "kind: 'Pod' is not a kind of the reference: MqttConnection, ObjectDetection, "
+            "kind: 'Pod' is no kind of the reference; known: MqttConnection, ObjectDetection, "
             "ObjectFusion",
         ),
         ("od-a: {'1x': {}}", f"od-a.1x: {NO_VERSION}"),
@@ -219,7 +220,7 @@ def test_an_import_that_finds_no_demands_fails(migration: Migration) -> None:
     assert (refused.code, refused.err) == (
         1,
         "error: nothing to import: "
-        "the given files name no requester of an application or a connection\n",
+        "no file or resource names a requester of an application or of a connection\n",
     )
     assert "nothing to import: give FILE or --cluster" in migration.run(files="no such file").err
 
@@ -246,7 +247,10 @@ def test_resources_are_read_from_a_cluster(migration: Migration, tmp_path: Path)
         unknown = migration.run(*where, "other", files="bookkeeping")
     assert migration.run().code == 0
     assert yaml.safe_load(by_files) == yaml.safe_load(migration.map.read_text())
-    assert "--cluster: 'other' has no kubeconfig in --clusters; known: c-its" in unknown.err
+    assert (
+        "--cluster: 'other' has no kubeconfig in the file of --clusters; "
+        "clusters that have one: c-its"
+    ) in unknown.err
     away = migration.run(*where, "c-its", files="bookkeeping")
     assert away.code == 1
     assert away.err.startswith("error: cluster c-its: cannot be read: ")

@@ -102,8 +102,8 @@ def test_rules_that_do_not_allow_the_application_are_told(checkout: Path, demand
     ran = demandops(*APPLICATION, "-C", checkout)
     assert ran.code == 0
     assert (
-        "to allow demands for it: no rule of access domain 'perception' allows it on edge; widen "
-        "one, such as 'cars', in policy/access-domains.yaml\n"
+        "no rule of access domain 'perception' allows demands for this application on edge; to "
+        "allow them, widen a rule, such as 'cars', in policy/access-domains.yaml\n"
     ) in ran.out
     demand = yaml.safe_load((checkout / "appdefs" / "tracking" / "demand.yaml").read_text())
     assert demand["requesters"] == ["vehicle00"]
@@ -118,7 +118,7 @@ def test_an_access_domain_beside_one_that_has_every_node_is_refused(
     assert (ran.code, ran.err) == (
         1,
         "error: policy/access-domains.yaml: nodes: access domain 'fleet' has every node by its "
-        "pattern '*', so no other one can have any; narrow its patterns first\n",
+        "pattern '*', so no other access domain can have a node; narrow this pattern first\n",
     )
 
 

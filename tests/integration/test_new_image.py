@@ -101,9 +101,19 @@ def test_an_invalid_tag_or_digest_is_refused(
 @pytest.mark.parametrize(
     ("name", "repository", "url", "told"),
     [
-        ("Big", "ghcr.io/x/y", "https://h/x", "error: NAME: 'Big' is no name"),
-        ("x", "ghcr.io/x:1", "https://h/x", "error: --repository: 'ghcr.io/x:1' is no repository"),
-        ("x", "ghcr.io/x/y", "https://h/$(x)", "error: --state-repo: 'https://h/$(x)' is no URL"),
+        ("Big", "ghcr.io/x/y", "https://h/x", "error: NAME: 'Big' is no valid name"),
+        (
+            "x",
+            "ghcr.io/x:1",
+            "https://h/x",
+            "error: --repository: 'ghcr.io/x:1' is no valid repository",
+        ),
+        (
+            "x",
+            "ghcr.io/x/y",
+            "https://h/$(x)",
+            "error: --state-repo: 'https://h/$(x)' is no valid URL",
+        ),
     ],
 )
 def test_what_cannot_be_written_is_refused(

@@ -101,7 +101,7 @@ class TestOverride:
             joined.path,
         )
         assert ran.code == 0
-        assert "warning: git does not know who you are, so this is done in the name " in ran.err
+        assert "warning: git does not know who you are, so the commit's author is " in ran.err
         assert 'git config --global user.name "Your Name"' in ran.err
 
     def test_it_may_be_proposed(
@@ -125,7 +125,7 @@ class TestOverride:
         before, where = joined.tip, ("--state-repo", joined.path)
         for options, told in (
             ((), "give the reason: -m TEXT"),
-            (("-m", "why"), "select what it applies to, for example --node edge"),
+            (("-m", "why"), "select what the override applies to, for example --node edge"),
             (("-m", "why", "--node", "edge"), "has no effect; give at least one of values"),
             (("-m", "why", "--node", "edge", "--hold", "--deny"), "with deny nothing runs"),
             (("-m", "why", "--node", "edge", "--hold", "--expires", "soon"), "'soon' is not a"),

@@ -246,7 +246,7 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
         "charts not rendered: helm is missing; install it and put it on PATH, or name it in "
         "HELM_BIN\n"
         "\n"
-        f"what merging would do since {base}:\n"
+        f"what merging would do, compared with {base}:\n"
         "\n"
         "desired state:\n"
         f"  - {source} (MQTT source of connection vehicle00/edge on vehicle00)\n"

@@ -279,7 +279,9 @@ def test_where_nothing_would_change_nothing_is_committed(
     before = state.tip
     ran = upgraded(*more)
     assert (ran.code, ran.err, state.tip) == (0, "", before)
-    assert ran.out == f"nothing to do: everything is rendered for flux by version 2, at {before}\n"
+    assert ran.out == (
+        f"nothing to do: at {before}, everything is rendered for flux with render version 2\n"
+    )
     assert upgraded(*more, "--output", "json").json()["outcome"] == "unchanged"
 
 

@@ -27,8 +27,8 @@ class Dependency:
     """An entry of a chart's ``dependencies``.
 
     ``index`` is the entry's place in the list. ``folder`` is the library's folder in the state
-    repo; None if the library is elsewhere. ``imports`` lists the names in the library's ``exports``
-    whose values the chart imports.
+    repo, or None if the library is elsewhere. ``imports`` lists those names in the library's
+    ``exports`` whose values the chart imports.
     """
 
     index: int
@@ -45,7 +45,7 @@ def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
-    """Return a chart's folder, then the folders of all libraries that it needs, even indirectly."""
+    """Return the folders of a chart and of all libraries that it needs, directly or indirectly."""
     found = [folder]
     for one in found:
         for dependency in dependencies(one, files):
@@ -91,9 +91,9 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield a fault for each library of a chart that is not in the folder that the chart names.
+    """Yield a fault for each library that is not in the folder which the chart names for it.
 
-    Also yield a fault if the chart requires an exact version and the library has another one.
+    Also yield a fault if the chart requires an exact version and the library has another version.
     """
     for one in dependencies(folder, files):
         if not one.repository.startswith(_LOCAL):
@@ -103,8 +103,8 @@ def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
         if text is None:
             where = f"'{one.folder}/Chart.yaml'" if one.folder else "that"
             message = (
-                f"{quoted(one.repository)}: {where} does not exist; correct the path, which "
-                "starts at the chart and stays in appdefs/"
+                f"{quoted(one.repository)}: {where} does not exist; correct the path, which must "
+                "start at the chart's folder and stay in appdefs/"
             )
             yield fault(f"{place}.repository", message).within(f"{folder}/Chart.yaml")
             continue
@@ -138,9 +138,9 @@ def _imports(listed: object) -> tuple[str, ...]:
 
 
 def _local_folder(folder: str, repository: str) -> str | None:
-    """Return the folder of a library in the state repo.
+    """Return the folder of a library in the state repo; None if it is not in ``appdefs/``.
 
-    Return None if the library is not in ``appdefs/``, because Flux fetches only this folder.
+    Flux fetches charts only from ``appdefs/``.
     """
     if not repository.startswith(_LOCAL):
         return None
@@ -159,7 +159,7 @@ def _values(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 def _mapping(text: str) -> dict[str, Any]:
     try:
         return _read(text)
-    except InvalidInput:  # another check reports this
+    except InvalidInput:  # cross_check reports it for the charts of the registry
         return {}
 
 

@@ -23,7 +23,7 @@ def composed(
 
     Args:
         title: the schema's title.
-        own: the properties that the chart adds or replaces, by name.
+        own: the properties that the chart adds to those of the library or replaces, by name.
         values: the text of the chart's ``values.yaml``, which describes its values.
         library: the schema of the library.
         shared: the text of the library's ``values.yaml``.
@@ -47,14 +47,14 @@ def composed(
             name: _described(copy.deepcopy(one), name, told)
             for name, one in sorted(properties.items())
         }
-        # Helm adds these keys for the library's own values and the global values.
+        # Helm adds these keys: one for the library's own values, and one for the global values.
         | {name: {"type": "object"} for name in (LIBRARY, "global")},
         "definitions": definitions,
     }
 
 
 def own_properties(schema: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the properties that a chart's schema adds to the library's schema, or changes there.
+    """Return those properties of a chart's schema that the library lacks or defines differently.
 
     The result maps names to properties. Descriptions are ignored and left out.
     """

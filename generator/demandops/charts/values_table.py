@@ -18,7 +18,7 @@ _HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------
 
 
 def descriptions(text: str) -> dict[str, str]:
-    """Return path → description for each described value, such as ``image.tag``."""
+    """Return a map from the path of a value, like ``image.tag``, to the value's description."""
     found: dict[str, str] = {}
     path: list[tuple[int, str]] = []
     said: list[str] = []

@@ -67,7 +67,7 @@ output_option = output_formats("text", "json")
 
 
 def show(output: str, data: object, text: Iterable[str | Table]) -> None:
-    """Print ``data`` as JSON if ``output`` is ``json``, and otherwise ``text``.
+    """Print ``data`` as JSON if ``output`` is ``json``; otherwise print ``text``.
 
     ``text`` consists of lines and tables. Lines are not wrapped.
     """
@@ -100,7 +100,7 @@ def time_data(moment: datetime | None) -> str | None:
 
 
 def time_text(time: str) -> str:
-    """Return text for people for a time from the JSON output, without fractions of a second."""
+    """Return a time of the JSON output in a form for people, without fractions of a second."""
     return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
 
 
@@ -138,7 +138,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return the description of a release and its cluster, access domain and node as JSON data."""
+    """Return as JSON data what a release is, and its cluster, access domain and node."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -165,7 +165,7 @@ def version_data(release: Release, ledger: Ledger) -> Json:
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    """Return an override as JSON data, with the effects that ``effects`` names; by default all."""
+    """Return an override as JSON data, with all its effects or only those in ``effects``."""
     names = override.effects() if effects is None else effects
     return {
         "name": override.name,

@@ -58,11 +58,14 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Name of a command → the package of its module, and its short help."""
+"""Name of a command → the package that has the command's module, and the command's short help."""
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that log or fill the screen. They do not show the progress of git operations."""
+"""The commands that run until they are stopped.
+
+They log or fill the screen, so they do not show the progress of git operations.
+"""
 
 
 class ExitCode(IntEnum):
@@ -99,7 +102,7 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the command that the arguments name; return name, command and arguments."""
+        """Import the named command; return its name, the command, and its other arguments."""
         name, command, rest = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             slow_git.listen(show_slow)
@@ -139,7 +142,9 @@ def run(args: list[str] | None = None) -> int:
         error.show()
         return ExitCode.WRONG_USAGE
     except click.Abort:
-        errors.print("\ninterrupted" if sys.stderr.isatty() else "interrupted")  # after ^C
+        errors.print(
+            "\ninterrupted" if sys.stderr.isatty() else "interrupted"
+        )  # the terminal has shown ^C
         return ExitCode.INTERRUPTED
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
@@ -158,7 +163,7 @@ def run(args: list[str] | None = None) -> int:
         logging.getLogger("demandops").debug("a fault of the program", exc_info=True)
         errors.print(
             f"error: a fault of demandops itself: {type(error).__name__}: {error}\n"
-            "please report it with the output of the same command after `demandops -v`"
+            "please report it, with what the same command prints if it is run as `demandops -v …`"
         )
         if logging.getLogger().isEnabledFor(logging.INFO):
             logging.exception("traceback")

@@ -1,4 +1,4 @@
-"""The names from the state repo that shells complete."""
+"""Completers for names from the state repo, by which a shell completes a command's arguments."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""The change of a release or of an entry of the bookkeeping → the sign before its name."""
+"""A change → the sign before the name of the release or bookkeeping entry that changed."""
 
 
 def terminal_width() -> int | None:
@@ -94,7 +94,7 @@ errors = _Errors()
 def warn_of(problems: Iterable[object]) -> None:
     """Warn about invalid files whose last valid version is in effect."""
     for problem in problems:
-        errors.print(f"warning: {problem}; its last valid version is in effect")
+        errors.print(f"warning: {problem}; the file's last valid version is in effect")
 
 
 def warn_of_not_rendered(paths: Collection[str]) -> None:
@@ -116,7 +116,7 @@ at_option = click.option(
 
 
 def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    """Parse an option that is a duration; return its seconds."""
+    """Return the value of an option that is a duration, in seconds."""
     from demandops.config.durations import seconds_of  # noqa: PLC0415 - --help must be fast
 
     try:
@@ -126,7 +126,7 @@ def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:
-    """Return a line with a release's version, and a line for each version that is asked for.
+    """Return a line with a release's version, and a line for each version that demands ask for.
 
     ``data`` has the form that :func:`demandops.cli.json_output.version_data` returns.
     """
@@ -182,9 +182,10 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that updates a progress bar with the number of parts done and in total.
+    """Yield a function that updates a progress bar.
 
-    The bar appears only on a terminal, and only if the work takes long.
+    Its arguments are the number of parts that are done and the number of all parts. The bar appears
+    only on a terminal, and only if the work takes long.
     """
     start = REAL.monotonic()
     bar: Bar | None = None

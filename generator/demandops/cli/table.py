@@ -1,7 +1,8 @@
-"""Tables of all commands: plain columns that fit the terminal without cutting a word.
+"""The tables that commands print: plain columns that fit the terminal without cutting a word.
 
 On a terminal, text wraps between words. If not all columns fit, the least important ones are left
-out. Elsewhere each row is one line with every column, for programs like awk and grep.
+out. If the output is no terminal, each row is one line with every column, so that programs like awk
+and grep can read it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from demandops.quoting import one_line
 
 _GAP = "  "
 _COMFORT = 12
-"""The width in characters that a column of wrapped text gets at least, if its text is that long.
+"""The smallest width, in characters, to which a column is narrowed by wrapping its text.
 
-Columns are left out rather than made narrower.
+If the terminal has no room for this width, columns are left out.
 """
 
 Cell = str | Sequence[str]
@@ -26,7 +27,7 @@ Cell = str | Sequence[str]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: its title, and whether a narrow table leaves it out.
+    """A column: its title, and how soon a narrow table leaves it out.
 
     Columns get room in the order of ``rank``, from low to high. A column of rank 0 is never left
     out. ``wraps`` is true if the cells contain text that may wrap between words.
@@ -101,7 +102,10 @@ class Table:
         return max([cell_len(self.columns[at].title), *lengths])
 
     def _least(self, rows: list[list[list[str]]], at: int) -> int:
-        """Return the smallest width of the column with index ``at`` in which no word is cut."""
+        """Return the smallest width that the column with index ``at`` may get.
+
+        This width cuts no word. A column that wraps gets ``_COMFORT`` if its text is that long.
+        """
         natural = self._natural(rows, at)
         if not self.columns[at].wraps:
             return natural
@@ -124,7 +128,7 @@ class Table:
 
 
 def _cell(cell: Cell, width: int | None) -> list[str]:
-    """Return the lines of a cell; without a width, one line with the lines joined by commas."""
+    """Return the lines of a cell; if ``width`` is None, join them to one line with commas."""
     lines = [one_line(line) for line in ([cell] if isinstance(cell, str) else cell)]
     return lines if width is not None else [", ".join(filter(None, lines))]
 

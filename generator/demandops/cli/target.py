@@ -1,10 +1,10 @@
 """Which state repo a command works on, and with which access: options, environment, contexts.
 
-The first of these that is given decides: the option, ``--context``, the environment variable, the
-checkout around the current folder, the current context. If the variable names a relative folder
-that does not exist, a command in a checkout ignores the variable, and any other command fails. A
-command that writes uses the remote of the checkout. The default signing key and clusters come from
-the same context as the state repo.
+The first of these that is given decides: ``--state-repo``, ``--context``, the environment variable,
+the checkout around the current folder, the current context. If the variable names a relative folder
+that does not exist, a command in a checkout ignores the variable, and any other command fails. In a
+checkout, a command that writes uses the checkout's remote. The default signing key and clusters
+come from the same context as the state repo.
 """
 
 from __future__ import annotations
@@ -89,12 +89,13 @@ def _writable() -> str | None:
 
 
 def hint_to_pull() -> list[str]:
-    """Return a hint to pull, for a command that pushed to the remote of the current checkout.
+    """Return a list with a hint to pull if the command pushed to the remote of the checkout.
 
-    The checkout lacks the new commit, and other commands read only the checkout.
+    The list is empty otherwise. The checkout lacks the new commit, and other commands read only the
+    checkout.
     """
     behind = click.get_current_context().meta.get(_BEHIND)
-    return ["to see it in this checkout: git pull"] if behind else []
+    return ["to see the new commit in this checkout: git pull"] if behind else []
 
 
 def _from_context(field: str) -> Callable[[], str | None]:
@@ -135,7 +136,7 @@ def _required(default: Callable[[], str | None]) -> Callable[..., str]:
 
 
 def _is_elsewhere(address: str) -> bool:
-    """Return whether an address is a relative folder that the current folder does not have."""
+    """Return whether an address is a relative path that does not exist in the current folder."""
     path = Path(address)
     return not (is_url(address) or path.is_absolute() or path.expanduser().exists())
 
@@ -171,7 +172,7 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
         is_eager=True,  # the defaults of other options depend on it
         callback=_required(default),
         help=f"The state repo: a bare repository's folder, or a URL that git can clone. Default: "
-        f"{where}, else that of the context [env: {_VARIABLE}].",
+        f"{where}, otherwise the state repo of the context [env: {_VARIABLE}].",
     )
     return lambda command: option(_context_option(command))
 
@@ -195,8 +196,8 @@ signing_option = click.option(
     type=click.Path(path_type=Path),
     metavar="FILE",
     default=_from_context("signing_key"),
-    help="Sign the commits with this SSH key: a private key without a passphrase, or the public "
-    "key of a key in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
+    help="Sign the commits with this SSH key: a private key without a passphrase, or a public key "
+    "whose private key is in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
 )
 
 clusters_option = click.option(
@@ -206,5 +207,6 @@ clusters_option = click.option(
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     default=_from_context("clusters"),
-    help="How to reach the clusters; see docs/status.md [env: DEMANDOPS_CLUSTERS].",
+    help="A file that says how to reach the clusters; see docs/status.md [env: "
+    "DEMANDOPS_CLUSTERS].",
 )

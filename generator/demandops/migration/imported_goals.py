@@ -1,4 +1,4 @@
-"""Goals of the reference's action that book again all that its requesters still hold."""
+"""Goals of ``DeploymentRequest`` that book again what requesters still hold in the reference."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ _MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # the numbers of these types in ROS mess
 
 
 def remaining_joins(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
-    """Return resource → the joins that no shutdown has undone yet, and warnings.
+    """Return a map from resource to the joins that no shutdown has undone yet, and warnings.
 
-    Detections are left out: a goal for a fusion brings the detections that the fusion needs.
+    Detections are left out, because a goal for a fusion brings the detections that the fusion
+    needs.
 
     Raises:
         InvalidInput: if the files do not say who holds a resource.
@@ -34,7 +35,7 @@ def remaining_joins(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[
             continue
         book = files.books.get(name)
         if book is None and any(name.startswith(prefix) for prefix in files.booked) and not spec:
-            continue  # the resource is deleted: the operator keeps only its requests
+            continue  # the resource is deleted, and the operator keeps only its requests
         if book is None and requests:
             if name.startswith(CONNECTION) and len(requests) > 1:
                 faults.append(_rewritten(name))
@@ -52,9 +53,10 @@ def remaining_joins(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[
 
 def _rewritten(name: str) -> Fault:
     message = (
-        "has requests, but no bookkeeping. The requests alone do not tell who holds it, because "
-        "the operator adds later requesters to the first one. Give mqtt_bookkeeping.yml too. If it "
-        f"is lost, write one that lists each requester as often as it joined: {name}: [vehicle00]"
+        "has requests, but no bookkeeping. The requests alone do not tell who holds the "
+        "connection, because the operator adds later requesters to the first request. Give "
+        "mqtt_bookkeeping.yml too. If this file is lost, write one that lists each requester as "
+        f"often as it joined: {name}: [vehicle00]"
     )
     return fault(name, message)
 
@@ -62,12 +64,12 @@ def _rewritten(name: str) -> Fault:
 def _last_request_only(name: str, shutdown: bool) -> str:
     if shutdown:
         return (
-            f"{name}: is not imported: its last request was a shutdown, and no bookkeeping says "
-            "who still holds it"
+            f"{name}: is not imported, because its last request was a shutdown and the bookkeeping "
+            "files do not say who still holds it"
         )
     return (
-        f"{name}: no bookkeeping says who holds it; only the requesters of its last request are "
-        "imported, once each"
+        f"{name}: the bookkeeping files do not say who holds it, so each requester of its last "
+        "request is imported once, and nobody else"
     )
 
 
@@ -75,14 +77,14 @@ def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
     """Return a warning for each detection whose object list no application holds."""
     topics = {topic for found in joins.values() for join in found for topic in join.topics}
     return [
-        f"{name}: is not imported: no application holds its object list"
+        f"{name}: is not imported, because no application holds its object list"
         for name, spec in files.specs_of(ObjectDetection).items()
         if f"/{spec.source}_local_objectlist" not in topics
     ]
 
 
 def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list[dict[str, Any]]:
-    """Return goals, oldest first: one for each set of requesters, with all that they hold together.
+    """Return goals, oldest first: one for each set of requesters that hold something together.
 
     If requesters hold a resource twice, they get a second goal with another id, because the ledger
     counts a repeated goal once.

@@ -1,12 +1,12 @@
 """The files of the reference's operators, and its custom resources.
 
-Each operator keeps two files. The bookkeeping maps a resource to the list of requesters that hold
-the resource; a requester is listed as often as it joined. For a fusion there is such a list for
-each topic. The versioning file maps a resource to its requests; the key of a request is the version
-of the resource.
+Each operator keeps two files. The bookkeeping file maps a resource to the list of requesters that
+hold the resource. A requester is listed as often as it joined. A fusion has such a list for each
+topic. The versioning file maps a resource to its requests, each under the version of the resource
+that the request led to.
 
-A file is recognized by its content, so it may have any name. Only a bookkeeping without entries
-(``{}``) is recognized by its name.
+A file is recognized by its content, so it may have any name. Only a bookkeeping file without
+entries (``{}``) is recognized by its name.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ _BOOKS = {
     "object_detection_bookkeeping": DETECTION,
     "object_fusion_bookkeeping": FUSION,
 }
-"""Name of a bookkeeping file → prefix of its resources; ``{}`` in the file means no holds."""
+"""Name of a bookkeeping file → prefix of its resources, for a file that contains only ``{}``.
+
+Such a file says that nobody holds any of these resources.
+"""
 
 _NUMBER = re.compile(r"[0-9]{1,20}")
 _CLOUD = re.compile(r"\bpoint_cloud_topic:=(\S+)")
@@ -42,7 +45,7 @@ Hold: TypeAlias = "tuple[str, str]"
 
 
 class _Part(BaseModel):
-    """A part of a file; other fields than those listed are ignored."""
+    """A part of a file. Fields that the class does not list are ignored."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore")
 
@@ -56,7 +59,7 @@ class Request(_Part):
     topics_objectlist: list[str] = Field(default_factory=list, alias="topicsObjectlist")
 
     def holds(self) -> Counter[Hold]:
-        """Return the holds that the request adds; those that it removes if it is a shutdown."""
+        """Return the holds that the request adds or, if it is a shutdown, removes."""
         topics = [*self.topics_ego_data, *self.topics_objectlist] or [""]
         return Counter((topic, who) for who in self.requester for topic in topics)
 
@@ -72,8 +75,8 @@ class _RosTopic(_Part):
 class _Ros2Mqtt(_Part):
     """The bridge at the source of a connection.
 
-    ``ros_topics`` has the topics of the last request. There is an extra field for each topic that
-    any request listed.
+    ``ros_topics`` lists the topics of the last request. Besides, there is an extra field for each
+    topic that the last or an earlier request listed.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -84,8 +87,8 @@ class _Ros2Mqtt(_Part):
 class _Mqtt2Ros(_Part):
     """The bridge at the target of a connection.
 
-    ``mqtt_topics`` has the topics of the last request. There is an extra field for each topic that
-    any request listed.
+    ``mqtt_topics`` lists the topics of the last request. Besides, there is an extra field for each
+    topic that the last or an earlier request listed.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -99,8 +102,8 @@ _BRIDGE = ("configMQTT", "bridge")
 class MqttConnection(_Part):
     """The spec of a connection.
 
-    If the initial deployment already carries the topics at one end, the fields of this end are
-    empty.
+    If the initial deployment already carries the topics at one of the two ends, the fields of this
+    end are empty.
     """
 
     operator: Request
@@ -122,12 +125,12 @@ class MqttConnection(_Part):
         return list(zip(self.ros2mqtt.ros_topics, names, strict=False))
 
     def dropped_topics(self) -> list[str]:
-        """Return the topics that an earlier request listed, and the last request did not."""
+        """Return the topics that an earlier request listed but the last request did not."""
         return sorted(set(self.ros2mqtt.__pydantic_extra__) - {*self.ros2mqtt.ros_topics})
 
 
 class ObjectDetection(_Part):
-    """The spec of a detection: one for each node and each source of a point cloud."""
+    """The spec of a detection. Each node has one detection for each source of a point cloud."""
 
     operator: Request
     node: str = Field(validation_alias=AliasPath("nodeSelector", "node_id"))
@@ -141,13 +144,13 @@ class ObjectDetection(_Part):
 
     @property
     def topic(self) -> str:
-        """The topic of the point cloud, as the command names it; empty if it names none."""
+        """The topic of the point cloud that the command names; empty if the command names none."""
         found = _CLOUD.search(" ".join(self.command))
         return found[1] if found else ""
 
 
 class ObjectFusion(_Part):
-    """The spec of a fusion: one for each application."""
+    """The spec of a fusion. Each application has one fusion."""
 
     operator: Request
     node: str = Field(validation_alias=AliasPath("fusion", "nodeSelector", "node_id"))
@@ -185,10 +188,10 @@ class ReferenceFiles:
     books: dict[str, Counter[Hold]] = field(default_factory=dict)
     versions: dict[str, dict[int, Request]] = field(default_factory=dict)
     booked: set[str] = field(default_factory=set)
-    """The prefixes of the resources whose bookkeeping was given, even if it is empty."""
+    """The prefixes of the resources whose bookkeeping file was given, even an empty file."""
 
     def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
-        """Return resource name → spec, for the resources with a spec of this class."""
+        """Return a map from name to spec, for the resources with a spec of this class."""
         return {name: spec for name, spec in sorted(self.specs.items()) if isinstance(spec, kind)}
 
     def names(self) -> list[str]:
@@ -197,7 +200,7 @@ class ReferenceFiles:
 
 
 def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
-    """Return the content of all documents; each comes with the name of its file.
+    """Return the content of all documents. Each document is paired with the name of its file.
 
     Raises:
         InvalidInput: with the faults of all files.
@@ -216,8 +219,8 @@ def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
 def _read(found: ReferenceFiles, file: str, document: object) -> None:
     if document is None:
         message = (
-            "is empty: an operator was stopped while it wrote the file; leave the file out, or "
-            "list in it who holds each resource, such as "
+            "is empty, because an operator was stopped while it wrote the file; leave the file "
+            "out, or list in it who holds each resource, such as "
             "'mqtt-connection-vehicle00-edge: [vehicle00]'"
         )
         raise InvalidInput.at("", message, file=file)
@@ -236,8 +239,8 @@ def _read(found: ReferenceFiles, file: str, document: object) -> None:
 
 
 _UNKNOWN = (
-    "is no file of the reference; give its operators' bookkeeping and versioning files, and its "
-    "custom resources as `kubectl get -o yaml` prints them"
+    "is no file of the reference; give the bookkeeping and versioning files of the reference's "
+    "operators, and its custom resources as `kubectl get -o yaml` prints them"
 )
 
 
@@ -245,7 +248,7 @@ def _read_resource(found: ReferenceFiles, file: str, where: str, item: Any) -> N
     kind = item.get("kind") if isinstance(item, dict) else None
     spec = KINDS.get(str(kind))
     if spec is None:
-        message = f"{quoted(str(kind))} is not a kind of the reference: {', '.join(KINDS)}"
+        message = f"{quoted(str(kind))} is no kind of the reference; known: {', '.join(KINDS)}"
         raise InvalidInput.at(f"{where}.kind".lstrip("."), message, file=file)
     name = parse(_Metadata, item, file).name
     _add(found.specs, name, parse(spec, item.get("spec"), f"{file}: {name}"), file)

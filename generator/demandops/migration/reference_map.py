@@ -32,7 +32,7 @@ _OBJECT_LIST = "_local_objectlist"
 
 
 class PointCloud(CamelModel):
-    """The topic of a point cloud from which a detection makes an object list, and its source."""
+    """A point cloud from which a detection makes an object list: its topic and its source node."""
 
     topic: _Filled
     source: _Filled
@@ -102,7 +102,7 @@ def propose(
     If the value of a field is not known, the field is empty, and a person fills it in.
 
     Args:
-        joins: resource → the joins that no shutdown has undone yet.
+        joins: maps a resource to the joins that no shutdown has undone yet.
         files: has the resources' specs.
         config: has the nodes and brokers of the inventory.
     """
@@ -120,7 +120,7 @@ def propose(
 
 
 class _Inventory:
-    """Finds nodes, topics and brokers for the map in the resources, else in the inventory."""
+    """Finds nodes, topics and brokers for the map: in the resources, otherwise in the inventory."""
 
     def __init__(self, files: ReferenceFiles, config: Config) -> None:
         self._connections = files.specs_of(MqttConnection)
@@ -154,8 +154,8 @@ class _Inventory:
     def _source(self, topic: str, node: str) -> str:
         """Return the node that probably publishes a topic, or an empty text.
 
-        This is the source of a connection that brings the topic to ``node``, else a node whose
-        inventory entry lists the topic.
+        This is the source of a connection that brings the topic to ``node``. If there is none, it
+        is a node whose inventory entry lists the topic.
         """
         over = [
             spec.source
@@ -181,8 +181,8 @@ class _Inventory:
             broker = self._broker(name, spec)
             if more := spec.dropped_topics():
                 self.warnings.append(
-                    f"{name}: earlier requests also listed {', '.join(more)}; its clients may "
-                    "still carry these topics, so add to the map those that are needed"
+                    f"{name}: earlier requests also listed {', '.join(more)}; the connection's "
+                    "clients may still carry these topics, so add the needed ones to the map"
                 )
         return {
             "id": f"{source}/{target}" if source and slug(f"{source}/{target}") == id else "",
@@ -197,7 +197,7 @@ class _Inventory:
             if is_host(broker, spec.host, spec.port):
                 return broker.node
         self.warnings.append(
-            f"{name}: its broker {spec.host}:{spec.port} is not in {self._broker_files}; add it "
-            "there, or leave it to the program to choose one"
+            f"{name}: its broker {spec.host}:{spec.port} is not in {self._broker_files}; add the "
+            "broker there, or leave the field empty, so that the program chooses one"
         )
         return ""

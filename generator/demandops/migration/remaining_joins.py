@@ -1,8 +1,8 @@
 """The joins that no shutdown has undone yet, from the records of the reference's operators.
 
-The bookkeeping records who holds what, and how often. The versioning file has the requests that led
-to these holds. But for connections and detections the operator later changes the recorded first
-request: it adds requesters to this request, and removes requesters from it. So the counts always
+The bookkeeping file records who holds what, and how often. The versioning file has the requests
+that led to these holds. But the operators of connections and detections later change the first
+request in this file: they add requesters to it, and remove requesters from it. So the counts always
 come from the bookkeeping, and the requests only show which requesters joined together.
 """
 
@@ -17,9 +17,10 @@ from demandops.migration.reference_files import Hold, Request
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """Requesters that hold the same topics of a resource, once each.
+    """Requesters that hold the same topics of a resource, each topic once.
 
-    ``version`` orders joins over all resources; 0 means unknown.
+    ``version`` is the version of the resource after the join, or 0 if it is not known. It orders
+    the joins of all resources.
     """
 
     version: int
@@ -31,12 +32,12 @@ def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join
     """Return the joins whose holds add up to ``book``, oldest first.
 
     First, the requests are undone, from the newest back to the request that created the resource.
-    The holds that are left are those of the creating request. Then the undone requests are applied
-    again, the oldest first, and each join stays separate.
+    Then only the holds of the creating request are left. After that, the undone requests are
+    applied again, the oldest first, and each join stays separate.
 
     Args:
         book: the bookkeeping: how many times each hold counts.
-        requests: the requests by version, in order; they may be incomplete.
+        requests: the requests by version, the oldest first; some may be missing.
     """
     left, undone, created = Counter(book), list[tuple[int, Request]](), 0
     for version, request in reversed([*requests.items()]):
@@ -90,7 +91,10 @@ def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
 
 
 def replayed(requests: Mapping[int, Request]) -> Counter[Hold]:
-    """Return the bookkeeping after these requests, if no operator changed them later."""
+    """Return the bookkeeping after these requests.
+
+    The result is right only if the operator did not change the requests after recording them.
+    """
     book = Counter[Hold]()
     for request in requests.values():
         if request.shutdown:

@@ -1,1 +1,1 @@
-"""The files that ``demandops new`` writes for people to edit, valid from the start."""
+"""The files that ``demandops new`` writes for people to edit. They are valid from the start."""

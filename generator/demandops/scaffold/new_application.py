@@ -1,7 +1,8 @@
 """A new application: its definition, values, chart, registry entries, README and example demand.
 
-The application's services form a chain: the first reads the inputs, each further one reads the
-outputs of the service before. Launch files of one image start all services. Pure.
+The application's services form a chain: the first service reads the application's inputs, and each
+further service reads the outputs of the service before it. Launch files of one image start all
+services. Pure.
 """
 
 from __future__ import annotations
@@ -70,13 +71,13 @@ def refuse_name(name: str, config: Config) -> None:
 
 
 def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> dict[str, str]:
-    """Return path → text of a new application.
+    """Return the files of a new application, as a map from path to text.
 
     Args:
         plan: the application to write.
-        config: the configuration that the application is added to.
-        library: path → text of the library chart; the result contains these files too if the
-            state repo lacks the library chart.
+        config: the configuration to which the application is added.
+        library: the files of the library chart, as a map from path to text. The result also
+            contains these files if the state repo lacks the library chart.
 
     Raises:
         InvalidInput: if :func:`refuse_name` refuses the application's name.
@@ -100,7 +101,10 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with its inputs: name → an application's input or a service's output."""
+    """Yield each service with a map from its input names to what the service reads there.
+
+    This is an input of the application, or an output of the service before.
+    """
     inputs = {role: role for role in plan.inputs}
     for service in plan.services:
         yield service, inputs
@@ -282,8 +286,8 @@ A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas
 def _requester(plan: ApplicationPlan, config: Config) -> str:
     """Return the requester of the example demand, whom the rules of the node's access domain allow.
 
-    If no rule allows the example, the requester is one of the first rule. A person must then extend
-    the rules (:func:`closed_domain`).
+    If no rule allows the example, the requester is one that the first rule names. Then a person
+    must extend the rules (:func:`closed_domain`).
     """
     domain = config.domain_of.get(plan.node)
     rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
@@ -306,9 +310,9 @@ def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
 
 
 def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
-    """Return the access domain whose rules do not allow the example demand.
+    """Return the access domain of the example demand's node if its rules do not allow the demand.
 
-    Return None if the rules allow it, or if there are no rules.
+    Return None if the rules allow the demand, or if there are no rules.
     """
     domain = config.domain_of.get(plan.node)
     return domain if domain and domain.rules and not _rules_for(plan, config) else None

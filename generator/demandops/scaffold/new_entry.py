@@ -12,7 +12,7 @@ from demandops.scaffold.yaml_document import document
 
 
 def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
-    """Return path → text of a file for a new node, and of a file for its cluster if that is new."""
+    """Return a map from path to text: a file for a new node, and one for its cluster if new."""
     if id in config.nodes:
         raise InvalidInput.at("ID", f"'{id}' is a node already; choose another id")
     path = f"inventory/nodes/{object_name('', id)}.yaml"
@@ -31,7 +31,7 @@ def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
 def access_domain(
     name: str, namespace: str, nodes: Iterable[str], requesters: Iterable[str], config: Config
 ) -> dict[str, str]:
-    """Return path → text of a file for a new access domain.
+    """Return a map from path to text: a file for a new access domain.
 
     Only ``requesters`` may demand something in the domain. If there are none, everybody may demand
     everything.
@@ -45,8 +45,8 @@ def access_domain(
         if "*" in other.nodes:
             file = config.file_of(DOMAINS_FILE, other.name)
             message = (
-                f"access domain '{other.name}' has every node by its pattern '*', so no other one "
-                "can have any; narrow its patterns first"
+                f"access domain '{other.name}' has every node by its pattern '*', so no other "
+                "access domain can have a node; narrow this pattern first"
             )
             raise InvalidInput.at("nodes", message, file=file)
     path = f"policy/access-domains/{name}.yaml"
@@ -65,7 +65,7 @@ def override(
     effect: Mapping[str, Any],
     config: Config,
 ) -> dict[str, str]:
-    """Return path → text of a file for a new override with one effect."""
+    """Return a map from path to text: a file for a new override with one effect."""
     if name in config.overrides:
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
     path = f"overrides/{name}.yaml"

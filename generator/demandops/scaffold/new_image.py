@@ -25,13 +25,13 @@ _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A
 
 
 def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str]) -> dict[str, str]:
-    """Return path → text of the container file and the pipelines.
+    """Return a map from path to text: the container file and the pipelines.
 
     Args:
         name: the image's name in the registry of the state repo.
         repository: the image's repository, with its host.
         state_repo: the URL of the state repo, without a password.
-        texts: name → text of the files in ``templates/scaffold/image``.
+        texts: the files in ``templates/scaffold/image``, as a map from name to text.
 
     Raises:
         InvalidInput: if ``name``, ``repository`` or ``state_repo`` has characters that the files
@@ -39,12 +39,12 @@ def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str])
     """
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
     if not _NAME.fullmatch(name):
-        raise InvalidInput.at("NAME", f"{quoted(name)} is no name; write letters, digits and -")
+        raise InvalidInput.at("NAME", f"{quoted(name)} is no valid name; use a-z, 0-9 and -")
     if image is None:
-        message = f"{quoted(repository)} is no repository; write HOST/PATH without a tag"
+        message = f"{quoted(repository)} is no valid repository; write HOST/PATH without a tag"
         raise InvalidInput.at("--repository", message)
     if not _URL.fullmatch(url):
-        message = f"{quoted(state_repo)} is no URL; write https://HOST/PATH or git@HOST:PATH"
+        message = f"{quoted(state_repo)} is no valid URL; write https://HOST/PATH or git@HOST:PATH"
         raise InvalidInput.at("--state-repo", message)
     given = {"NAME": name, "REPOSITORY": repository, "HOST": image["host"], "STATE_REPO": url}
     return {

@@ -133,14 +133,14 @@ METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
             "file://../ros-service",
             "dependencies[0].repository: 'file://../ros-service': "
             "'appdefs/object-detection-fusion/charts/ros-service/Chart.yaml' does not exist; "
-            "correct the path, which starts at the chart and stays in appdefs/",
+            "correct the path, which must start at the chart's folder and stay in appdefs/",
         ),
         (
             METADATA,
             "file://../../../charts/ros-service",
             "file://../../../../other/ros-service",
             "dependencies[0].repository: 'file://../../../../other/ros-service': that does not "
-            "exist; correct the path, which starts at the chart and stays in appdefs/",
+            "exist; correct the path, which must start at the chart's folder and stay in appdefs/",
         ),
         (
             METADATA,

@@ -139,9 +139,9 @@ def test_the_versioning_of_a_connection_is_not() -> None:
         imported_goals.remaining_joins(files)
     assert str(refused.value) == (
         f"{CONNECTION}: has requests, but no bookkeeping. The requests alone do not tell who holds "
-        "it, because the operator adds later requesters to the first one. Give "
-        "mqtt_bookkeeping.yml too. If it is lost, write one that lists each requester as often as "
-        f"it joined: {CONNECTION}: [vehicle00]"
+        "the connection, because the operator adds later requesters to the first request. Give "
+        "mqtt_bookkeeping.yml too. If this file is lost, write one that lists each requester as "
+        f"often as it joined: {CONNECTION}: [vehicle00]"
     )
 
 
@@ -159,13 +159,13 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         for number in (1, 2, 3)
     }
     assert warnings[0] == (
-        f"{CONNECTION}: is not imported: its last request was a shutdown, and no bookkeeping says "
-        "who still holds it"
+        f"{CONNECTION}: is not imported, because its last request was a shutdown and the "
+        "bookkeeping files do not say who still holds it"
     )
     assert warnings[1] == (
-        "mqtt-connection-vehicle01-edge: no bookkeeping says who holds it; only the requesters of "
-        "its last request are imported, once each"
+        "mqtt-connection-vehicle01-edge: the bookkeeping files do not say who holds it, so each "
+        "requester of its last request is imported once, and nobody else"
     )
     assert warnings[-1] == (
-        "od-edge-station00: is not imported: no application holds its object list"
+        "od-edge-station00: is not imported, because no application holds its object list"
     )

@@ -28,8 +28,8 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 def proposal_named(repo: Reader, name: str) -> PendingProposal:
     """Return the proposal that ``name`` identifies.
 
-    ``name`` is a branch or the id of a demand. If no proposal has it, ``name`` may also be a part
-    of a branch's name.
+    ``name`` is the branch of the proposal, or the id of one of its demands. If no proposal has
+    this branch or demand, ``name`` may be a part of a branch's name.
 
     Raises:
         InvalidInput: if no proposal or several proposals fit.
@@ -48,7 +48,7 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print the branch, summary, requesters and time of a proposal, but only for text output."""
+    """Print a proposal's branch, summary, requesters and time if the output format is text."""
     if output == "text":
         errors.print(f"{proposal.branch}: {proposal.summary}")
         errors.print(
@@ -73,8 +73,9 @@ def approve(
 ) -> None:
     """Approve a proposed demand: merge its branch in your own name.
 
-    The generator then answers the demand and removes the branch. If the same files changed
-    on main since the proposal was made, the generator first makes the proposal anew.
+    The generator then answers the demand and removes the branch. If main has changed the same
+    files since the proposal was made, the command merges nothing. In this case, wait until a
+    running generator has made the branch anew, and then approve the proposal again.
 
     \b
     Examples:

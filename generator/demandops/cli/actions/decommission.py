@@ -63,10 +63,11 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
 ) -> None:
     """Release all claims of a node or a requester.
 
-    A node loses its applications, the inputs from it and the connections from and to it, for every
-    requester; then you can delete it from the inventory. A requester loses all its claims, also
-    the claims that it shares with other requesters. If NAME is both a node and a requester, both
-    are decommissioned. At a terminal, the command shows the consequences first and asks.
+    For a node, the command releases the applications on the node, the inputs that come from the
+    node, and the connections from and to the node, for every requester. Then you can delete the
+    node from the inventory. For a requester, the command releases all claims of this requester,
+    even those that other requesters share. If NAME is both a node and a requester, the command
+    does both. At a terminal, the command first shows the consequences and asks.
 
     \b
     Examples:
@@ -94,7 +95,7 @@ def _book(
 ) -> dict[str, Any] | None:
     """Book the decommissioning; return the command's result as JSON data.
 
-    Return None if no claim concerns the node but the inventory has it; that is no error.
+    Return None if the inventory has the node but no claim concerns the node. This is no error.
     """
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
@@ -125,7 +126,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
-    """Return whether the only fault is that no claim concerns a node of the inventory."""
+    """Return whether a node of the inventory holds nothing, and ``error`` has no other fault."""
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 

@@ -41,12 +41,14 @@ from demandops.staterepo import reader
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The map from the reference's names to applications and connections. If the file does not "
-    "exist, the command writes a proposal of it and books nothing.",
+    help="The map from the reference's names to applications and connections. If this file does "
+    "not exist, the command writes a proposed map there and books nothing.",
 )
 @dry_run_option
 @click.option(
-    "--cluster", metavar="NAME", help="Read the custom resources from this cluster of --clusters."
+    "--cluster",
+    metavar="NAME",
+    help="Read the custom resources from this cluster. The file of --clusters must list it.",
 )
 @click.option(
     "--namespace",
@@ -72,9 +74,9 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
     """Import bookings from the paper's application manager.
 
     The options and docs call this manager the reference. FILE is a bookkeeping or versioning file
-    of one of the reference's operators, or the reference's custom resources, printed by
-    `kubectl get -o yaml`. Write - for standard input. docs/migration.md explains each step.
-    Importing the same files again books nothing more.
+    of one of the reference's operators, or a file with the reference's custom resources as
+    `kubectl get -o yaml` prints them. Write - for standard input. docs/migration.md explains each
+    step. If you import the same files again, the command books nothing more.
 
     \b
     Examples:
@@ -92,7 +94,8 @@ def import_(  # noqa: PLR0913, PLR0917 - each is an option
         errors.print(f"warning: {warning}")
     if not joins:
         message = (
-            "nothing to import: the given files name no requester of an application or a connection"
+            "nothing to import: no file or resource names a requester of an application or of a "
+            "connection"
         )
         raise InvalidInput([fault("", message)])
     if not map_file.exists():
@@ -112,12 +115,14 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return one (origin, data) pair, in a list: the reference's custom resources in a cluster."""
+    """Return a list with one pair: the cluster as text, and the reference's custom resources."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:
         known = ", ".join(one for one, way in clusters.items() if way.kubeconfig) or "none"
-        message = f"'{name}' has no kubeconfig in --clusters; known: {known}"
+        message = (
+            f"'{name}' has no kubeconfig in the file of --clusters; clusters that have one: {known}"
+        )
         raise click.UsageError(f"--cluster: {message}")
     cache = ObjectCache(name, reachable, lambda: None)
     wanted = [ObjectSelector(kind, namespace) for kind in reference_files.KINDS]
@@ -149,7 +154,7 @@ def _propose(
     ]
     text = [f"wrote {map_file}; nothing is booked", *rows]
     text.append(
-        "The reference does not record these ids. Compare each with what your clients send, fill "
-        "in what is empty, then run the same command with --dry-run."
+        "The reference does not record these ids, so compare each with the id that your clients "
+        "send. Fill in the empty fields of the map. Then run the same command with --dry-run."
     )
     show(output, {"map": str(map_file), "proposed": data}, text)

@@ -21,8 +21,8 @@ _LOOK_UP_S = 0.5
 def await_answer(future: Future[Any]) -> None:
     """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait.
 
-    The function polls the future. A wait without a timeout could miss a signal that arrives just
-    before the wait begins, or a signal that another library handles.
+    The function polls the future, because a wait without a timeout could miss a signal that arrives
+    just before the wait begins, or a signal that another library handles.
     """
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)

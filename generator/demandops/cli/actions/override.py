@@ -50,10 +50,10 @@ def override() -> None:
 
 
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    """Return ``name``; raise BadParameter if an override cannot have it."""
+    """Return ``name``; raise BadParameter if an override cannot have this name."""
     if not is_override_name(name):
         raise click.BadParameter(
-            f"{quoted(name)} cannot name an override; use lower-case letters, digits and '-'"
+            f"{quoted(name)} is not a valid override name; use lower-case letters, digits and '-'"
         )
     return name
 
@@ -64,17 +64,22 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
 @click.option("--keep", is_flag=True, help="Keep services running without a demand.")
-@click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the replicas.")
+@click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
 @click.option("--on", "target", metavar="NODE", help="Move services to this node.")
 @click.option("--use-version", "version", metavar="WORD", help="Pin the version of the chart.")
 @click.option(
     "--values", "values_file", metavar="FILE", help="Patch Helm values with this YAML file."
 )
 @click.option(
-    "--priority", type=int, metavar="N", help="If several match, the highest wins. Default: 0."
+    "--priority",
+    type=int,
+    metavar="N",
+    help="If several overrides match, the one with the highest priority wins. Default: 0.",
 )
 @click.option(
-    "--expires", metavar="TIME", help="When it ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z."
+    "--expires",
+    metavar="TIME",
+    help="When the override ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
 @click.option("--owner", metavar="NAME", help="Who is responsible. Default: your name in git.")
 @editing
@@ -95,8 +100,10 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 ) -> None:
     """Create an override.
 
-    It is committed in your own name, as git knows it, or with --propose put on a branch. Options of
-    the same name are alternatives; options of different names must all match (docs/overrides.md).
+    The command commits the override to main in your own name, as git knows it. With --propose, it
+    commits to a branch instead. --application to --requester select what the override applies to:
+    all of these options that you give must match. Of a repeated option, one value must match
+    (docs/overrides.md).
 
     \b
     Examples:
@@ -148,7 +155,7 @@ def new_override(
     Args:
         repo: the open state repo.
         name: the name of the override.
-        options: the options of the command; the override takes the reason from them.
+        options: the options of the command, which give the reason.
         selected: the values of the options that select releases and claims.
         more: the effects and the other fields of the override; None leaves a field out.
     """
@@ -156,7 +163,7 @@ def new_override(
         raise click.UsageError("give the reason: -m TEXT")
     chosen = selector(selected)
     if not chosen:
-        raise click.UsageError("select what it applies to, for example --node edge")
+        raise click.UsageError("select what the override applies to, for example --node edge")
     fields = {
         "reason": options.reason,
         **more,
@@ -208,7 +215,7 @@ def _values(file: str | None) -> dict[str, Any] | None:
 
 
 def ends_at(text: str | None) -> str | None:
-    """Return the time at which an override ends, as written in its file; None without ``text``.
+    """Return the end of an override in the format of its file, or None if ``text`` is None.
 
     ``text`` is a time, or a duration from now.
     """

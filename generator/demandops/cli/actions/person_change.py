@@ -48,18 +48,21 @@ from demandops.staterepo.write.person_commit import Author, Published
 Command = Callable[..., Any]
 
 reason_option = click.option(
-    "-m", "--reason", metavar="TEXT", help="The reason, for the commit message and the file."
+    "-m",
+    "--reason",
+    metavar="TEXT",
+    help="The reason, for the commit message and any override file.",
 )
 yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
 propose_option = click.option(
     "--propose",
     is_flag=True,
-    help="Push a branch and open a merge request, instead of a commit on main.",
+    help="Push a branch and open a merge request, instead of committing to main.",
 )
 
 
 def is_asked(yes: bool, output: str) -> bool:
-    """Return whether to ask for confirmation: at a terminal, with text output, without ``yes``."""
+    """Return whether to ask for confirmation: only at a terminal, for text, without ``yes``."""
     return not yes and output == "text" and sys.stdin.isatty()
 
 
@@ -77,7 +80,7 @@ def warned_if_unnamed(person: Person) -> Person:
     """Return ``person`` unchanged; warn if git's configuration does not name the person."""
     if not person.is_known:
         errors.print(
-            f"warning: git does not know who you are, so this is done in the name {person}; to "
+            f"warning: git does not know who you are, so the commit's author is {person}; to "
             'change that: git config --global user.name "Your Name" and '
             "git config --global user.email you@example.org"
         )
@@ -113,7 +116,7 @@ class EditOptions:
 def editing(command: Command) -> Command:
     """Return the command with the options of :class:`EditOptions` added.
 
-    The command gets their values as one argument, ``options``.
+    The command gets the values of these options as one argument, ``options``.
     """
 
     @wraps(command)
@@ -141,7 +144,7 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override, and the commit message.
+    """A person's edit of one override: the file's text, and the commit's summary and reason.
 
     ``text`` is the new text of the override's file; None removes the file.
     """
@@ -158,9 +161,9 @@ class Edit:
 
 
 def consequence(repo: Reader, edit: Edit) -> Entry:
-    """Return the override of an edit with the releases and claims that it affects.
+    """Return the edited override, and the releases and claims that this override affects.
 
-    For a new override, these are the releases and claims that it would affect now.
+    A new override is treated as if it were already on main.
 
     Raises:
         InvalidInput: the new file is not valid.
@@ -177,7 +180,7 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 
 
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
-    """Publish the edit; return its commit, branch and link.
+    """Publish the edit; return its commit, its branch, and the link of its merge request.
 
     With ``propose``, the commit goes to a branch with a merge request, otherwise to main.
     """
@@ -226,7 +229,7 @@ def _opened(repo: Reader, edit: Edit, branch: str) -> str:
 
 
 def print_edit(edit: Edit, entry: Entry, made: Published | None, output: str) -> None:
-    """Print the outcome of the edit, and the releases and claims that the override applies to.
+    """Print the outcome of the edit. JSON also lists what the override applies to.
 
     ``made`` is the published commit; None if nothing was published.
     """
@@ -253,7 +256,7 @@ def _outcome(made: Published | None) -> str:
 def _lines(edit: Edit, data: Json) -> Iterator[str]:
     if data["outcome"] == "committed":
         yield f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}"
-        yield "a running generator carries it out, or else the next one that starts"
+        yield "a running generator carries the commit out; if none runs, the next one to start does"
         yield from hint_to_pull()
     elif data["outcome"] == "proposed":
         yield f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()
@@ -269,7 +272,7 @@ def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     """
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
-    found += [f"  {verb} {claim.subject} of {claim.demand}" for claim in entry.claims]
+    found += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
     return found or ["  affects nothing now"]
 
 
@@ -294,11 +297,11 @@ def selecting(command: Command) -> Command:
             metavar="NAME",
             multiple=True,
             shell_complete=names_of(f"{name}s"),
-            help=f"Select this {name}; * and ? stand for any text. May be repeated.",
+            help=f"Select this {name}; * matches any text, ? one character. May be repeated.",
         )(command)
     return command
 
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
-    """Return the selector of an override from the values of the options of :func:`selecting`."""
+    """Return an override's selector, made from the options that :func:`selecting` adds."""
     return {name: list(values) for name, values in given.items() if values}

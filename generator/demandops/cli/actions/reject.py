@@ -20,8 +20,8 @@ from demandops.staterepo.write.proposal_branch import ProposalBranches
 def reject(name: str, yes: bool, state_repo: str, output: str) -> None:
     """Turn a proposed demand down: delete its branch.
 
-    The generator aborts the goal with `turned-down`. If the generator changed the branch meanwhile,
-    nothing is deleted.
+    The generator then aborts the goal with `turned-down`. If the branch has changed since the
+    command read it, the command deletes nothing.
 
     \b
     Examples:

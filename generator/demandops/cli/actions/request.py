@@ -69,8 +69,9 @@ class _Answer(Future["Receipt | dict[str, str]"]):
 @click.option(
     "--wait",
     is_flag=True,
-    help="Wait until demands that need approval are decided. Otherwise they are proposed, and "
-    "the next generator that starts on this machine completes them after the decision.",
+    help="Wait for the decision on demands that need approval. Without this option, the command "
+    "ends once they are proposed, and the next generator that starts on this machine for this "
+    "state repo continues with them.",
 )
 @signing_option
 @output_option
@@ -87,8 +88,8 @@ def request(
 
     FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
     documents of the kind Demand (docs/demand.md). Write - for standard input. If the command cannot
-    parse a document, it books nothing. Otherwise it books the documents in order; a document that
-    is refused does not keep it from booking the others.
+    parse one of the documents, it books none. Otherwise it books the documents in order. If one of
+    them is refused, the command still books the others.
 
     \b
     Examples:
@@ -154,7 +155,7 @@ def _documents(file: str) -> Iterable[Document]:
 def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
     """Return the goal that releases what ``goal`` demands.
 
-    Return data that are not a mapping unchanged; the check of goals refuses them later.
+    If ``goal`` is not a mapping, return it unchanged, because the check of goals refuses it later.
     """
     if not isinstance(goal, dict):
         return goal
@@ -183,7 +184,7 @@ def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]
         state = repo.snapshot(progress=report).state
     rows = []
     for index, document in enumerate(documents):
-        message = "not booked because another request of this call does not parse"
+        message = "not booked, because another request of the same command cannot be parsed"
         refusal = InvalidInput([fault("", message)])
         if form_faults(document.goal):
             try:
@@ -248,7 +249,7 @@ def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
     """Submit a request; return a future for its answer.
 
-    Without ``wait``, a proposal that awaits approval is an answer too.
+    Without ``wait``, the future has its answer as soon as the request is proposed for approval.
     """
     answer = _Answer()
     name = document.request_id
@@ -315,7 +316,10 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
 
 
 def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
-    """Yield a warning if the lease has no unit: it counts as seconds, but may mean minutes."""
+    """Yield a warning if the lease has no unit.
+
+    The number counts as seconds, but its author may have meant minutes.
+    """
     lease = goal.get("lease") if isinstance(goal, dict) else None
     if isinstance(lease, int) and not isinstance(lease, bool):
         yield f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"

@@ -32,7 +32,9 @@ def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) 
       demandops resume suspend-vehicle00-1c2f3a
     """
     if bool(name) == bool(selector(selected)):
-        raise click.UsageError("give the options that suspended it, or the override's name")
+        raise click.UsageError(
+            "give either the options of `demandops suspend`, or the override's name"
+        )
     summary = f"Resume {name or described(selected)}"
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
         end_override(repo, Edit(name or name_of(selected), None, summary, options.reason), options)

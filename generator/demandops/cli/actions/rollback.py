@@ -45,7 +45,8 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 @click.option(
     "--drop-newer",
     is_flag=True,
-    help="Also drop claims that were booked since then; otherwise they prevent the rollback.",
+    help="Also drop claims that were booked after that commit. Without this option, such claims "
+    "prevent the rollback.",
 )
 @dry_run_option
 @yes_option
@@ -63,10 +64,11 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 ) -> None:
     """Restore the claims of an earlier commit, by a new commit.
 
-    Claims that were released since then are booked again, with the current configuration. Claims
-    that were booked since then prevent the rollback, unless you give --drop-newer. A lease
-    starts again with its full term. REV is a commit; TIME means the newest commit at or before it.
-    At a terminal, the command shows the consequences first and asks.
+    Claims that were released after the earlier commit are booked again, with the current
+    configuration. Claims that were booked after it prevent the rollback, unless you give
+    --drop-newer. The lease of a restored claim starts again with its full term. REV is a commit.
+    TIME selects the newest commit at or before this time. At a terminal, the command first shows
+    the consequences and asks.
 
     \b
     Examples:
@@ -100,7 +102,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
 
 def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
-    """Return the outcome and consequences of a rollback on the commit ``base``; book nothing."""
+    """Return the outcome and consequences of a rollback on top of ``base``; book nothing."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])
@@ -124,9 +126,9 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    ``base`` is the commit for which the caller has computed the consequences. The result has
-    consequences only if others apply: the rollback was refused, changed nothing, or is based on a
-    newer commit.
+    ``base`` is the commit for which the caller has computed the consequences. The result contains
+    consequences only if those of the caller do not apply, because the rollback was refused, changed
+    nothing, or is based on a newer commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:
@@ -160,5 +162,8 @@ def _lines(result: dict[str, Any], dry_run: bool) -> Iterator[str]:
     releases = (ReleaseChange(**each) for each in result["releases"])
     yield from (f"  {line}" for line in release_lines(releases, "release "))
     if result["configuration_since"]:
-        yield f"a rollback does not change the configuration; these files differ from {to}:"
+        yield (
+            "a rollback does not change the configuration, so these configuration files stay "
+            f"different from those at {to}:"
+        )
         yield from (f"  {path}" for path in result["configuration_since"])

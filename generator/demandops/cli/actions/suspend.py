@@ -21,7 +21,7 @@ _LONGEST = 40
 
 
 def name_of(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return the name of the override that suspends a selection; equal selections get one name."""
+    """Return the name of the override for a selection; equal selections get the same name."""
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
     slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:_LONGEST].rstrip("-")
@@ -32,7 +32,9 @@ def name_of(selected: dict[str, tuple[str, ...]]) -> str:
 @click.command()
 @selecting
 @click.option(
-    "--expires", metavar="TIME", help="When it ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z."
+    "--expires",
+    metavar="TIME",
+    help="When the suspension ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
 @editing
 def suspend(
@@ -42,8 +44,9 @@ def suspend(
 ) -> None:
     """Stop applications and connections without releasing them.
 
-    Their claims stay booked, but nothing runs for them, and new demands for them are refused, until
-    `demandops resume` with the same options. This makes an override with `deny`, in your own name.
+    Their claims stay booked, but nothing runs for these claims, and new demands that match the
+    options are refused. To end this, give `demandops resume` the same options. The command creates
+    an override with `deny` in your own name.
 
     \b
     Examples:

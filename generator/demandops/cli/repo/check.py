@@ -33,24 +33,24 @@ _MOST_DIFF_LINES_JSON = 20_000
 @click.option(
     "--base",
     metavar="REV",
-    help="The branch that the edits will be merged into. They are compared with the merge base. "
-    "Default: origin/main, or main.",
+    help="The branch into which the edits will be merged. The edits are compared with the common "
+    "ancestor of HEAD and this branch. Default: origin/main, or main if there is no origin/main.",
 )
 @click.option(
     "--require-helm",
     is_flag=True,
-    help="Fail if helm is missing, so that no chart can be rendered.",
+    help="Fail if helm is not installed, because charts cannot be rendered without it.",
 )
 @output_formats("text", "json", "markdown")
 def check(directory: Path, base: str | None, require_helm: bool, output: str) -> None:
     """Check edits of a state repo and show their consequences.
 
-    DIR is a checked-out state repo; default: this folder. Its files must be valid, every
-    application must render, no generated file may be edited (the override to write instead is
-    printed), and a changed chart needs a new version. Helm lints the charts, and renders them for
-    the current releases and for an example of each application. Then the command shows the
-    consequences of a merge: changed releases, files and bookkeeping. docs/pull-requests.md
-    describes the check in a pipeline.
+    DIR is a checked-out state repo; default: this folder. The files of DIR must be valid, every
+    application must render, no generated file may be edited, and a changed chart needs a new
+    version. If a generated file is edited, the command prints the override to write instead. Helm
+    lints the charts, and renders them for the current releases and for an example of each
+    application. Then the command shows what a merge changes: releases, files and bookkeeping.
+    docs/pull-requests.md describes the check in a pipeline.
 
     \b
     Examples:
@@ -104,7 +104,10 @@ def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return path → diff, at most ``most`` lines in all, and the number of lines left out."""
+    """Return a map from path to diff, with at most ``most`` lines in all.
+
+    Also return how many lines are left out.
+    """
     shown: dict[str, str] = {}
     left = 0
     for file in files:
@@ -136,7 +139,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
         yield f"\ninstead of editing {each.instead_of}, write {each.file}:\n"
         yield from each.text.splitlines()
         if each.other_releases:
-            yield f"\n(it also applies to {', '.join(each.other_releases)})"
+            yield f"\n(this override also applies to {', '.join(each.other_releases)})"
     if checked.newer:
         commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
         yield f"\nthe merge target has {commits} that this checkout lacks: git pull --rebase"
@@ -146,8 +149,8 @@ def _lines(checked: CheckResult) -> Iterator[str]:
             yield "\nfix the errors to see what merging would do"
         return
     if consequence.files or checked.bookkeeping:
-        since = f" since {checked.base[:10]}" if checked.base else ""
-        yield f"\nwhat merging would do{since}:"
+        compared = f", compared with {checked.base[:10]}" if checked.base else ""
+        yield f"\nwhat merging would do{compared}:"
     if checked.base and not checked.base_valid:
         yield f"({checked.base[:10]} has invalid files, so their last valid versions are compared)"
     if consequence.releases:

@@ -1,4 +1,4 @@
-"""``demandops completion``: the code by which a shell completes commands, options and names."""
+"""``demandops completion``: code with which a shell completes commands, options and names."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ VARIABLE = "_DEMANDOPS_COMPLETE"
 def completion(shell: str) -> None:
     """Print the code that makes a shell complete commands.
 
-    It completes commands, options, and names from the state repo that the command would use: of
-    demands, nodes, releases, applications, requesters, proposals and overrides. It does not fetch a
-    URL, but uses the commit that was fetched last.
+    The code completes commands, options and names: of demands, nodes, releases, applications,
+    requesters, proposals and overrides. The names come from the state repo that the command would
+    use. If this state repo is behind a URL, the code fetches nothing, but reads the commit that was
+    fetched last.
 
     \b
     Examples:

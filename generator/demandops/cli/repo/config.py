@@ -24,7 +24,8 @@ def config() -> None:
     """List, set and choose contexts: the fleets that you work with.
 
     A context names a state repo, the access to its clusters and a signing key, so that commands
-    need no options. The contexts are in ~/.config/demandops/contexts.yaml ($XDG_CONFIG_HOME).
+    need no options. The contexts are in ~/.config/demandops/contexts.yaml. $XDG_CONFIG_HOME
+    replaces ~/.config.
 
     \b
     Examples:
@@ -68,14 +69,19 @@ def list_contexts(output: str) -> None:
 @config.command("set")
 @_name
 @click.option("--state-repo", metavar="URL_OR_DIR", help="The state repo.")
-@click.option("--clusters", metavar="FILE", help="How to reach the clusters (docs/status.md).")
+@click.option(
+    "--clusters",
+    metavar="FILE",
+    help="The file that says how to reach the clusters (docs/status.md).",
+)
 @click.option("--signing-key", metavar="FILE", help="The key that signs commits (docs/audit.md).")
 def set_context(
     name: str, state_repo: str | None, clusters: str | None, signing_key: str | None
 ) -> None:
-    """Add or change a context; the first one becomes the current one.
+    """Add or change a context.
 
-    Options that you leave out keep their values. Paths become absolute.
+    If there is no current context, this one becomes the current context. Options that you leave out
+    keep their values. Paths that exist become absolute.
 
     \b
     Examples:
@@ -107,7 +113,7 @@ def _given(options: dict[str, str | None]) -> dict[str, str]:
 
 
 def _absolute(place: str | None) -> str | None:
-    """Return an existing path as an absolute path, and anything else, such as a URL, unchanged."""
+    """Return the absolute form of a path that exists; return other text, such as a URL, as is."""
     if place is None or not Path(place).expanduser().exists():
         return place
     return str(Path(place).expanduser().resolve())

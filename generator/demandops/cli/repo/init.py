@@ -28,23 +28,23 @@ from demandops.staterepo.git.signing import Signer
 @click.option(
     "--bare",
     is_flag=True,
-    help="Create a bare repository, for `serve` and `request` on this machine. Otherwise the files "
-    "are checked out in DIR, so that you can push them to a Git server.",
+    help="Create a bare repository, for `serve` and `request` on this machine. Without this "
+    "option, the files are checked out in DIR, so that you can push them to a Git server.",
 )
 @click.option(
     "--url",
     default="",
     metavar="URL",
     help="The URL (https or ssh, or git@host:path) from which the clusters fetch the state repo. "
-    "It is written to demandops.yaml; you can change it there. Without it, no cluster can follow "
-    "the state repo yet.",
+    "The command writes this URL to demandops.yaml, where you can change it. Without a URL, no "
+    "cluster can follow the state repo yet.",
 )
 @click.option(
     "--example",
     type=click.Choice(["experiment", "none"]),
     default="experiment",
     show_default=True,
-    help="The fleet to begin with: that of the paper's experiment with its application, or none.",
+    help="The fleet to begin with: the paper's experiment with its application, or none.",
 )
 @signing_option
 @output_option
@@ -60,8 +60,8 @@ def init(
 ) -> None:
     """Create a state repo.
 
-    Its first commit has the files that people edit, with the fleet and application of the example.
-    To make a cluster follow the state repo, install Flux or Argo CD there (docs/flux.md,
+    The first commit has the files that people edit, with the fleet and application of the example.
+    To make a cluster follow the state repo, install Flux or Argo CD on the cluster (docs/flux.md,
     docs/argocd.md) and run:
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
@@ -73,8 +73,9 @@ def init(
     """
     if gitops == "argocd" and not url:
         raise StateRepoError(
-            "--gitops argocd needs --url, because all its manifests name the URL from which the "
-            "clusters fetch the state repo: --url https://HOST/PATH or git@HOST:PATH"
+            "--gitops argocd needs --url, because all manifests for Argo CD name the URL from "
+            "which the clusters fetch the state repo: --url https://HOST/PATH or "
+            "--url git@HOST:PATH"
         )
     with busy("creating the state repo"):
         commit = new_repo.init(
@@ -98,12 +99,12 @@ def init(
             "kubectl apply -f -"
         )
     if bare:
-        lines.append(f"to see or edit its files: git clone {directory}")
+        lines.append(f"to see or edit the files of the state repo: git clone {directory}")
     if example == "none":
         where = ", in the clone" if bare else ""
         lines += [
-            f"to fill it{where}: demandops new node, inventory/brokers.yaml, demandops new",
-            "            application (--help has examples); then demandops check, commit and push",
+            f"to fill it{where}: run demandops new node, edit inventory/brokers.yaml, and run",
+            "      demandops new application (--help has examples); then check, commit and push",
         ]
     if bare:
         lines.append(f"next: demandops serve --state-repo {directory}")

@@ -1,4 +1,4 @@
-"""``demandops journal``: the accepted demands that generators on this machine did not publish."""
+"""``demandops journal``: accepted demands that generators on this machine have yet to publish."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from demandops.staterepo.write.slot import FoundJournal, find_journals
 def journal(state_repo: str, set_aside: bool, output: str) -> None:
     """List the accepted demands that are not published.
 
-    A generator on this machine accepted them, and the next one that starts here carries them out. A
-    generator does not start if a journal is damaged, because demands may be missing in it. Then use
-    --set-aside, and send again those of the listed demands that are still needed: --output json
-    prints their goals.
+    A generator on this machine accepted these demands, and the next generator that starts here for
+    the state repo carries them out. If a journal is damaged, no generator starts, because the
+    journal may lack demands. In this case, use --set-aside, and send again the listed demands that
+    are still needed. --output json prints their goals.
 
     \b
     Examples:
@@ -65,6 +65,6 @@ def _lines(found: list[FoundJournal]) -> Iterator[str]:
         for entry in each.demands:
             yield f"{entry.operation}  received {entry.received}"
         if each.set_aside:
-            yield f"the damaged {each.file} is now {each.set_aside}"
+            yield f"the damaged journal {each.file} is now called {each.set_aside}"
     number = sum(len(each.demands) for each in found)
     yield f"{number} {'demand is' if number == 1 else 'demands are'} accepted and not published"

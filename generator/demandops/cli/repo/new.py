@@ -55,7 +55,9 @@ def new() -> None:
 
 @new.command()
 @click.argument("name")
-@click.option("--description", default="", metavar="TEXT", help="What it does, in a sentence.")
+@click.option(
+    "--description", default="", metavar="TEXT", help="What the application does, in a sentence."
+)
 @click.option(
     "--input",
     "inputs",
@@ -69,7 +71,7 @@ def new() -> None:
     multiple=True,
     metavar="NAME=PACKAGE/FILE",
     help="A service and the launch file that it runs: detector=my_package/detector.launch.py. May "
-    "be repeated; each further service reads the outputs of the one before.",
+    "be repeated. Each further service reads the outputs of the service before it.",
 )
 @click.option("--image", default="", metavar="IMAGE", help="The image, with a tag or digest.")
 @click.option("--node", default="", metavar="ID", help="The node of the example demand.")
@@ -88,7 +90,7 @@ def application(  # noqa: PLR0913 - as many as options
 ) -> None:
     """Write a new application: definition, values, chart, registry, README and a demand.
 
-    On a terminal, it asks for the options that are missing.
+    On a terminal, the command asks for --input, --service and --image if they are missing.
 
     \b
     Examples:
@@ -112,14 +114,14 @@ def application(  # noqa: PLR0913 - as many as options
         if domain := new_application.closed_domain(plan, config):
             then.insert(
                 0,
-                f"to allow demands for it: no rule of access domain '{domain.name}' allows it on "
-                f"{plan.node}; widen one, such as '{domain.rules[0].name}', in "
+                f"no rule of access domain '{domain.name}' allows demands for this application on "
+                f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
                 f"{config.file_of(DOMAINS_FILE, domain.name)}",
             )
         return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
 
     then = [
-        "to try it once the files are on main: demandops request --dry-run "
+        "to try the application once the files are on main: demandops request --dry-run "
         f"{directory / 'appdefs' / name / 'demand.yaml'}",
     ]
     _lay_down(directory, made, output, then)
@@ -128,7 +130,9 @@ def application(  # noqa: PLR0913 - as many as options
 @new.command()
 @click.argument("id")
 @click.option("--type", "type_", required=True, metavar="WORD", help="vehicle, station, edge, …")
-@click.option("--cluster", required=True, metavar="NAME", help="Its cluster, which may be new.")
+@click.option(
+    "--cluster", required=True, metavar="NAME", help="The node's cluster, which may be new."
+)
 @directory_option
 @output_option
 def node(id: str, type_: str, cluster: str, directory: Path, output: str) -> None:
@@ -145,14 +149,19 @@ def node(id: str, type_: str, cluster: str, directory: Path, output: str) -> Non
 @click.argument("name")
 @click.option("--namespace", default="", metavar="NAME", help="Default: the access domain's name.")
 @click.option(
-    "--node", "nodes", multiple=True, required=True, metavar="PATTERN", help="The ids of its nodes."
+    "--node",
+    "nodes",
+    multiple=True,
+    required=True,
+    metavar="PATTERN",
+    help="The ids of the domain's nodes. May be repeated.",
 )
 @click.option(
     "--requester",
     "requesters",
     multiple=True,
     metavar="PATTERN",
-    help="Who may demand there. Default: everybody.",
+    help="Who may demand something in the domain. Default: everybody. May be repeated.",
 )
 @directory_option
 @output_option
@@ -167,9 +176,9 @@ def policy(
 ) -> None:
     """Write a new access domain: who may demand what on which nodes.
 
-    The patterns of at most one access domain may match a node. A new state repo has one domain for
-    every node ("*"). So first narrow, in policy/access-domains.yaml, the patterns that match the
-    nodes of the new domain.
+    The patterns of at most one access domain may match a node. A new state repo has one domain,
+    whose pattern "*" matches every node. So first edit policy/access-domains.yaml: narrow the
+    patterns that match the nodes of the new domain.
 
     \b
     Examples:
@@ -184,8 +193,8 @@ def policy(
 
 @new.command()
 @click.argument("name")
-@click.option("-m", "--reason", required=True, metavar="TEXT", help="Why it is needed.")
-@click.option("--owner", required=True, metavar="NAME", help="Who is responsible for it.")
+@click.option("-m", "--reason", required=True, metavar="TEXT", help="Why the override is needed.")
+@click.option("--owner", required=True, metavar="NAME", help="Who is responsible.")
 @click.option(
     "--service", "services", multiple=True, metavar="PATTERN", help="Select services by name."
 )
@@ -196,7 +205,9 @@ def policy(
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
 @click.option("--keep", is_flag=True, help="Keep services running without a demand.")
-@click.option("--replicas", type=click.IntRange(min=0), metavar="N", help="Set the replicas.")
+@click.option(
+    "--replicas", type=click.IntRange(min=0), metavar="N", help="Set the number of replicas."
+)
 @directory_option
 @output_option
 def override(  # noqa: PLR0913 - as many as options
@@ -223,7 +234,7 @@ def override(  # noqa: PLR0913 - as many as options
     given = {"services": services, "applications": apps, "nodes": nodes}
     select = {field: [*values] for field, values in given.items() if values}
     if not select:
-        raise click.UsageError("say what it selects: --service, --application or --node")
+        raise click.UsageError("say what the override selects: --service, --application or --node")
     effects = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
     does = {
         effect: value
@@ -231,7 +242,7 @@ def override(  # noqa: PLR0913 - as many as options
         if value is not None
     }
     if len(does) != 1:
-        raise click.UsageError("give one effect: --hold, --deny, --keep or --replicas")
+        raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
     _lay_down(
         directory,
         lambda config: new_entry.override(name, reason, owner, select, does, config),
@@ -242,7 +253,10 @@ def override(  # noqa: PLR0913 - as many as options
 @new.command()
 @click.argument("name")
 @click.option(
-    "--repository", required=True, metavar="HOST/PATH", help="The image's name with its registry."
+    "--repository",
+    required=True,
+    metavar="HOST/PATH",
+    help="The image's repository in a container registry, such as ghcr.io/me/cam.",
 )
 @click.option(
     "--state-repo",
@@ -264,7 +278,8 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     """Write a container file and pipelines for a ROS package of your own.
 
     NAME is the image's name in registry/images/. The pipelines, for GitHub and GitLab, test the
-    package. For a tag, they build the image and propose it to the state repo with its digest.
+    package. When you push a tag, they also build the image and propose it, with its digest, to the
+    state repo.
 
     \b
     Examples:
@@ -277,7 +292,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return option → values; ask for the values that are missing.
+    """Return a map from option to values; ask for the values that are missing.
 
     Raises:
         click.UsageError: if values are missing and there is no terminal to ask at.
@@ -301,7 +316,9 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
     def valid(answer: str) -> tuple[str, ...]:
         words = tuple(answer.split())
         if not words:
-            raise click.UsageError("an answer is needed; Ctrl-C ends, and nothing is written")
+            raise click.UsageError(
+                "an answer is needed; Ctrl-C ends the command, and nothing is written"
+            )
         if most is not None and len(words) > most:
             raise click.UsageError(f"'{answer}' has {len(words)} words; give {most}")
         for word in words:
@@ -354,23 +371,23 @@ def _image(text: str) -> Image:
 
 _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     "--input": (
-        "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; several with spaces",
+        "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
         _input,
         None,
     ),
     "--service": (
-        "Services, as name=package/file, such as detector=my_package/detector.launch.py; several "
-        "with spaces",
+        "Services, as name=package/file, such as detector=my_package/detector.launch.py; separate "
+        "several by spaces",
         _service,
         None,
     ),
     "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
 }
-"""Option → the arguments of :func:`_asked`: the question, the check and the most words."""
+"""Option → the arguments of :func:`_asked`: question, check, and the highest number of words."""
 
 
 def _example_node(config: Config) -> str:
-    """Return the id of the example demand's node: an edge server, if the inventory has one."""
+    """Return the id of a node for the example demand: of an edge server if there is one."""
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not nodes:
         raise StateRepoError(
@@ -402,7 +419,12 @@ def _lay_down(
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
     with busy("rendering an example of each application"):
         try_configuration(State.of(load({**known, **found}), Ledger()))
-    _write(directory, found, output, [f"to check it: demandops check {directory}", *(then or [])])
+    _write(
+        directory,
+        found,
+        output,
+        [f"to check the files: demandops check {directory}", *(then or [])],
+    )
 
 
 def _write(directory: Path, found: Files, output: str, then: list[str]) -> None:

@@ -1,9 +1,9 @@
 """The result of ``demandops check`` as a comment on a pull request.
 
-Text that people wrote appears only in code spans and fences, so that it cannot mention users, link
-or break the layout. Each span or fence uses more backticks than any run of backticks in its text.
-The length of a comment is limited. So the most important parts come first, and the comment states
-how many parts are omitted.
+Text that people wrote appears only in code spans and fences, so that this text cannot mention
+users, make links or break the layout. Each span or fence uses more backticks than any run of
+backticks in its text. The length of a comment is limited. So the most important parts come first,
+and the comment states how many parts are omitted.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def report(checked: CheckResult, longest: int = LONGEST) -> str:
 
 
 def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
-    """Yield lines: which charts helm rendered, and for each other chart why it is not rendered."""
+    """Yield lines that say which charts helm rendered, and why it did not render the others."""
     if charts is None:
         return
     if MISSING in charts.not_rendered.values():

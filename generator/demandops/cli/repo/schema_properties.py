@@ -41,7 +41,7 @@ def _said(root: str, model: str, name: str) -> list[Any]:
 
 
 def _fixed(field: dict[str, Any]) -> list[Any]:
-    """Return a list with one example if the property has fixed values, otherwise an empty list."""
+    """Return a list with one example if only certain values are valid; otherwise an empty list."""
     for part in (field, *field.get("anyOf", ())):
         if "const" in part:
             return [part["const"]]

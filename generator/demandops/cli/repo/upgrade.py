@@ -32,8 +32,9 @@ _MOST_PATHS = 50
 @click.option(
     "--url",
     metavar="URL",
-    help="The URL (https or ssh) from which the clusters fetch the state repo, if demandops.yaml "
-    "has no section for the controller. Default: the URL of the other controller.",
+    help="The URL (https or ssh) from which the new controller fetches the state repo, if "
+    "demandops.yaml has no section for this controller yet. Default: the URL of the current "
+    "controller.",
 )
 @dry_run_option
 @click.option(
@@ -52,10 +53,10 @@ def upgrade(
 ) -> None:
     """Render everything again, in one commit.
 
-    Use it when a new version of demandops renders differently (a generator refuses a state repo of
-    another render version), or to change between Flux and Argo CD. To change the controller, a
-    person also works on the clusters: the steps are printed, and docs/argocd.md explains them. If
-    nothing changes, there is no commit.
+    Use this command when a new version of demandops renders differently, because a generator
+    refuses a state repo of another render version. Also use it to change between Flux and Argo CD.
+    Such a change needs steps on the clusters, which a person takes: the command prints them, and
+    docs/argocd.md explains them. If no file changes, the command makes no commit.
 
     \b
     Examples:
@@ -116,8 +117,8 @@ def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
     new = made.new.repo_settings
     if not made.files:
         yield (
-            f"nothing to do: everything is rendered for {new.gitops} by version "
-            f"{new.render_version}, at {made.commit}"
+            f"nothing to do: at {made.commit}, everything is rendered for {new.gitops} with "
+            f"render version {new.render_version}"
         )
         return
     yield from _summary(made, dry_run)

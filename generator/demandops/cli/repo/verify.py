@@ -22,14 +22,16 @@ from demandops.staterepo.audit.verification import Verdict
 @click.option(
     "--whole",
     is_flag=True,
-    help="Load and render each commit completely, not only its difference from the commit before.",
+    help="Load and render each commit completely. Without this option, the commits between the "
+    "first and the last are verified by their differences from the commit before.",
 )
 @output_option
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
     """Render commits again from their ledger and compare the bytes.
 
-    If the state repo has policy/allowed-signers, each later commit of the generator must have a
-    good signature by a key in that file (docs/audit.md). REV, A and B are commits or times.
+    Once the state repo has policy/allowed-signers, each further commit of the generator must have a
+    good signature by a key that the file lists in the commit before (docs/audit.md). REV, A and B
+    are commits or times.
 
     \b
     Examples:
@@ -59,7 +61,7 @@ def _lines(verdicts: list[Verdict]) -> Iterator[str]:
         note = f" ({verdict.skipped})" if verdict.skipped else ""
         yield f"{verdict.commit[:10]} {word}{note}  {verdict.summary}"
         if verdict.fault:
-            yield f"    its ledger can no longer be rendered: {verdict.fault}"
+            yield f"    the ledger of this commit can no longer be rendered: {verdict.fault}"
         yield from (f"    {path}" for path in verdict.differing)
         yield from (f"    {path} (this commit must not change it)" for path in verdict.touched)
         if verdict.signature:

@@ -17,8 +17,8 @@ from demandops.cli.json_output import output_option, show
 def version(output: str) -> None:
     """Print the versions of the program and of its formats.
 
-    The render version is that of the files in `clusters/`. A generator refuses a state repo of
-    another render version, until `demandops upgrade`.
+    The render version says how the program renders the files in `clusters/`. A generator refuses a
+    state repo of another render version until you run `demandops upgrade`.
 
     \b
     Examples:

@@ -63,7 +63,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    """Return the state at a revision; warn about files whose last valid version is in effect."""
+    """Return the state at a revision, and warn about files that are not valid there."""
     with progress("reading the ledger") as report:
         snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))
@@ -71,7 +71,7 @@ def loaded(repo: Reader, revision: str | None) -> Snapshot:
 
 
 def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:
-    """Yield lines for releases that differ; ``word`` goes before each release's name."""
+    """Yield the lines for releases that differ, with ``word`` before the name of each release."""
     for release in releases:
         yield f"{SIGNS[release.change]} {word}{release.name} ({release.what})"
         yield from (f"    {detail}" for detail in release.details)

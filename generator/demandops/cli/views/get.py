@@ -71,7 +71,7 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
             f"--{name}",
             metavar="NAME",
             shell_complete=names_of(f"{name}s"),
-            help=f"Only items of this {name}; * and ? stand for any text.",
+            help=f"List only items of this {name}; * matches any text, ? one character.",
         )(command)
     return command
 
@@ -96,11 +96,11 @@ def get(
     """List demands, nodes, services, overrides and so on.
 
     KIND is demands, leases, nodes, services, connections, claims, proposals or overrides. A
-    proposal is a branch that a person merges to approve its demand, or deletes to refuse it.
-    NAME and the filters may be patterns with * and ?. Of several filters, all must match. The
-    state of an override is `in force`, `not rendered yet` (a generator has yet to write its files),
-    `held back` (another override with hold keeps the files as they are), `expired` or `matches
-    nothing`.
+    proposal is a branch that a person merges to approve its demands, or deletes to refuse them.
+    NAME and the filters may be patterns with * and ?. If you give several filters, an item must
+    match all of them. The state of an override is `in force`, `not rendered yet` (a generator has
+    yet to write the files that the override changes), `held back` (another override with hold keeps
+    these files as they are), `expired` or `matches nothing`.
 
     \b
     Examples:
@@ -111,7 +111,7 @@ def get(
       demandops get overrides --at 2h -o json
     """
     if watch and at:
-        raise click.UsageError("--watch shows the newest commit; leave out --at")
+        raise click.UsageError("--watch follows the newest commit, so leave out --at")
     shown = KINDS[kind]
     wanted = {name: value for name, value in filters.items() if value is not None}
     for name in wanted.keys() - shown.filters.keys():

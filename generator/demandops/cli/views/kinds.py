@@ -73,7 +73,7 @@ def _demands(source: Source) -> list[Json]:
 
 
 def _now(state: str, lease: Lease | None, now: datetime) -> str:
-    """Return the state now: ``overdue`` instead of ``held`` if the lease has ended."""
+    """Return ``state``, but ``overdue`` instead of ``held`` if the lease has ended."""
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 

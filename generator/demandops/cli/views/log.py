@@ -37,13 +37,12 @@ OPERATIONS = (
     "scale-down",
     "follow",
     "expire-override",
-    "scale-down",
     "rollback",
     "upgrade",
     "init",
     "by-hand",
 )
-"""The operations that ``--operation`` accepts; ``by-hand`` selects commits by people."""
+"""The operations that ``--operation`` accepts. ``by-hand`` selects the commits by people."""
 
 _TRAILERS = {
     "requester": "Requester",
@@ -70,48 +69,54 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     "--requester",
     metavar="ID",
     shell_complete=names_of("requesters"),
-    help="Commits that book or release claims of this requester.",
+    help="List only commits that book or release claims of this requester.",
 )
 @click.option(
     "--application",
     metavar="ID",
     shell_complete=names_of("applications"),
-    help="Commits about this application.",
+    help="List only commits about this application.",
 )
 @click.option(
     "--connection",
     metavar="ID",
     shell_complete=names_of("connections"),
-    help="Commits about this connection.",
+    help="List only commits about this connection.",
 )
 @click.option(
     "--node",
     metavar="ID",
     shell_complete=names_of("nodes"),
-    help="Commits that change a release on this node or a claim that names it.",
+    help="List only commits that change a release on this node or a claim that names this node.",
 )
 @click.option(
     "--release",
     metavar="NAME",
     shell_complete=names_of("releases"),
-    help="Commits that changed the file of this release.",
+    help="List only commits that changed the file of this release.",
 )
 @click.option(
-    "--demand", metavar="ID", shell_complete=names_of("demands"), help="Commits about this demand."
+    "--demand",
+    metavar="ID",
+    shell_complete=names_of("demands"),
+    help="List only commits about this demand.",
 )
 @click.option(
     "--operation",
     type=click.Choice(OPERATIONS),
     metavar="WORD",
-    help=f"Commits of this operation: {', '.join(OPERATIONS[:-1])}; or {OPERATIONS[-1]}.",
+    help=f"List only commits of this operation: {', '.join(OPERATIONS[:-1])}. {OPERATIONS[-1]} "
+    "means commits by people.",
 )
 @click.option(
     "--since",
     callback=_time,
     metavar="TIME",
-    help=f"Commits at or after this time: {revisions.TIMES}.",
+    help=f"List only commits at or after this time: {revisions.TIMES}.",
 )
-@click.option("--until", callback=_time, metavar="TIME", help="Commits at or before this time.")
+@click.option(
+    "--until", callback=_time, metavar="TIME", help="List only commits at or before this time."
+)
 @click.option(
     "-n",
     "--max-count",
@@ -129,8 +134,8 @@ def log(
 ) -> None:
     """List the commits of the state repo, newest first.
 
-    With several filters, a commit must match all of them. REV, A and B are commits, or times
-    written as for --since. -o wide adds the absolute times, the operations and the request ids.
+    If you give several filters, a commit must match all of them. REV, A and B are commits, or times
+    written as for --since. -o wide adds the absolute times, operations, authors and request ids.
 
     \b
     Examples:
@@ -183,7 +188,7 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     path = release if "/" in release else repo.release_path(release, tip)
     if path is None:
         raise StateRepoError(
-            f"there was never a release '{release}'; `demandops bookkeeping` lists what runs"
+            f"there never was a release '{release}'; `demandops bookkeeping` lists what runs"
         )
     return repo.log(commit_range, path)
 

@@ -1,4 +1,4 @@
-"""Finds the release, demand, node or other object that a name given to ``demandops why`` means."""
+"""Finds the release, demand, node or other object whose name is given to ``demandops why``."""
 
 from __future__ import annotations
 
@@ -106,8 +106,9 @@ def _by_looser_match(
 ) -> Iterator[Match]:
     """Yield the demand, node or other object of this name.
 
-    If there is none, yield the release whose name contains ``name``, or the demand whose id begins
-    with it.
+    If there is none, yield the first of these that exists: a current release whose name contains
+    ``name``, a held demand whose id begins with ``name``, an ended demand of exactly this id, an
+    ended release whose name contains ``name``.
     """
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
@@ -124,7 +125,7 @@ def _by_looser_match(
 
 
 def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield everything of this name except releases, applications and connections."""
+    """Yield each object of this name that is no release, application or connection."""
     config = world.config
     if ("demand", name) in world.ledger.index:
         yield Match("demand", name)
@@ -181,7 +182,7 @@ def _the_only_name(
     listed = ", ".join(names[:_MOST_LISTED])
     more = ", …" if len(names) > _MOST_LISTED else ""
     raise StateRepoError(
-        f"{len(names)} {what.format(quoted(part))}; give more of it: {listed}{more}"
+        f"{len(names)} {what.format(quoted(part))}; give a longer part: {listed}{more}"
     )
 
 
@@ -202,7 +203,9 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     if release is not None and path_of(release) == path:
         return Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
-        raise StateRepoError(f"{quoted(path)} is not in the state repo and never was; correct it")
+        raise StateRepoError(
+            f"{quoted(path)} is not in the state repo and never was; correct the path"
+        )
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return Match("file", path, path)
     return Match("claim" if claim_file.kind_of(path) else "release", name, path)

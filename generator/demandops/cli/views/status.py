@@ -48,7 +48,7 @@ _PATIENCE_S = 10
 @click.option(
     "--wait",
     is_flag=True,
-    help="Wait until every release is healthy and no file is invalid, or --timeout has passed.",
+    help="Wait until the exit code would be 0, or until --timeout has passed.",
 )
 @click.option(
     "--timeout",
@@ -64,7 +64,7 @@ _PATIENCE_S = 10
     default=duration_text(_PATIENCE_S),
     show_default=True,
     callback=duration,
-    help="How long a cluster may take to answer. All are asked at once.",
+    help="How long a cluster may take to answer. All clusters are asked at the same time.",
 )
 @output_option
 def status(
@@ -79,10 +79,10 @@ def status(
     """Show the state of each release on its cluster.
 
     The state is the commit that the cluster has applied, and the health of the release. The exit
-    code is 1 if a file is invalid or waits for a generator, or if a cluster with a kubeconfig in
-    --clusters does not answer, has an old bootstrap file, an object that belongs to no release, or
-    a release that is not healthy. The state of a cluster without a kubeconfig is unknown, which is
-    no fault.
+    code is 1 if a file is invalid, or if a generator has yet to write one. It is also 1 if a
+    cluster with a kubeconfig in --clusters does not answer, or has an old bootstrap file, an object
+    that belongs to no release, or a release that is not healthy. The state of a cluster without a
+    kubeconfig is unknown, which is no fault.
 
     \b
     Examples:
@@ -107,7 +107,7 @@ def status(
         errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
     for name in clusters.keys() - found.clusters:
         errors.print(
-            f"warning: --clusters: no release runs on a cluster '{name}'"
+            f"warning: --clusters: the inventory has no cluster '{name}'"
             f"{suggestion(name, found.clusters)}"
         )
     if not clusters and output == "text":
@@ -187,7 +187,7 @@ class Status:
         return cls(commit, rows, problems, known, pending, old, left, missing, unreadable)
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
-        """Return a text that counts problems and unhealthy releases; empty if there are none.
+        """Return a text that counts problems and unhealthy releases; empty if nothing is wrong.
 
         Only releases on clusters with a kubeconfig in ``clusters`` count.
         """
@@ -228,13 +228,13 @@ class Status:
         if self.problems:
             count = len(self.problems)
             title = "1 problem" if count == 1 else f"{count} problems"
-            text.insert(0, f"{title}; of each file the last valid version is in effect:")
+            text.insert(0, f"{title}; the last valid version of each file is in effect:")
         further = map(str, (*self.old_bootstraps, *self.orphans))
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 
 
 def _wanted(domains: Iterable[ClusterDomain]) -> dict[str, list[ObjectSelector]]:
-    """Return cluster → the selectors of the objects to read there."""
+    """Return a map from each cluster to the selectors of the objects to read in that cluster."""
     wanted: dict[str, dict[ObjectSelector, None]] = {}
     for domain in domains:
         watched = health_reader(domain).objects_to_watch(domain)
@@ -247,7 +247,7 @@ def _read(
     wanted: Mapping[str, Iterable[ObjectSelector]],
     patience_s: int,
 ) -> dict[str, ObjectCache]:
-    """Return cluster → a cache with the selected objects of the cluster.
+    """Return a map from each cluster with a kubeconfig to a cache with its selected objects.
 
     Read all clusters at the same time, so that a slow cluster does not delay the others.
     """

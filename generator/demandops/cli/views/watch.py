@@ -26,7 +26,10 @@ from demandops.staterepo.reader import Reader
 _PAUSE_S = 2.0
 _COMMITS = 6
 _TITLES = 6
-"""How many lines the title and the empty lines between the parts take."""
+"""The lines of the screen besides the three parts.
+
+Two are the title, three are the empty lines before the parts, and one stays free at the bottom.
+"""
 
 
 @click.command()
@@ -36,7 +39,7 @@ def watch(state_repo: str, access_file: Path | None) -> None:
     """Show releases, demands and the latest commits live.
 
     Releases that are not healthy come first. The health is known only with --clusters. Ctrl-C ends
-    it.
+    the command.
 
     \b
     Examples:

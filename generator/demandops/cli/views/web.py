@@ -44,7 +44,8 @@ def _interval(ctx: click.Context, param: click.Parameter, text: str) -> float:
     show_default=True,
     callback=_interval,
     metavar="DURATION",
-    help="How often to fetch a state repo behind a URL; one on this disk is always current.",
+    help="How often to fetch a state repo behind a URL. A state repo on this disk is always "
+    "current.",
 )
 def web(state_repo: str, listen: str, access_file: Path | None, interval: float) -> None:
     """Show the state repo on a web page.

@@ -1,4 +1,4 @@
-"""``demandops why``: why something runs: its requesters, configuration, overrides, commits."""
+"""``demandops why``: the requesters, configuration, overrides and commits behind what runs."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _MOST_CARRIED_OUT = 5
 @click.option(
     "--kind",
     type=click.Choice(KINDS),
-    help="What the name means, if it could mean several things.",
+    help="The kind of the object, if several objects have the name.",
 )
 @click.option(
     "-n",
@@ -65,7 +65,7 @@ _MOST_CARRIED_OUT = 5
     type=click.IntRange(0),
     default=10,
     show_default=True,
-    help="List at most this many of the commits that changed it.",
+    help="List at most this many of the commits that changed the object.",
 )
 @output_option
 def why(
@@ -76,8 +76,8 @@ def why(
     The command shows the requesters, the configuration and overrides that apply, and the commits.
     NAME is the name of a release, application definition or override, or the id of an application,
     connection, demand, node or requester. A part of a release's name or the start of a demand's id
-    is enough if no other release or demand has it. PATH is a file below clusters/ or ledger/. For
-    what no longer runs, the command shows the commit that stopped it.
+    is enough if no other release or demand has it. PATH is a file below clusters/ or ledger/. If
+    something no longer runs, the command shows the commit that stopped it.
 
     \b
     Examples:
@@ -96,7 +96,7 @@ def why(
 def _answer(
     repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int
 ) -> dict[str, Any]:
-    """Return the explanation as JSON data, including at most ``most`` of the changing commits."""
+    """Return the explanation as JSON data, with at most ``most`` of the object's changes."""
     answer: dict[str, Any] = {
         "commit": str(snapshot.commit),
         "kind": match.kind,
@@ -117,7 +117,7 @@ def _answer(
 
 
 def _missing(world: World, answer: dict[str, Any]) -> list[str]:
-    """Return the reasons why topics that the answer's claims need do not arrive."""
+    """Return why topics do not arrive, for all topics that the claims in ``answer`` need."""
     files = {one["file"] for one in answer.get("claims", ())}
     found = (one for one in missing_inputs(world) if one.file in files)
     return list(dict.fromkeys(f"application '{one.application}': {one.reason}" for one in found))
@@ -126,9 +126,9 @@ def _missing(world: World, answer: dict[str, Any]) -> list[str]:
 def _not_rendered(
     repo: Reader, snapshot: Snapshot, answer: dict[str, Any], match: Match
 ) -> list[str]:
-    """Return the answer's files that a generator has yet to write or remove.
+    """Return those files of ``answer`` that a generator has yet to write or remove.
 
-    If there are any, the state ``in force`` in ``answer`` becomes ``not rendered yet``.
+    If there are such files, change the state ``in force`` in ``answer`` to ``not rendered yet``.
     """
     files = {match.path, *(one["file"] for one in answer.get("releases", ()))}
     found = sorted(files & repo.not_rendered(snapshot))
@@ -273,7 +273,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
     """Return the commits that started, changed and stopped the object of ``match``."""
-    if match.kind in ("node", "requester"):  # `demandops log` lists the commits of both
+    if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
         return _history(repo, repo.history(match.path, str(snapshot.commit), most))
@@ -285,7 +285,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 
 
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
-    """Return commits as JSON data; each lists the commits by people that it carries out."""
+    """Return commits as JSON data. Each one lists the commits by people that it carries out."""
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:
         if entry is None:

@@ -66,7 +66,11 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
         lease, subject = claim["lease"], f"{claim['subject']['kind']} '{claim['subject']['id']}'"
         until = f", lease of {duration_text(lease['seconds'])}" if lease else ""
         until += f" until {time_text(lease['until'])}" if lease else ""
-        until += ", which is over: waits for a generator" if claim["overdue"] else ""
+        until += (
+            ", which has passed; a generator has yet to release the claim"
+            if claim["overdue"]
+            else ""
+        )
         version = f", version {claim['version']}" if claim["version"] else ""
         yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
         yield f"    demand {claim['demand']}, request '{claim['request']}'{version}{until}"
@@ -104,7 +108,7 @@ def _history_lines(answer: Json) -> Iterator[str]:
             yield from _commit_lines(entry, why=False)
     if answer["more_changes"]:
         git_log = f", or git log -- {answer['file']}" if answer["file"] else ""
-        yield f"  and {answer['more_changes']} earlier ones: -n{git_log}"
+        yield f"  and {answer['more_changes']} earlier commits; to see them: -n{git_log}"
     if answer["started"]:
         yield "started by"
         yield from _commit_lines(answer["started"], why=True)
