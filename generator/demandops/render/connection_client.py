@@ -28,7 +28,8 @@ def render(client: Client, config: Config, engine: Engine) -> str:
     """Return the manifests of a client as one YAML text.
 
     Raises:
-        InvalidInput: if the configuration does not match the schema of the connection type.
+        InvalidInput: if the configuration does not match the schema of the connection type, or if
+            an override's patch gives no valid settings.
         Refused: if the registry has no image for the client.
     """
     kind, node = client.type, client.node

@@ -36,7 +36,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
 
 
 def domain(**fields: Any) -> dict[str, str]:
-    """Return the policy, with these fields added to its access domain."""
+    """Return the skeleton's policy, with these fields added to its access domain."""
     text = "".join(f"\n    {name}: {value}" for name, value in fields.items())
     return edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]{text}')
 

@@ -1,4 +1,4 @@
-"""`registry/clients.yaml`, an image registry, prefixes and overrides set how clients run."""
+"""The registry, the inventory and overrides set how clients run, with what image and topics."""
 
 from __future__ import annotations
 
