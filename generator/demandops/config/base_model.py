@@ -81,7 +81,7 @@ Line breaks and tabs are valid.
 """
 
 Text = Annotated[str, Visible]
-"""Any visible text."""
+"""Any text without hidden control characters."""
 
 Approval = Literal["none", "required"]
 """Whether a demand needs a person's approval."""

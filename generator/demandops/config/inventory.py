@@ -1,8 +1,8 @@
 """The inventory: nodes, clusters and brokers.
 
 A node is a vehicle, a roadside station, an edge or a cloud server, or anything else that runs
-services. It belongs to one cluster and one access domain. A node selector identifies it in its
-cluster.
+services. A node belongs to one cluster and to one or more access domains. A node selector
+identifies the node in its cluster.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ class Position(CamelModel):
 
 
 class FurtherDomain(CamelModel):
-    """A further access domain of a node, besides the domain whose ``nodes`` match the node.
+    """A further access domain of a node, besides the domain whose patterns match the node.
 
     For connections of this domain, ``zenoh`` and ``wan`` replace those of the node, because two
     programs cannot listen on one port.

@@ -84,7 +84,7 @@ class LeasePolicy(CamelModel):
         for name in ("default", "longest"):
             value = getattr(self, name)
             if value is not None and seconds_of(value) < 1:
-                raise ValueError(f"{name} is zero; leave it out for no limit")
+                raise ValueError(f"{name} is zero; leave it out, or give a longer duration")
         if self.deployment_requests and self.default is None:
             raise ValueError("deploymentRequests needs a default lease; add default")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):

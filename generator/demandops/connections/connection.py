@@ -48,7 +48,7 @@ class Connection:
 
     @property
     def known_type(self) -> ConnectionType:
-        """The type of the connection; fails if no type is chosen yet."""
+        """The type of the connection, for callers that know that a type is chosen."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 

@@ -132,7 +132,7 @@ class End(Client):
 def message_type(route: Route, sender: str, config: Config) -> str:
     """Return the message type of a route whose messages come from the node ``sender``.
 
-    The route's own type comes first, then the type that the inventory gives for the topic of the
+    The route's own type comes first, then the type that the inventory lists for the topic at the
     sender. The result is empty if neither is known.
     """
     known = config.nodes.get(sender)
@@ -149,7 +149,7 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection with an id, or ``None`` if no claim holds one of this type.
+        """Return the connection of this type with an id, or ``None`` if no claim holds it.
 
         Raises:
             Refused: if the type cannot carry the connection.

@@ -100,7 +100,7 @@ class Mqtt(ConnectionType):
         return replace(connection, broker=broker.node), note
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the broker as the value that ``brokers`` of an access rule must allow."""
+        """Return the broker's node as the value that ``brokers`` of a policy's rule must allow."""
         broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
@@ -163,7 +163,10 @@ class MqttEnd(End):
         )
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
-        """Return the ROS domain and, unless the image chooses the middleware, the middleware."""
+        """Return the variables that set the ROS domain and the middleware.
+
+        Without a variable for the middleware, the image chooses it.
+        """
         ros = self.node.ros
         rmw = (isinstance(settings, MqttClientSettings) and settings.rmw) or ros.rmw
         chosen = {} if rmw == "image" else {"RMW_IMPLEMENTATION": rmw}

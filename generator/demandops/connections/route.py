@@ -107,7 +107,7 @@ class RouteOptions(FrozenModel):
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
-    """Yield the faults of routes that make a connection of any type invalid."""
+    """Yield the faults that a connection's routes have, whatever the type of the connection."""
     targets: dict[str, Route] = {}
     carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):
@@ -156,8 +156,8 @@ def _shown(value: object) -> str:
 def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
     """Return one route for each source topic, sorted by source topic.
 
-    If several routes have the same source topic, the first route with a message type is kept, or
-    else the first route.
+    If several routes have the same source topic, the first route with a message type is kept. If
+    none of them has a message type, the first route is kept.
     """
     merged: dict[str, Route] = {}
     for route in routes:

@@ -187,7 +187,8 @@ class Engine:
         try:
             with budget():
                 compiled: Template = self._config.get_template(template)
-            with budget():  # a new one, so that a template that was compiled before renders alike
+            # a new budget, so that it does not matter whether the template was compiled before
+            with budget():
                 text = compiled.render(**context)
             values = _mapping(text, template)
             check(values)

@@ -57,7 +57,7 @@ _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
 """Filters that call another filter or test for each item; each call takes its own steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
-"""Slow filter → how many times as many steps as other filters it takes."""
+"""Slow filter → the factor by which its steps are multiplied."""
 _PADDING = frozenset(
     {"batch", "center", "indent", "literal", "block", "round", "slice", "truncate"}
 )
@@ -137,7 +137,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Return a new value, an iterator as a list, and take as many steps as the value has parts."""
+    """Return a new value (a list for an iterator), and take as many steps as it has parts."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:

@@ -1,4 +1,4 @@
-"""A check of a new configuration, which renders invented demands before real demands arrive."""
+"""Checks a new configuration by rendering invented demands, before real demands arrive."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return the releases that a trial demand for each appdef gives, by appdef.
+    """Return a map from each appdef to the releases that a trial demand for the appdef gives.
 
     Overrides do not apply. Each trial demand names the first suitable node (:func:`_trial_node`).
     If no node is in an access domain, there are no trial demands.

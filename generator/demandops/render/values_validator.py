@@ -93,7 +93,7 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return the highest number of schemas that ``schema`` applies to values of this depth.
+        """Return the most schemas that ``schema`` may apply to a value of ``depth`` nested levels.
 
         Raises:
             RecursionError: if a schema applies itself to the same value, or the number is too high.

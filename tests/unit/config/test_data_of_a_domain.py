@@ -34,7 +34,8 @@ CONNECTION = {
 def domains(fleet: str = "", city: str = "") -> dict[str, str]:
     """Return a policy with the access domains `fleet` and `city`.
 
-    Each argument has further fields of the domain of its name, in place of the default rules.
+    ``fleet`` and ``city`` are further fields of these domains. By default, these fields are rules
+    that permit everything.
     """
     return {
         DOMAINS: f"""

@@ -71,7 +71,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
     problems = []
     for mutation in mutations.mutations(document, form_of(file).limits()):
         found = loader.faults(file, mutation.document)
-        if file == DOMAINS:  # an invalid domain has no nodes, and overrides report that too
+        if file == DOMAINS:  # an invalid domain has no nodes, so overrides have faults too
             found = [one for one in found if one.file == file or "access domain" not in one.message]
         free = FREE_PLACES if file != "registry/charts.yaml" else ()
         problems.append(mutations.problem(mutation, found, form_of(file), free=free, file=file))

@@ -1,4 +1,4 @@
-"""The registry, the inventory and overrides set how clients run, with what image and topics."""
+"""The registry, the inventory and overrides decide how clients run."""
 
 from __future__ import annotations
 

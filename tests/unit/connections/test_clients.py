@@ -227,7 +227,7 @@ BRIDGED: dict[str, Any] = {"bridged": {"edge": ["/a"]}}
 
 
 class TestBridgedAlready:
-    """Clients carry no topic that the inventory lists as bridged, and no client has no topic."""
+    """No client carries a topic that is bridged already, and each client has at least one topic."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_no_client_without_a_topic(self, kind: str) -> None:

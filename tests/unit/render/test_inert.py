@@ -100,7 +100,10 @@ def quoted(text: str) -> str:
 
 
 def inventory(lines: Iterable[str]) -> MemoryRepo:
-    """Return a state repo with one more vehicle for each of ``lines``, the lines of its fields."""
+    """Return a state repo with one more vehicle for each item of ``lines``.
+
+    An item has the fields of the vehicle besides type and cluster.
+    """
     entries = "".join(f"  - type: vehicle\n    cluster: c-its\n{line}" for line in lines)
     return MemoryRepo({NODES: skeleton()[NODES] + entries})
 
@@ -163,7 +166,7 @@ def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
 
 @pytest.mark.parametrize("name", ["null", "y", "1e3", "12", "0x1f", "010", "true", "on"])
 def test_names_that_kubernetes_takes_and_yaml_misreads(name: str) -> None:
-    """A namespace, an account, a secret and a cluster have the name at once."""
+    """A namespace, an account, a secret and a cluster all have this name."""
     domains = (
         "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
         f'  - {{name: "{name}", namespace: "{name}", serviceAccount: "{name}", nodes: ["*"]}}\n'

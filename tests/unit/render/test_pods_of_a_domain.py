@@ -103,7 +103,7 @@ def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> N
 
 
 def test_a_chart_in_a_new_folder_changes_nothing_that_someone_applied() -> None:
-    """If the bootstrap file changed, Flux would need a person who applies the file again."""
+    """Flux must be able to read the chart although nobody applies the bootstrap file again."""
     folder = "appdefs/new/charts/new"
     charts = skeleton()["registry/charts.yaml"]
     added = {

@@ -20,7 +20,10 @@ TopicPattern = Annotated[
         pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
     ),
 ]
-"""A topic name in which ``{instance}`` stands for the application or node that is served."""
+"""The name of an output's topic.
+
+``{instance}`` stands for the source, the application or the node that the service runs for.
+"""
 
 Scope = Literal["application", "topic", "node", "cluster"]
 """The scope of a service: what each of its instances is for."""
@@ -59,7 +62,7 @@ class Parameter(CamelModel):
 
 
 class Deployed(CamelModel):
-    """How a service runs and what it publishes: the names, chart and values of its releases.
+    """How a service runs (the names, chart and values of its releases), and what it publishes.
 
     If ``each`` names an input, the service runs once for every topic of this input. ``place`` has
     the requirements on the node, if the generator chooses a node for the service

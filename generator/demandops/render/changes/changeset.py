@@ -31,7 +31,7 @@ CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
 """The kinds of changes, in the order in which lists of changes show them."""
 
 FileReader = Callable[[str], str | None]
-"""A function that returns the text of a file of the state repo, or None without such a file."""
+"""A function that returns the text of a state repo's file, or None if the file is missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ def build_changeset(
 
     Args:
         before, after: the world before and after the change, with the same configuration.
-        changes: what differs between both ledgers.
+        changes: the differences between both ledgers.
         keys: the keys of the releases that may differ
             (:func:`demandops.plan.release_keys.affected_keys`).
         engine: the engine of the configuration.

@@ -106,7 +106,7 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
 
 def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
-    """Return the files of the claims that need each release, by the release's key."""
+    """Return a map from each release's key to the files of the claims that need the release."""
     by_release: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
         paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]

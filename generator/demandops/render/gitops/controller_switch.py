@@ -76,7 +76,8 @@ def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
         commands = []
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
-            commands.append(  # Helm's records of releases, from which a later Flux would continue
+            # delete Helm's records of releases, because a later Flux would continue from them
+            commands.append(
                 f"{kubectl} get helmrelease -l {_label(domain)} -o name | sed s,.*/,, | "
                 f"xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
             )
