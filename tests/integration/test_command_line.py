@@ -138,7 +138,7 @@ class TestInit:
         root.write_text(root.read_text().replace(url, "git@git.example:fleet/state.git"))
         assert demandops("check", folder).err == (
             "error: demandops.yaml:12: flux.url: 'git@git.example:fleet/state.git' is not a URL, "
-            f"which the controllers need; write {url}\n"
+            f"but the GitOps controllers need one; write {url}\n"
         )
 
     @pytest.mark.parametrize("gitops", ["flux", "argocd"])

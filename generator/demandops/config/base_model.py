@@ -30,7 +30,7 @@ Model = TypeVar("Model", bound=BaseModel)
 Item = TypeVar("Item")
 
 Items = Annotated[tuple[Item, ...], Field(strict=False)]
-"""A list in a file; the model has it as a tuple."""
+"""A list in a file. The model has the items as a tuple."""
 
 Positive = Annotated[int, Field(ge=1)]
 """A whole number above zero."""
@@ -81,7 +81,7 @@ Line breaks and tabs are valid.
 """
 
 Text = Annotated[str, Visible]
-"""Any visible text."""
+"""Any text without hidden control characters."""
 
 Approval = Literal["none", "required"]
 """Whether a demand needs a person's approval."""
@@ -94,7 +94,7 @@ class FrozenModel(BaseModel):
 
 
 class CamelModel(FrozenModel):
-    """A part of a configuration file: ``hostNetwork`` there is ``host_network`` here."""
+    """A part of a configuration file. The field ``host_network`` is ``hostNetwork`` in the file."""
 
     model_config = ConfigDict(alias_generator=to_camel)
 
@@ -134,7 +134,10 @@ def faults_of(
 
 
 def _counts_faulty_items(item: dict[str, Any]) -> bool:
-    """Return whether a list is only too short without its faulty items, which have own faults."""
+    """Return whether pydantic calls a list too short only because it does not count faulty items.
+
+    Such an error is left out, because the faulty items have faults of their own.
+    """
     is_short = item["type"] == "too_short" and isinstance(item.get("input"), list)
     return is_short and len(item["input"]) >= item["ctx"]["min_length"]
 

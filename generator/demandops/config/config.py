@@ -43,13 +43,14 @@ COLLECTIONS = (
     CLIENTS_FILE,
     VERSIONS_FILE,
 )
-"""The collections: files with many entries.
+"""The collections of entries, each named by the file that usually lists its entries.
 
-The files of a folder with the same name may have further entries (:func:`collection_of`).
+Files in the folder ``inventory/nodes/`` may list further entries of the collection
+``inventory/nodes.yaml``, and likewise for the others (:func:`collection_of`).
 """
 
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
-"""The top-level entries of a state repo that hold the configuration; people own them."""
+"""The top-level entries of a state repo that hold the configuration, which people write."""
 
 
 def collection_of(path: str) -> str | None:
@@ -65,9 +66,10 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return the text with which a message names the files of a collection.
+    """Return how a message names the files of a collection.
 
-    ``files`` are the files that have entries.
+    The result is like ``inventory/nodes.yaml or inventory/nodes/``. ``files`` are the files that
+    have entries of the collection.
     """
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
@@ -79,10 +81,11 @@ class Config:
     """What can run, where, and from which charts and images.
 
     ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
-    ``files`` maps the paths of templates and chart schemas to their texts. ``overrides`` has every
-    override; :class:`demandops.ledger.world.World` knows which of them have ended. ``entry_files``
-    maps each collection's entries to the files that they are in. ``hosts`` maps each node in a
-    further access domain (``edge@city``) to the node of the inventory (``edge``).
+    ``files`` maps the path of each file below ``appdefs/`` to its text, for example of templates
+    and charts. ``overrides`` has every override; :class:`demandops.ledger.world.World` knows which
+    of them have ended. ``entry_files`` maps each collection to a map from its entries to the files
+    that have them. ``hosts`` maps each node in a further access domain (``edge@city``) to the node
+    of the inventory (``edge``).
     """
 
     repo_settings: RepoSettings
@@ -107,13 +110,13 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """Part of a topic name → the nodes whose ids give it (:func:`demandops.naming.topic_part`)."""
+    """Part of a topic name → the nodes whose ids give it by :func:`demandops.naming.topic_part`."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    """Type of nodes → these nodes, sorted by id; the empty type has all nodes."""
+    """Node type → the nodes of the type, sorted by id; the empty type stands for all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """A capability, or the key and value of a label → the nodes that have it, sorted by id."""
+    """``(capability,)`` or ``(label key, label value)`` → the nodes that have it, sorted by id."""
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
     """Property → the type of its value on most nodes, and the first node with this type."""
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
@@ -121,13 +124,13 @@ class Config:
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     """Whether any node declares a capacity."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The roles, sorted, for which a service of any appdef runs once for each topic."""
+    """The input roles, sorted, for each of whose topics a service of some appdef runs once."""
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
     """The names of the services whose scaling has ``downAfter``, in at least one appdef."""
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """Appdef → version or channel → the version's contents; the empty name is the default."""
+    """Appdef → version or channel → this version; the empty name stands for the default."""
 
     def __post_init__(self) -> None:
         """Set the fields that are derived from other fields."""
@@ -201,7 +204,7 @@ class Config:
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return the text with which a message names the files of a collection."""
+        """Return how a message names the files of a collection (:func:`place_of_collection`)."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
@@ -233,7 +236,7 @@ class Config:
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return the text with which a message names the files with the versions of an appdef."""
+        """Return how a message names the files that list the versions of an appdef."""
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
         return self.place_of(CHARTS_FILE)

@@ -20,7 +20,7 @@ _NAME = TypeAdapter(DnsLabel)
 
 
 class ConfigReader:
-    """Reads the configuration files of one state repo and collects every fault."""
+    """Reads the configuration files of one state repo, and collects their faults."""
 
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
@@ -37,7 +37,10 @@ class ConfigReader:
         self.faults.append(fault(field, message).within(file))
 
     def read_file(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file as ``model``; if the file is missing or invalid, collect the faults."""
+        """Return a file as an instance of ``model``.
+
+        If the file is missing or invalid, add its faults and return ``None``.
+        """
         text = self.files.get(file)
         if text is None:
             self.add_fault(file, "", "is missing; `demandops init` creates an example")
@@ -105,22 +108,26 @@ class ConfigReader:
             self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
 
     def entry_files(self) -> dict[str, dict[str, str]]:
-        """Return collection → entry → file, for the collections that :meth:`read_items` read."""
+        """Return each entry's file, by collection and entry.
+
+        The result has the collections that :meth:`read_items` has read.
+        """
         return {
             collection: {name: file for name, (file, _) in places.items()}
             for collection, places in self._places.items()
         }
 
     def head(self, file: str, model: type[Model]) -> Model | None:
-        """Return the fields of a file besides its items, as an instance of ``model``.
+        """Return a file without its items, as an instance of ``model``.
 
-        :meth:`read_items` must have read the file. Return ``None`` if these fields are not valid.
+        :meth:`read_items` must have read the file. Return ``None`` if the other fields of the file
+        are not valid.
         """
         head = self._heads.get(file)
         return head if isinstance(head, model) else None
 
     def place_of(self, collection: str, name: str) -> tuple[str, str]:
-        """Return the file that has an item, and the field in it: ``nodes[3]``."""
+        """Return the file that has an item, and the item's path in this file, like ``nodes[3]``."""
         return self._places[collection][name]
 
     def add_alias(self, collection: str, name: str, of: str) -> None:

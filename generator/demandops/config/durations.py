@@ -30,7 +30,7 @@ def seconds_of(text: str) -> int:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration with all its units, as :func:`seconds_of` reads it."""
+    """Return a duration in all units that it needs, as text that :func:`seconds_of` reads."""
     text, left = "", round(seconds)
     for size, name in _UNITS:
         whole, left = divmod(left, size)

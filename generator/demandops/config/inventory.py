@@ -1,8 +1,8 @@
 """The inventory: nodes, clusters and brokers.
 
 A node is a vehicle, a roadside station, an edge or a cloud server, or anything else that runs
-services. It belongs to one cluster and one access domain. A node selector identifies it in its
-cluster.
+services. A node belongs to one cluster and to one or more access domains. A node selector
+identifies the node in its cluster.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A
 """A host name or an IP address."""
 
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
-"""A key in a Kubernetes Secret; it becomes a file name."""
+"""A key in a Kubernetes Secret; in the pod, the key is a file's name."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
 Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), Visible]
-"""A Zenoh endpoint without certificates: ``tcp/host:7447``."""
+"""A Zenoh endpoint whose protocol needs no certificates, like ``tcp/host:7447``."""
 
 
 class Tls(CamelModel):
-    """TLS to a broker; without ``caSecret``, the client trusts the CAs of its image."""
+    """TLS to a broker. Without ``caSecret``, the client trusts the CAs that its image trusts."""
 
     ca_secret: DnsLabel | None = None
     ca_key: SecretKey = "ca.crt"
@@ -58,8 +58,8 @@ class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
     Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
-    the endpoint's port at every address. It always connects to the routers in ``connect``. A node
-    with none of these fields connects to the nodes that have an endpoint.
+    the endpoint's port at every address. It always connects to the routers in ``connect``. If none
+    of these fields is given, the bridge only connects to bridges that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -69,7 +69,9 @@ class Zenoh(CamelModel):
     @model_validator(mode="after")
     def _reachable(self) -> Zenoh:
         if self.listen and not self.endpoint:
-            raise ValueError("listen needs an endpoint, where others reach the node; add it")
+            raise ValueError(
+                "listen needs an endpoint, where other bridges reach this one; add endpoint"
+            )
         return self
 
     def listening(self) -> tuple[str, ...]:
@@ -107,10 +109,10 @@ _FACTORS = {"m": 1, "": 1000} | {
 
 @lru_cache(maxsize=1024)
 def amount_of(text: str) -> int:
-    """Return a quantity of a resource in thousandths: ``500m`` is 500, ``2`` is 2000.
+    """Return a quantity of a resource in thousandths: 500 for ``500m``, 2000 for ``2``.
 
     Raises:
-        ValueError: if the text is not a quantity as Kubernetes writes them.
+        ValueError: if the text is not a quantity as Kubernetes writes it.
     """
     match = _QUANTITY.fullmatch(text)
     if match is None:
@@ -123,7 +125,7 @@ def amount_of(text: str) -> int:
 
 
 def amount_text(amount: int, resource: str) -> str:
-    """Return an amount in thousandths as a person writes it: ``1.5``, or ``16Gi`` of memory."""
+    """Return an amount that is given in thousandths as people write it: ``1.5``, ``16Gi``."""
     if resource.endswith(("memory", "storage")):
         for unit in ("Ti", "Gi", "Mi", "Ki"):
             if amount and amount % _FACTORS[unit] == 0:
@@ -142,7 +144,7 @@ Quantity = Annotated[
     BeforeValidator(_plain_number, json_schema_input_type=str | int | float),
     readable_by(amount_of),
 ]
-"""A quantity as Kubernetes writes them; a plain number needs no quotes."""
+"""A quantity as Kubernetes writes it, like ``500m``. A plain number needs no quotes."""
 
 ResourceName = Annotated[
     str, StringConstraints(pattern=r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$", max_length=120)
@@ -175,7 +177,7 @@ class Cluster(CamelModel):
 
 
 class Toleration(CamelModel):
-    """A taint of the node that workloads tolerate (Kubernetes core/v1 Toleration)."""
+    """A taint that workloads on the node tolerate (Kubernetes core/v1 Toleration)."""
 
     key: Text = ""
     operator: Literal["Exists", "Equal"] = "Equal"
@@ -216,7 +218,7 @@ class Position(CamelModel):
 
 
 class FurtherDomain(CamelModel):
-    """A further access domain of a node, besides the domain whose ``nodes`` field has the node.
+    """A further access domain of a node, besides the domain whose patterns match the node.
 
     For connections of this domain, ``zenoh`` and ``wan`` replace those of the node, because two
     programs cannot listen on one port.
@@ -230,22 +232,22 @@ class FurtherDomain(CamelModel):
 class Node(CamelModel):
     """A C-ITS entity that runs services.
 
-    ``type`` is the role of the node, any word. ``capabilities`` are words for what the node has,
-    and ``properties`` are values with a type. A demand may require these three instead of naming a
-    node; the generator then chooses a node that is not ``drained``
-    (:mod:`demandops.plan.nodes.placement`). The services on the node together request at most its
+    ``type`` is the role of the node and may be any word. ``capabilities`` are words for what the
+    node has, and ``properties`` are values with a type. A demand may say what it requires of these
+    three instead of naming a node. Then the generator chooses a node that is not ``drained``
+    (:mod:`demandops.plan.nodes.placement`). All services on the node together request at most its
     ``capacity`` (:mod:`demandops.plan.nodes.capacity`).
 
-    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses. A ROS domain of
-    the access domain replaces the ROS domain in ``ros``. ``topics`` maps each input role to the
-    node's usual topic. The names of releases and derived topics contain the node; for a topic that
-    is not the usual one, these names contain the topic too.
+    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses. If the access
+    domain has a ROS domain, it replaces the ROS domain in ``ros``. ``topics`` maps each input role
+    to the node's usual topic. The names of releases and derived topics contain the node. For a
+    topic that is not the usual one, these names contain the topic too.
 
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` maps topics to
-    message types, for requests that give no type. ``bridged`` maps other nodes to the topics that
-    the initial deployment already carries there under the same name; connections skip these topics.
-    ``access_domains`` are the node's further domains. For each of them, the configuration has a
-    further node ``<id>@<domain>`` (:meth:`in_domain`).
+    message types, for requests that give no type. ``bridged`` maps another node to the topics that
+    the initial deployment already carries to that node under the same name. Connections skip these
+    topics. ``access_domains`` are the node's further domains. For each of them, the configuration
+    has a further node ``<id>@<domain>`` (:meth:`in_domain`).
     """
 
     id: NodeId
@@ -272,9 +274,9 @@ class Node(CamelModel):
     def _findable(self) -> Node:
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
-                "the id is not a valid label value, so no cluster node can have the label node_id "
-                "with it; choose an id of up to 63 letters, digits, '-', '_' and '.', or add a "
-                "selector"
+                "the id is not a valid label value, so no node of the cluster can have it in the "
+                "label node_id; choose an id of up to 63 letters, digits, '-', '_' and '.', or "
+                "add a selector"
             )
         return self
 
@@ -317,7 +319,8 @@ def id_in_domain(node: str, domain: str) -> str:
 class Broker(CamelModel):
     """A message broker and the node that it runs on.
 
-    Every MQTT topic of a connection at this broker starts with ``topic_prefix`` and ``/``.
+    If ``topic_prefix`` is given, every MQTT topic of a connection at this broker starts with
+    ``topic_prefix`` and ``/``.
     """
 
     node: NodeId

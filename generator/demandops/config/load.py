@@ -68,7 +68,7 @@ _ANY = RepoSettings(
     gitops="flux",
     renderVersion=RENDER_VERSION,
     flux=Flux(url="https://unread.invalid/repo.git"),
-)  # stands for invalid settings, so that the other files can be checked
+)  # replaces settings that are not valid, so that the other files can be checked
 
 
 def load(files: Mapping[str, str]) -> Config:
@@ -132,9 +132,9 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services, with ``runs_at`` set for each that runs once for each cluster.
+    """Return the services, with ``runs_at`` set for those that run once for each cluster.
 
-    ``runs_at`` maps the id of each node to the node of its cluster at which the service runs.
+    ``runs_at`` maps the id of each node to the node in the same cluster where the service runs.
     """
     found = dict(services)
     for name, service in services.items():
@@ -160,7 +160,7 @@ def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
 
 
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the clients' settings from all files, and connection type → the file with settings."""
+    """Return the clients' settings from all files, and the file that sets each connection type."""
     found, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
@@ -198,7 +198,7 @@ def _read_versions(reader: ConfigReader) -> Mapping[str, VersionList]:
 def _read_definitions(
     reader: ConfigReader, file: str, model: type[Definition]
 ) -> Mapping[str, Definition]:
-    """Return name → definition, from each file ``appdefs/<name>/<file>``."""
+    """Return the definitions in all files ``appdefs/<name>/<file>``, by name."""
     found = {}
     for path in sorted(reader.files):
         parts = path.split("/")
@@ -274,7 +274,7 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return the nodes, and for each further access domain of a node the node ``<id>@<domain>``.
+    """Return the nodes, with a node ``<id>@<domain>`` added for each further access domain.
 
     Returns:
         Three mappings: id → node, id → access domain, and ``<id>@<domain>`` → ``<id>``.
@@ -289,11 +289,12 @@ def _in_further_domains(
             domain = domains.get(further.name)
             reader.check_reference(file, f"{where}.name", further.name, DOMAINS_FILE)
             if first is None:
-                message = f"'{node.id}' is in the nodes of no access domain; add it to one"
+                message = f"no access domain has '{node.id}' in its nodes; add it to one"
                 reader.add_fault(file, where, message)
             elif domain is first or id in nodes:
-                message = f"'{node.id}' is in '{further.name}' already, or '{id}' is a node"
-                reader.add_fault(file, f"{where}.name", f"{message}; remove this, or the other")
+                message = f"'{node.id}' is already in '{further.name}', or a node has the id '{id}'"
+                message += "; remove this entry or the other one"
+                reader.add_fault(file, f"{where}.name", message)
             elif domain is not None:
                 number = _in_ros_domain(node, domain).ros.domain_id
                 other = ros.setdefault(number, domain.name)

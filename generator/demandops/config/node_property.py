@@ -2,7 +2,7 @@
 
 The value of a property is a number, text, true or false. A condition is a text: ``ros=jazzy``,
 ``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values of the same type on all nodes. This
-type decides how the value in a condition is read.
+type decides how the generator reads the value in a condition.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _required_value(value: object) -> object:
     for bound in value.values():
         if kind_of(bound) != "a number":
             shown = strict_yaml.short_repr(bound)
-            raise ValueError(f"has the bound {shown}; give a number")
+            raise ValueError(f"has {shown} as a bound; give a number")
     if len(bounds) == 2 and value["min"] > value["max"]:
         raise ValueError("has a min above its max; lower min or raise max")
     return value
@@ -85,7 +85,7 @@ PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": 
 RequiredValue = Annotated[
     Any, AfterValidator(_required_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
 ]
-"""The value that a definition requires of a property, or bounds of a number: ``{min: 8}``."""
+"""The value that a definition requires of a property; for a number also bounds: ``{min: 8}``."""
 
 
 def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
@@ -98,7 +98,7 @@ def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
 
 
 def comparable_kind(value: object) -> Kind | None:
-    """Return the type of the properties with which a required value can be compared.
+    """Return the type that a property must have to be compared with a required value.
 
     Return ``None`` if the required value is not valid.
     """
@@ -148,7 +148,7 @@ def meets_condition(properties: Mapping[str, object], text: str) -> bool:
 
 
 def _read(condition: PropertyCondition, kind: Kind) -> object:
-    """Return the value of a condition, read as ``kind``; ``None`` if it has another type."""
+    """Return a condition's value, read as ``kind``, or ``None`` if the value has another type."""
     if kind == "a number":
         return _number(condition.value)
     if condition.sign != "=":

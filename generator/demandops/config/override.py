@@ -62,7 +62,9 @@ def parse_time(text: str) -> datetime:
         moment = datetime.fromisoformat(f"{day}T{clock}.{(fraction or '0').ljust(6, '0')}{zone}")
         return moment.astimezone(timezone.utc)
     except (ValueError, OverflowError):
-        raise ValueError(f"{quoted(text)} does not exist; correct the day or the clock") from None
+        raise ValueError(
+            f"{quoted(text)} is a time that does not exist; correct the date or the clock time"
+        ) from None
 
 
 def format_time(moment: datetime) -> str:
@@ -112,8 +114,8 @@ def _filled_in(model: FrozenModel) -> None:
 class Selector(FrozenModel):
     """Selects the releases and claims that match every field given here.
 
-    Patterns may contain ``*`` and ``?``. ``requesters`` matches if one of the requesters does,
-    ``labels`` if the node's selector has all of them.
+    Patterns may contain ``*`` and ``?``. ``requesters`` matches if it matches one of the
+    requesters. ``labels`` matches if the node's selector has all of these labels.
     """
 
     applications: Patterns | None = None
@@ -198,7 +200,7 @@ class OverrideFile(FileModel):
                 )
 
     def selects_clients(self) -> bool:
-        """Return whether a selector names connections."""
+        """Return whether any selector of the override names connections."""
         return any(selector.connections for selector in self.select)
 
     def patches_clients(self) -> bool:
@@ -222,11 +224,11 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @classmethod
     def from_file(cls, name: str, file: OverrideFile) -> Override:
-        """Return the override of a parsed file."""
+        """Return the override ``name`` that a parsed file declares."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 
     def __eq__(self, other: object) -> bool:
-        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
+        """Compare as JSON, because 1, True and 1.0 are equal in Python, but not for a chart."""
         return isinstance(other, Override) and self.model_dump_json() == other.model_dump_json()
 
     @property
@@ -269,7 +271,7 @@ class Shaping:
     def held(self) -> bool:
         """Whether a ``hold`` keeps the release's file unchanged.
 
-        A later override that changes the release cancels the ``hold``.
+        An override that applies later and changes the release cancels the ``hold``.
         """
         held = False
         for _, effects in self.by:

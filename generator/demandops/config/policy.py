@@ -37,10 +37,10 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
 
 
 class Rule(CamelModel):
-    """The demands that some requesters may make; each requester of a demand needs such a rule.
+    """Which demands some requesters may make. Each requester of a demand needs a rule that fits.
 
-    ``nodes`` are the nodes of applications and the ends of connections, ``brokers`` the nodes of
-    brokers, ``peers`` the other access domains that connections may come from and go to.
+    ``nodes`` are the nodes of applications and the ends of connections. ``brokers`` are the nodes
+    of brokers. ``peers`` are the other access domains that connections may come from and go to.
     ``approval`` defaults to that of the access domain.
     """
 
@@ -54,7 +54,7 @@ class Rule(CamelModel):
 
 
 class Quotas(CamelModel):
-    """The upper limits of an access domain; an absent one means no limit.
+    """The upper limits of an access domain. A field that is not given sets no limit.
 
     ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
@@ -69,7 +69,7 @@ class LeasePolicy(CamelModel):
 
     A demand that requests no lease gets ``default``, or ``longest`` if there is no ``default``. If
     neither is set, its claims last forever. Goals of the reference's ``DeploymentRequest`` get a
-    lease only with ``deployment_requests``; their clients must then repeat them in time. The
+    lease only with ``deployment_requests``. Their clients must then repeat the goals in time. The
     recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
     release a claim late by that much.
     """
@@ -84,7 +84,7 @@ class LeasePolicy(CamelModel):
         for name in ("default", "longest"):
             value = getattr(self, name)
             if value is not None and seconds_of(value) < 1:
-                raise ValueError(f"{name} is zero; leave it out for no limit")
+                raise ValueError(f"{name} is zero; leave it out, or give a longer duration")
         if self.deployment_requests and self.default is None:
             raise ValueError("deploymentRequests needs a default lease; add default")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
@@ -143,7 +143,7 @@ def _by_word(value: object) -> object:
         return value
     if value not in KINDS:
         raise ValueError(
-            f"{quoted(value)} is not a kind that is known by its name; give kind, group and "
+            f"{quoted(value)} is not a kind that one word can name; give kind, group and "
             f"resource{suggestion(value, KINDS)}"
         )
     return KINDS[value]
@@ -168,11 +168,11 @@ class AccessDomain(CamelModel):
     Kubernetes' Pod Security Standards, ``host-network`` also permits the host's network, and
     ``privileged`` permits everything.
 
-    ``when_full`` says what happens to a demand if its nodes are suitable but have no room
+    ``when_full`` says what happens to a demand if the nodes that suit it have no room
     (:mod:`demandops.ledger.waiting`).
 
-    ``ros`` replaces the ROS domain of its nodes. ``broker_credentials`` maps the node of a broker
-    to the credentials that the domain's ends of connections use for this broker.
+    ``ros`` replaces the ROS domain of the nodes. ``broker_credentials`` maps the node of a broker
+    to the credentials that connection ends in this domain use for the broker.
     """
 
     name: DnsLabel
@@ -217,7 +217,8 @@ class AccessDomain(CamelModel):
         missing = [name for name in NEEDED_KINDS if KINDS[name] not in self.kinds]
         if missing:
             raise ValueError(
-                f"kinds: needs {' and '.join(missing)} for connections and Helm's releases; add it"
+                f"kinds: lacks {' and '.join(missing)}, but connections and Helm's releases need "
+                "them; add what is missing"
             )
         if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
             raise ValueError(
@@ -231,7 +232,7 @@ class AccessDomain(CamelModel):
         names = [rule.name for rule in self.rules]
         for name in names:
             if names.count(name) > 1:
-                raise ValueError(f"rules: two have the name '{name}'; give each its own")
+                raise ValueError(f"rules: two rules have the name '{name}'; give each its own name")
         return self
 
 

@@ -119,7 +119,8 @@ class Image(FrozenModel):
     def pulled_from(self, registry: str) -> Image:
         """Return the image pulled from ``registry``.
 
-        ``registry`` replaces the host of the image. It precedes the name of an image without host.
+        ``registry`` replaces the host in the image's name. If the name has no host, ``registry``
+        is put before the name.
         """
         host, _, path = self.repository.partition("/")
         named = path and ("." in host or ":" in host or host == "localhost")
@@ -185,8 +186,8 @@ class ImagePin(FrozenModel):
 class VersionContents(CamelModel):
     """The charts and images of one version of an application.
 
-    A chart that is not listed has its default version. An image that is not listed is that of
-    ``registry/images.yaml``.
+    A chart that is not listed has its default version. An image that is not listed stays as
+    ``registry/images.yaml`` has it.
     """
 
     charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
@@ -216,7 +217,7 @@ class VersionList(CamelModel):
 class VersionsFile(FileModel):
     """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
 
-    An application definition without an entry has the versions of its charts.
+    If an application definition has no entry, the versions of its charts are its versions.
     """
 
     kind: Literal["Versions"]
@@ -237,7 +238,7 @@ def precedence(version: str) -> Precedence:
 
 @dataclass(frozen=True)
 class ApplicationVersion:
-    """One version of an application definition, with the chart sources and image pins that it has.
+    """One version of an application definition, with the version's chart sources and image pins.
 
     ``name`` is empty if the definition has no entry in ``registry/versions.yaml``.
     """
@@ -254,7 +255,7 @@ class ApplicationVersion:
         return tuple(map(precedence, [self.name] if self.name else charts))
 
     def image(self, name: str, image: Image) -> Image:
-        """Return an image of the registry with the version's pin."""
+        """Return an image of the registry, changed by the version's pin if there is one."""
         return self.images[name].over(image) if name in self.images else image
 
 

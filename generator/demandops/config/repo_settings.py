@@ -26,7 +26,7 @@ _SCP = re.compile(r"(?P<user>[^\s:@/]+)@(?P<host>[^\s:@/]+):(?!\d+/)(?P<path>[^\
 
 
 def as_git_url(text: str) -> str:
-    """Return an address like ``git@host:path`` as a URL; return any other unchanged."""
+    """Return an address like ``git@host:path`` as a URL, and any other address unchanged."""
     scp = _SCP.fullmatch(text)
     return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
 
@@ -36,7 +36,7 @@ def _git_url_problem(text: str) -> str:
         return ""
     url = as_git_url(text)
     if url != text:
-        return f"{quoted(text)} is not a URL, which the controllers need; write {url}"
+        return f"{quoted(text)} is not a URL, but the GitOps controllers need one; write {url}"
     return (
         f"{quoted(text)} is not a URL that clusters can fetch; write https://HOST/PATH or "
         "ssh://USER@HOST/PATH, without a password or token"
@@ -47,7 +47,7 @@ GitUrl = Annotated[str, without(_git_url_problem), Visible]
 
 
 class Flux(FrozenModel):
-    """Flux's access to this repo: the GitRepository of each access domain.
+    """How Flux fetches this repo, in a GitRepository for each access domain.
 
     Without ``url`` there are no bootstrap files, so no cluster can follow the repo.
     """
@@ -60,9 +60,9 @@ class Flux(FrozenModel):
 
 
 class ArgoCd(FrozenModel):
-    """Argo CD's access to this repo, and its namespace.
+    """How Argo CD fetches this repo, and the namespace that Argo CD runs in.
 
-    Argo CD finds its credentials in a Secret of this namespace. The Secret names the URL.
+    Argo CD finds the credentials in a Secret of this namespace. The Secret names the URL.
     """
 
     url: GitUrl
@@ -89,9 +89,10 @@ WebUrl = Annotated[str, without(_web_url_problem), Visible]
 class Proposals(FrozenModel):
     """The forge on which demands that need approval are proposed.
 
-    With ``none`` the generator pushes the branch, but opens no pull request. With GitLab, the push
-    options of the branch open a merge request. With GitHub and Gitea (Forgejo), the generator opens
-    a pull request through the API, whose address follows from ``url`` unless ``api`` gives it.
+    With ``none``, the generator pushes the proposal's branch, but opens no pull request. With
+    GitLab, the push options of the branch open a merge request. With GitHub and Gitea (Forgejo),
+    the generator opens a pull request through the API, whose address follows from ``url`` unless
+    ``api`` gives it.
     """
 
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
@@ -123,9 +124,10 @@ class Proposals(FrozenModel):
 class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
-    ``demand_items``: applications, connections, topics and requesters that the demand lists.
-    ``parameter_bytes``: an application's parameters as JSON. ``file_bytes``: a file that the
-    generator writes for the demand; Kubernetes stores no object above 1.5 MB.
+    ``demand_items`` limits how many applications, connections, topics and requesters the demand
+    lists in total. ``parameter_bytes`` limits the parameters of an application, written as JSON.
+    ``file_bytes`` limits each file that the generator writes for the demand, because Kubernetes
+    stores no object above 1.5 MB.
     """
 
     demand_items: Positive = 20_000
@@ -136,7 +138,7 @@ class Limits(CamelModel):
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
-    The file may also contain the section of the controller that ``gitops`` does not name; this
+    The file may also contain the section of the controller that ``gitops`` does not name. That
     section is not used. ``placement`` is the rule by which the generator chooses among the nodes
     that fit an application (:mod:`demandops.plan.nodes.placement`).
     """

@@ -1,4 +1,4 @@
-"""Connections: demands list them, claims hold them, and clients are planned from them."""
+"""Connections, which demands list, claims hold, and clients carry."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class Connection:
     """One connection and the topics that it carries.
 
-    ``type`` is ``None`` if a demand leaves the type open. ``broker`` is empty if the program
+    ``type`` is ``None`` if a demand leaves the type open. ``broker`` is empty if the generator
     chooses the broker. The connection of a claim has a type, and its routes are sorted by source
     topic, without duplicates (:meth:`booked`).
     """
@@ -38,24 +38,24 @@ class Connection:
 
     @property
     def home(self) -> str:
-        """The node whose access domain sets leases and quotas."""
+        """The target, whose access domain sets leases and quotas for the connection."""
         return self.target
 
     @property
     def nodes(self) -> tuple[str, str]:
-        """The nodes that an override's selector may match."""
+        """Both ends. An override's selector may match either of them."""
         return (self.source, self.target)
 
     @property
     def known_type(self) -> ConnectionType:
-        """The type of the connection, which must be chosen already."""
+        """The type of the connection, for callers that know that a type is chosen."""
         assert self.type is not None, self.id  # noqa: S101
         return self.type
 
     def route(self, source: str) -> Route | None:
         """Return the route of a source topic, or ``None`` if there is none.
 
-        The routes must be sorted, as those of a claim are.
+        The routes must be sorted, as the routes of a claim are.
         """
         place = bisect_left(self.topics, source, key=attrgetter("source"))
         found = self.topics[place : place + 1]
@@ -94,14 +94,14 @@ class Connection:
         return (self.source, self.target, self.known_type.word)
 
     def topic_keys(self) -> Iterator[TopicKey]:
-        """Yield the key of each topic: its name on the source node."""
+        """Yield the key of each topic: a tuple with the topic's name on the source node."""
         for route in self.topics:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
         """Yield (text, keys) for each topic that a shutdown lists in ``listed``.
 
-        The keys are those of the topic in this connection: one, or none if the connection does not
+        The text names the topic in messages. There is one key, or none if this connection does not
         carry the topic.
         """
         assert isinstance(listed, Connection)  # noqa: S101 - see matches_listed
@@ -115,9 +115,10 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return the connection without the node, which is its broker or one of its ends.
+        """Return what is left of the connection without a node, its broker or one of its ends.
 
-        Without its broker, the connection names no broker. Without an end, the result is ``None``.
+        Without its broker, the connection names no broker. Without an end, nothing is left and the
+        result is ``None``.
         """
         return None if node in self.nodes else replace(self, broker="")
 

@@ -66,14 +66,14 @@ class Client(ABC):
 
     @abstractmethod
     def facts(self) -> list[str]:
-        """Return the client's properties as lines; commit messages show the changed ones."""
+        """Return one line for each property of the client; commit messages show changed lines."""
 
     @abstractmethod
     def configuration(self) -> dict[str, Any]:
         """Return the configuration that the client's program reads."""
 
     def written(self, configuration: Mapping[str, Any]) -> str:
-        """Return a configuration as the text that the client's program reads."""
+        """Return a configuration as text, in the format that the client's program reads."""
         return strict_yaml.dump(configuration)
 
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
@@ -100,7 +100,7 @@ class Client(ABC):
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Return (file, entry, effect) for each configuration entry that shapes the client."""
+        """Yield (file, entry, what the entry decides) for each entry that shapes the client."""
         file = config.entry_files.get(CLIENTS_FILE, {}).get(self.type.word)
         if file is not None:
             yield file, self.type.word, "how its container runs"
@@ -125,15 +125,15 @@ class End(Client):
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS; the other end then publishes it."""
+        """Return whether this end reads the topic from ROS, so that the other end publishes it."""
         return route.reverse is (self.side == "target")
 
 
 def message_type(route: Route, sender: str, config: Config) -> str:
     """Return the message type of a route whose messages come from the node ``sender``.
 
-    The route's own type comes first, then the type that the inventory gives. The result is empty if
-    neither is known.
+    The route's own type comes first, then the type that the inventory lists for the topic at the
+    sender. The result is empty if neither is known.
     """
     known = config.nodes.get(sender)
     return route.type or (known.types.get(route.read_topic, "") if known else "")
@@ -149,7 +149,7 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection with an id, or ``None`` if no claim of this type has it.
+        """Return the connection of this type with an id, or ``None`` if no claim holds it.
 
         Raises:
             Refused: if the type cannot carry the connection.
@@ -169,7 +169,10 @@ class ConnectionType(ABC):
     image: ClassVar[str]
     """The name of the clients' image in the registry."""
     options: ClassVar[frozenset[str]]
-    """The options of a route that the type supports, apart from message type and direction."""
+    """The route options that this connection type supports.
+
+    Message type and direction are not listed, because every type supports them.
+    """
     renames: ClassVar[bool] = False
     """Whether a topic may have another name at the target than at the source."""
     takes_broker: ClassVar[bool] = False
@@ -200,7 +203,7 @@ class ConnectionType(ABC):
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield a fault for each reason why the type cannot link the two nodes of a connection.
 
-        Unknown nodes are skipped; :mod:`demandops.demand.admission` reports them.
+        There is no fault for unknown nodes, because :mod:`demandops.demand.admission` reports them.
         """
 
     def route_faults(
@@ -219,20 +222,21 @@ class ConnectionType(ABC):
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         """Return the connection as clients will carry it, and a note.
 
-        The note says how the connection differs from the demanded one. It is empty if it does not
-        differ. The caller must have checked that the inventory can fulfill the demand.
+        The note says how the returned connection differs from the demanded one, and is empty if
+        there is no difference. The demanded connection may have faults, because the generator
+        checks the connection only after this call.
         """
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the access that a demand of the connection needs, besides the access to its nodes.
+        """Return the access that a demand for the connection needs besides access to its nodes.
 
-        Each item is a field of an access rule, and the value that this field must allow.
+        Each item is a field of a policy's rule, and the value that this field must allow.
         """
         return []
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
-        """Return the keys of the clients that a connection needs: by default, one at each end."""
+        """Return the keys of the clients that a connection needs. By default, each end has one."""
         return ClientKey(self, connection, "source"), ClientKey(self, connection, "target")
 
     @abstractmethod
@@ -241,7 +245,7 @@ class ConnectionType(ABC):
 
         Raises:
             Refused: if connections contradict each other, or the configuration no longer has what
-                they need.
+                the connections need.
         """
 
 
@@ -252,7 +256,9 @@ def make_end(
     config: Config,
     **more: Any,  # noqa: ANN401 - any field
 ) -> AnyEnd:
-    """Return one end of a connection; ``more`` has the fields that only the class ``end`` has.
+    """Return one end of a connection as an instance of ``end``.
+
+    ``more`` has the fields that only the class ``end`` has.
 
     Raises:
         Refused: if the end's node is no longer in the inventory or in an access domain.

@@ -23,12 +23,12 @@ CONNECTION_TYPES: tuple[ConnectionType, ...] = (ZENOH, MQTT, ROS)
 
 
 def type_numbered(number: int) -> ConnectionType | None:
-    """Return the type that has a number in ``DeploymentRequest``, or ``None`` if none has it."""
+    """Return the type with this number in ``DeploymentRequest``, or ``None`` if no type has it."""
     return next((known for known in CONNECTION_TYPES if known.number == number), None)
 
 
 def type_named(word: str) -> ConnectionType:
-    """Return the type that files call ``word``, or raise :class:`KeyError`."""
+    """Return the type whose :attr:`word`, its name in files, is ``word``, or raise ``KeyError``."""
     return {known.word: known for known in CONNECTION_TYPES}[word]
 
 
@@ -72,7 +72,7 @@ def choose_type(connection: Connection, config: Config) -> ConnectionType | None
 
 
 def no_type_fault(connection: Connection, config: Config) -> Fault:
-    """Return a fault that says for each type why it cannot carry a connection."""
+    """Return a fault that says for each type why this type cannot carry a connection."""
     reasons = []
     for kind in CONNECTION_TYPES:
         reason = next(type_faults(kind, connection, config))
@@ -86,8 +86,8 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
     """Yield a fault for each reason why ``kind`` cannot carry a connection.
 
-    The field of a fault is a field of :class:`Connection`. Nodes that are not in the inventory are
-    skipped; :mod:`demandops.demand.admission` reports them.
+    The field of a fault is a field of :class:`Connection`. There is no fault for nodes that are not
+    in the inventory, because :mod:`demandops.demand.admission` reports them.
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:
@@ -96,7 +96,7 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
         yield fault("type", message, code=UNSUPPORTED)
     if connection.broker and not kind.takes_broker:
         able = listed(known for known in CONNECTION_TYPES if known.takes_broker)
-        message = f"a broker is for {able} only, and the type is {kind.name}; leave it out"
+        message = f"a broker is for {able} only, but the type is {kind.name}; leave the broker out"
         yield fault("broker", message)
     if kind.speaks_dds and {*ends.values()} <= config.nodes.keys():
         for end, node in ends.items():
@@ -133,6 +133,6 @@ def route_faults(
             able = listed(known for known in CONNECTION_TYPES if known.renames)
             yield fault(
                 f"{where}.target",
-                f"'{route.source}' cannot become '{route.target}': {kind.name} keeps the name; "
-                f"use one name, or type {able}",
+                f"'{route.source}' cannot become '{route.target}', because {kind.name} keeps the "
+                f"name of a topic; use one name, or type {able}",
             )

@@ -3,8 +3,8 @@
 The parameters are those of ika-rwth-aachen/mqtt_client v2.5. The client cannot drop a bridge while
 it runs, so a change of topics restarts the pod.
 
-The parameters do not contain a broker's user name and password: the pod reads them from a Secret
-(``docs/decisions/0009-credentials-of-brokers.md``).
+The parameters do not contain a broker's user name and password, because the pod reads them from a
+Secret (``docs/decisions/0009-credentials-of-brokers.md``).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from demandops.errors import Fault, Refused, fault
 from demandops.quoting import quoted
 
 CA_FILE = "/tls/ca.crt"
-"""The path where the certificate of the broker's authority is mounted."""
+"""The path at which the certificate of the CA that signs for the broker is mounted."""
 
 _NO_BROKER = "no-broker"
 
@@ -56,7 +56,7 @@ class Mqtt(ConnectionType):
             yield fault("images", message).within(IMAGES_FILE)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if the connection has no broker (:func:`choose_broker`)."""
+        """Yield a fault if :func:`choose_broker` finds no broker for the connection."""
         if not {connection.source, connection.target} <= config.nodes.keys():
             return
         if choose_broker(connection, config) is not None:
@@ -87,8 +87,8 @@ class Mqtt(ConnectionType):
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         """Return the connection, and a note if it gets another broker than it names.
 
-        A named broker is replaced if :func:`choose_broker` chooses another one. A connection that
-        names no broker stays as it is.
+        A connection that names no broker stays as it is. In a connection that names one, the broker
+        that :func:`choose_broker` chooses replaces the named broker.
         """
         broker = choose_broker(connection, config)
         if not connection.broker or broker is None or broker.node == connection.broker:
@@ -100,7 +100,7 @@ class Mqtt(ConnectionType):
         return replace(connection, broker=broker.node), note
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the broker as the value that ``brokers`` of an access rule must allow."""
+        """Return the broker's node as the value that ``brokers`` of a policy's rule must allow."""
         broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
@@ -128,8 +128,9 @@ MQTT = Mqtt()
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
     """Return the broker of a connection, or ``None`` if no broker fits.
 
-    The choice is that of the reference. If there is only one broker, it is chosen. Otherwise it is
-    the broker on the named node, or else on the target, or else on the source.
+    The choice is that of the reference. If there is only one broker, it is chosen. If there are
+    several, the choice is the first that exists of the broker on the node that the connection
+    names, the broker on the target, and the broker on the source.
     """
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))
@@ -152,7 +153,7 @@ class MqttEnd(End):
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Return the entries of the clients' settings and of the broker."""
+        """Yield the entries that :class:`End` yields, and the broker's entry."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield (
@@ -162,7 +163,10 @@ class MqttEnd(End):
         )
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
-        """Return the ROS domain, and the middleware if the image does not choose it."""
+        """Return the variables that set the ROS domain and the middleware.
+
+        Without a variable for the middleware, the image chooses it.
+        """
         ros = self.node.ros
         rmw = (isinstance(settings, MqttClientSettings) and settings.rmw) or ros.rmw
         chosen = {} if rmw == "image" else {"RMW_IMPLEMENTATION": rmw}

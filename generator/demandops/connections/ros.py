@@ -1,8 +1,7 @@
 """ROS connections: each end is an eProsima DDS-Router that links the node to the other end.
 
-The configuration has the format v5.0, as DDS-Router v3.5 reads it. A running router accepts a new
-allowlist from the mounted file, which it reads again at an interval. Any other change restarts the
-pod.
+The configuration has the format v5.0, as DDS-Router v3.5 reads it. A running router reads the
+mounted file again at an interval and accepts a new allowlist. Any other change restarts the pod.
 """
 
 from __future__ import annotations
@@ -55,22 +54,19 @@ class Ros(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield a fault if the message type is unknown.
-
-        Yield another one if durability is set without reliability.
-        """
+        """Yield a fault for an unknown message type, and for durability without reliability."""
         if sender in config.nodes and not message_type(route, sender, config):
             yield fault(
                 f"{where}.type",
-                f"the message type of '{route.source}' is not known, and ROS needs it; give it in "
-                "the request if it has a field for it, or add it to types of "
-                f"'{sender}' in {config.file_of(NODES_FILE, sender)}",
+                f"the message type of '{route.source}' is not known, and ROS needs it; give the "
+                "type in the request, if the request has a field for it, or add the type to types "
+                f"of '{sender}' in {config.file_of(NODES_FILE, sender)}",
             )
         if route.durability and not route.reliability:
             yield fault(
                 f"{where}.reliability",
                 f"is not given, but durability of '{route.source}' is set; ROS needs both, so "
-                "add it",
+                "add reliability",
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
@@ -85,7 +81,8 @@ class Ros(ConnectionType):
         )
         listener = _listener(connection, config)
         if listener is None or listener.wan is None:
-            message = f"connection '{key.id}' has no end with a wan address any longer; restore one"
+            message = f"connection '{key.id}' has no end with a wan address any longer; "
+            message += "restore wan at one end"
             raise Refused.at("connections", message, code=UNSUPPORTED)
         port = _port(key.id, listener.wan)
         for other in connections.at(listener.id):
@@ -95,8 +92,9 @@ class Ros(ConnectionType):
             if found is not None and _listener(found, config) is listener:
                 message = (
                     f"connection '{key.id}' would listen on port {port} of "
-                    f"'{listener.id}', but '{other}' listens there; use another connection id, or "
-                    f"widen firstPort and lastPort under wan of '{listener.id}'"
+                    f"'{listener.id}', but connection '{other}' already does; use another "
+                    "connection id, or widen the range from firstPort to lastPort under wan of "
+                    f"'{listener.id}'"
                 )
                 raise Refused.at("connections", message, code=UNSUPPORTED)
         connection = replace(connection, topics=typed)
@@ -121,13 +119,16 @@ def _listener(connection: Connection, config: Config) -> Node | None:
 
 
 def _port(connection: str, wan: Wan) -> int:
-    """Return a connection's port; it depends only on the connection id and the port range."""
+    """Return a connection's port, which depends only on the connection id and the port range."""
     return wan.first_port + _number(connection) % (wan.last_port - wan.first_port + 1)
 
 
 @lru_cache(maxsize=65_536)
 def _number(connection: str) -> int:
-    """Return a number that depends on the connection id only; it is cached for fast comparisons."""
+    """Return a number that depends only on the connection id.
+
+    The result is cached, because the ports of all connections at a node are compared.
+    """
     return int(naming.digest("port", connection), 16)
 
 
@@ -136,7 +137,7 @@ class RosEnd(End):
     """One end of a ROS connection. Each route in ``topics`` has its message type set."""
 
     listener: str
-    """The node that listens, at ``port`` of its address ``wan``."""
+    """The id of the node that listens; its address is ``wan``, and its port is ``port``."""
     wan: Wan
     port: int
 
@@ -148,8 +149,8 @@ class RosEnd(End):
         """Return the configuration of one end's router.
 
         A topic passes only from the end that reads it to the end that writes it. The general routes
-        are for topics that come from the source. Most topics do, so a new topic needs no route of
-        its own and no restart.
+        are for topics that come from the source. Most topics do, so most new topics need no route
+        of their own and no restart.
         """
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []
@@ -186,7 +187,7 @@ class RosEnd(End):
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """Return the configuration without the list of topics.
 
-        A running router reads that list again when it changes, so it needs no restart.
+        A running router reads the list again, so a change of the list needs no restart.
         """
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 

@@ -1,7 +1,7 @@
 """Routes: one topic of a connection, with its names, direction and options.
 
-Requests and claims contain :class:`Route`, and clients are configured from it. This module knows
-the valid options; each connection type knows which of them it supports.
+Requests and claims contain routes, and the configuration of clients follows from the routes. This
+module knows all valid options. Each connection type knows which of these options it supports.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from demandops.quoting import quoted
 class Route:
     """One topic that a connection carries.
 
-    ``source`` is its name on the source node, ``target`` on the target node. With ``reverse``
-    messages go from the target to the source. ``type`` is the ROS message type
+    ``source`` is the topic's name on the source node, and ``target`` its name on the target node.
+    With ``reverse``, messages go from the target to the source. ``type`` is the ROS message type
     (``std_msgs/msg/String``), empty if not given. The options are ``qos`` (MQTT, 0 to 2),
     ``retained`` and ``primitive`` (MQTT), ``reliability``, ``durability`` and ``queue`` (of the ROS
-    endpoints), ``rate`` (the highest rate in Hz; 0 for all messages). An option with its default
-    leaves the client's own behavior unchanged.
+    endpoints), and ``rate`` (the highest rate in Hz; 0 for all messages). An option that has its
+    default leaves the client's own behavior unchanged.
     """
 
     source: str
@@ -43,19 +43,19 @@ class Route:
     rate: float = 0.0
 
     def options(self) -> dict[str, Any]:
-        """Return option → value for each option that differs from its default."""
+        """Return the options that differ from their defaults, as a map from option to value."""
         return {
             name: value for name, default in _DEFAULTS if (value := getattr(self, name)) != default
         }
 
     @property
     def read_topic(self) -> str:
-        """The topic on the node that messages come from."""
+        """The topic's name on the node that the messages come from."""
         return self.target if self.reverse else self.source
 
     @property
     def written_topic(self) -> str:
-        """The topic on the node that messages go to."""
+        """The topic's name on the node that the messages go to."""
         return self.source if self.reverse else self.target
 
     @property
@@ -69,7 +69,7 @@ class Route:
     def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
         """Return the node that sends the topic, and the node that receives it.
 
-        ``source`` and ``target`` are the nodes of the connection.
+        ``source`` and ``target`` are the nodes at the ends of the connection.
         """
         return (target, source) if self.reverse else (source, target)
 
@@ -107,7 +107,7 @@ class RouteOptions(FrozenModel):
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
-    """Yield the faults of a connection's routes that do not depend on the connection's type."""
+    """Yield the faults that a connection's routes have, whatever the type of the connection."""
     targets: dict[str, Route] = {}
     carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):
@@ -132,8 +132,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.target)} is carried back to {quoted(carried_back[route.target])} "
-                f"and to {quoted(route.source)}; one topic goes to one place, so use a second "
-                "connection",
+                f"and to {quoted(route.source)}; a connection carries a topic back to only one "
+                "topic, so use a second connection",
             )
 
 
@@ -156,8 +156,8 @@ def _shown(value: object) -> str:
 def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
     """Return one route for each source topic, sorted by source topic.
 
-    If several routes have the same source topic, the first route with a message type is kept, or
-    else the first route.
+    If several routes have the same source topic, the first route with a message type is kept. If
+    none of them has a message type, the first route is kept.
     """
     merged: dict[str, Route] = {}
     for route in routes:

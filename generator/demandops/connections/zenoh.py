@@ -1,7 +1,7 @@
 """Zenoh connections: each node has one zenoh-bridge-ros2dds for all its connections.
 
 Two bridges must not share a host and a ROS domain. The configuration is that of
-eclipse-zenoh/zenoh-plugin-ros2dds 1.10. A bridge reads it only at its start.
+eclipse-zenoh/zenoh-plugin-ros2dds 1.10. A bridge reads its configuration only at its start.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Zenoh(ConnectionType):
     options = frozenset({"rate"})
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield a fault for each further bridge on the same host and ROS domain."""
+        """Yield a fault for each bridge that shares host and ROS domain with an earlier bridge."""
         hosts: dict[tuple[object, ...], str] = {}
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
@@ -54,7 +54,7 @@ class Zenoh(ConnectionType):
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if a node has no bridge, or if neither bridge can reach the other."""
+        """Yield a fault if a node has no bridge, or if there is no route between both bridges."""
         source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:
             return
@@ -63,8 +63,8 @@ class Zenoh(ConnectionType):
                 yield fault(
                     end,
                     f"'{node.id}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to it in "
-                    f"{config.file_of(NODES_FILE, node.id)}, or zenoh: {{}} if it can reach "
-                    "others",
+                    f"{config.file_of(NODES_FILE, node.id)}, or zenoh: {{}} if the "
+                    "node can reach other bridges",
                     code=UNSUPPORTED,
                 )
         if source.zenoh is None or target.zenoh is None or source.id == target.id:
@@ -84,7 +84,7 @@ class Zenoh(ConnectionType):
         return ClientKey(self, source), ClientKey(self, target)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
-        """Return the bridge of a node, or ``None`` if it carries no topic."""
+        """Return the bridge of a node, or ``None`` if the bridge would carry no topic."""
         publishers: dict[str, tuple[float, str]] = {}
         subscribers: set[str] = set()
         peers: dict[str, str] = {}
@@ -181,7 +181,7 @@ class Bridge(Client):
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of a node's bridge.
 
-        ``allow`` lists the topics that pass. If ``publishers`` or ``subscribers`` is missing there,
+        ``allow`` lists the topics that pass. If ``allow`` lacks ``publishers`` or ``subscribers``,
         no topic of that kind passes. Multicast scouting is off, because the state repo defines
         which bridges connect.
         """

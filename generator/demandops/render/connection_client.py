@@ -1,8 +1,9 @@
 """The file of a communication client: a Deployment, and a ConfigMap with its configuration.
 
 Each connection type has a template and a schema in ``templates/connections/<type>/``. The schemas
-are part of DemandOps and list the fields that each client program reads. Without this check, an
-unknown field would be noticed only on the node: the program ignores the field or crashes.
+are part of DemandOps and list the fields that each client program reads. A configuration is checked
+against its schema, because an unknown field would otherwise be noticed only on the node, where the
+program ignores the field or crashes.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ def render(client: Client, config: Config, engine: Engine) -> str:
     """Return the manifests of a client as one YAML text.
 
     Raises:
-        InvalidInput: if the client's configuration has a field that the client does not read.
+        InvalidInput: if the configuration does not match the schema of the connection type, or if
+            an override's patch gives no valid settings.
         Refused: if the registry has no image for the client.
     """
     kind, node = client.type, client.node
@@ -64,8 +66,8 @@ def check_configuration(kind: str, configuration: dict[str, Any], client: str) -
     """Check the configuration of a client against the schema of its connection type.
 
     Raises:
-        InvalidInput: if fields do not match; the error names each of them. The cause is a fault of
-            DemandOps, not of a demand.
+        InvalidInput: if fields do not match the schema. The error names each of these fields. The
+            cause is a mistake in DemandOps, not in a demand.
     """
     schema = data_folder("templates") / "connections" / kind / "schema.json"
     faults = [

@@ -1,8 +1,8 @@
 """The template engine: strict Jinja2 that writes every value as JSON.
 
-``{{ x }}`` writes one JSON value, so a value cannot change the structure of the YAML. Undefined
-names fail. The program's templates come from its ``templates`` folder. Templates of appdefs come
-from the configuration and run in a sandbox.
+``{{ x }}`` writes one JSON value, so a value cannot change the structure of the YAML. An undefined
+name is an error. The program's own templates come from its ``templates`` folder. Templates of
+appdefs come from the configuration and run in a sandbox.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _TEMPLATE_FAULTS = (
     RecursionError,
     SyntaxError,
     MemoryError,
-)  # errors that a template causes and that its author must fix
+)  # errors that a template causes, so that the template's author must fix them
 
 _MAX_LENGTH = 100_000
 """How many characters a values template may have."""
@@ -59,7 +59,7 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the template's text, its path, and a function that reports it as up to date."""
+        """Return the text of a template, its path, and a function that says the text is current."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]
@@ -78,7 +78,7 @@ class _CompiledTemplates(BytecodeCache):
         self._kept: dict[tuple[str, str], CodeType] = {}
 
     def load_bytecode(self, bucket: Bucket) -> None:
-        """Set the bucket's code to the kept code of its template; None if there is none."""
+        """Set the bucket's code to the kept code of its template, or to None if no code is kept."""
         bucket.code = self._kept.get((bucket.key, bucket.checksum))
 
     def dump_bytecode(self, bucket: Bucket) -> None:
@@ -93,7 +93,7 @@ def _finalize(value: object) -> object:
     if isinstance(value, _Verbatim):
         return value
     if isinstance(value, Undefined):
-        str(value)  # StrictUndefined raises here and names what is missing
+        str(value)  # StrictUndefined raises an error here that names what is missing
     return strict_yaml.to_json(_plain(value))
 
 
@@ -155,12 +155,15 @@ class Engine:
         self._files = files
         own, config = FileSystemLoader(data_folder("templates")), _FilesLoader(files)
         self._own = Environment(loader=own, bytecode_cache=_OWN_COMPILED, **_OPTIONS)  # noqa: S701 - YAML, not HTML
-        del self._own.filters["tojson"]  # every value becomes JSON anyway; twice would add quotes
+        del self._own.filters["tojson"]  # _finalize writes JSON; tojson would quote the JSON again
         self._own.filters |= _FILTERS
         self._config = Sandbox(_FILTERS, loader=config, bytecode_cache=_CONFIG_COMPILED, **_OPTIONS)
 
     def text(self, template: str, **context: object) -> str:
-        """Return the rendered text of a program's template, such as ``flux/release.yaml.j2``."""
+        """Return the rendered text of one of the program's templates.
+
+        A template is named by its path in the ``templates`` folder, like ``flux/release.yaml.j2``.
+        """
         return self._own.get_template(template).render(**context)
 
     def data(
@@ -184,7 +187,8 @@ class Engine:
         try:
             with budget():
                 compiled: Template = self._config.get_template(template)
-            with budget():  # a new budget, because the template may be compiled already
+            # a new budget, so that it does not matter whether the template was compiled before
+            with budget():
                 text = compiled.render(**context)
             values = _mapping(text, template)
             check(values)

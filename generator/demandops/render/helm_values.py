@@ -1,7 +1,7 @@
-"""The Helm values of a service: its appdef's template, rendered and checked against the chart.
+"""The Helm values of a service: what its template renders to, checked against the chart.
 
 The variables that the template gets are the interface of application definitions
-(docs/appdef.md). Requesters are not among them.
+(docs/appdef.md). Requesters are not among these variables.
 """
 
 from __future__ import annotations
@@ -45,9 +45,10 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
 
 
 def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
-    """Yield the faults of a template.
+    """Yield the faults of a template, with a note in each message.
 
-    Each message also names the overrides that change the variables of the template.
+    The note names the overrides that change the variables of the template. Without such overrides,
+    the messages have no note.
     """
     changing = {"version", "images", "replicas", "node"}
     files = [override.path for override, effects in release.shaping.by if changing & {*effects}]

@@ -57,7 +57,8 @@ def check_values(
         template: the path of the file that the values come from: a template or an override.
 
     Raises:
-        InvalidInput: if values do not match the schema; it names ``template`` and each value.
+        InvalidInput: if values do not match the schema. The error names ``template`` and each of
+            these values.
     """
     schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:
@@ -78,11 +79,11 @@ def check_values(
 
 
 def check_files(files: Mapping[str, str | None]) -> None:
-    """Check files that are about to be committed; ``None`` removes a file.
+    """Check files that are about to be committed. A file with the text ``None`` is removed.
 
     Raises:
-        InvalidInput: if a file is not valid; it lists all faults. Their cause is DemandOps or a
-            template, not a demand.
+        InvalidInput: if a file is not valid. The error lists all faults. Their cause is a mistake
+            in DemandOps or in a template, not in a demand.
     """
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
@@ -100,10 +101,10 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield the documents of a file, and append the faults of the others to ``faults``.
+    """Yield the valid documents of a file, and append the faults of the others to ``faults``.
 
-    Documents for Flux and Argo CD are yielded without their ``spec``, which needs no check here: a
-    template of the program writes it, and :func:`check_values` checks the values in it.
+    Documents for Flux and Argo CD are yielded without their ``spec``. It needs no check here,
+    because a template of the program writes it and :func:`check_values` checks the values in it.
     """
     for part in text.split("\n---\n"):
         api = _API.search(part)
@@ -148,7 +149,7 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
 
 @lru_cache(maxsize=64)
 def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
-    """Return the validator for a built-in kind of Kubernetes."""
+    """Return the validator for objects of a kind that is built into Kubernetes."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
     package = find_spec("kubernetes_validate")  # only its files are used; an import is slow

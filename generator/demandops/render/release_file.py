@@ -1,7 +1,7 @@
 """The file of a release: comment lines that name the overrides, then the rendered body.
 
 A ``hold`` override keeps the body of a file byte for byte. Only the comments above the body may
-change. They still name the overrides that shaped the body when the hold started.
+change. These comments still name the overrides that shaped the body when the hold started.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
-"""Effects that do not change the body; their comments are updated even if the body is held."""
+"""Effects that do not change the body, so that their comments change even if the body is held."""
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
@@ -76,7 +76,7 @@ def split_comments(text: str) -> tuple[list[str], str]:
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
-    """Return path → text of the chart sources to keep because a held release may still use them.
+    """Return the chart sources to keep because a held release may still use them, by path.
 
     If the files of a chart are in the state repo, the old source is not kept, because it would
     fetch the changed chart.
@@ -84,7 +84,7 @@ def kept_charts(
     Args:
         files: the new generated files.
         current: the generated files in the state repo.
-        world: the overrides that apply.
+        world: the world, whose overrides say whether a release is held.
     """
     if not any(override.hold for override in world.overrides):
         return {}

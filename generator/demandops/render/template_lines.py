@@ -11,7 +11,10 @@ from demandops.errors import Fault
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")
 _LONGEST = 2_000
-"""The highest number of characters of a line to search for; a longer line could take too long."""
+"""The most characters that a searched line may have.
+
+The search for a longer line could take too long.
+"""
 _VALUES = "values."
 
 
@@ -24,7 +27,7 @@ class TemplateLines:
         self._fields: dict[str, int] | None = None
 
     def located(self, fault: Fault) -> Fault:
-        """Return a fault of the rendered text, with the line of the template if it is known."""
+        """Return a fault of the rendered text, with the template's line if this line is known."""
         place = _PLACE.match(fault.field)
         number = int(place[1]) if place else self._number_of(fault.field.removeprefix(_VALUES))
         return replace(fault, line=fault.line or (self._line_of(number) if number else None))
@@ -38,7 +41,7 @@ class TemplateLines:
         """Return the number of the template's line that produced a line of the rendered text.
 
         Prefer an identical line of the template to a line with expressions. Return None if no line
-        or more than one line may have produced it.
+        of the template, or more than one, may have produced the rendered line.
         """
         if number > len(self._rendered) or len(self._rendered[number - 1]) > _LONGEST:
             return None
@@ -52,7 +55,8 @@ class TemplateLines:
 def _may_write(line: str, rendered: str) -> bool:
     """Return whether a line of a template may have produced a rendered line.
 
-    The line needs expressions, and the rendered line must contain all text around them in order.
+    The template's line must have expressions, and the rendered line must contain all text around
+    these expressions in the same order.
     """
     first, *others = _EXPRESSION.split(line)
     if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):

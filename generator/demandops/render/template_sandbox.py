@@ -3,7 +3,7 @@
 Each loop, call, filter and comparison takes steps from a budget. The number of steps depends on the
 size of the values, and no value can become large. So a template that exceeds the budget fails at
 the same place on every machine. Templates can use only the filters and methods that this module
-lists: the others give random results, expose memory addresses, or make HTML.
+lists, because the others give random results, expose memory addresses, or make HTML.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_STEPS = 1_000_000
 A template with 100 topics takes several thousand steps.
 """
 MAX_LENGTH = 1_000_000
-"""How many characters a text may have. Kubernetes accepts objects of at most 1.5 MB."""
+"""How many characters a text may have, because Kubernetes accepts objects of at most 1.5 MB."""
 MAX_SIZE = 100_000
 """How many parts a value may have. An item, a key and 16 characters of text each count as one."""
 _MAX_BITS = 1024
@@ -57,7 +57,7 @@ _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
 """Filters that call another filter or test for each item; each call takes its own steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
-"""Slow filter → the factor by which it takes more steps than other filters."""
+"""Slow filter → the factor by which its steps are multiplied."""
 _PADDING = frozenset(
     {"batch", "center", "indent", "literal", "block", "round", "slice", "truncate"}
 )
@@ -103,7 +103,7 @@ def budget() -> Iterator[None]:
 
 
 def _size(value: object, *, data: bool = True) -> int:
-    """Return the size of a value with all its parts; a part that occurs twice counts twice.
+    """Return the size of a value with all its parts. A part that occurs twice counts twice.
 
     With ``data``, raise SecurityError for an object that is no text, number, list or mapping. Its
     text could contain a memory address, which differs between machines.
@@ -137,7 +137,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Take as many steps as a new value has parts; return it, with iterators as lists."""
+    """Return a new value (a list for an iterator), and take as many steps as it has parts."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
@@ -152,7 +152,7 @@ def _refuse_large(name: str, size: int, most: int = MAX_LENGTH) -> None:
 
 
 def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
-    """Raise SecurityError if the text of ``values`` in the format ``form`` may be too large."""
+    """Raise SecurityError if formatting ``values`` with ``form`` may give too large a text."""
     if _WIDTH_AS_ARGUMENT.search(form):
         _refuse_large(name, MAX_LENGTH + 1)
     fields = form.count("%") + form.count("{")
@@ -161,7 +161,7 @@ def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
 
 
 def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
-    """Raise SecurityError if a filter or method may give too large a result for its arguments."""
+    """Raise SecurityError if a filter or method may give too large a result for these values."""
     subject, *others = values or ("",)
     if name in _PADDING or name in ("ljust", "rjust", "zfill"):
         numbers = [abs(each) for each in others if isinstance(each, int)]
@@ -305,7 +305,10 @@ def _is_text(node: nodes.Const) -> bool:
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox with a budget. Templates work only in a block of :func:`budget`."""
+    """Jinja's sandbox with a budget.
+
+    Templates can be compiled and rendered only inside a ``with`` block of :func:`budget`.
+    """
 
     intercepted_binops = frozenset({"+", "*", "**", "%"})
 
@@ -371,7 +374,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _kept(super().call_binop(context, operator, left, right))
 
     def getitem(self, obj: Any, argument: Any) -> Any:  # noqa: ANN401
-        """Return an item of a value; if the key is a tuple, take as many steps as it has parts."""
+        """Return an item of a value. A key that is a tuple takes as many steps as it has parts."""
         if isinstance(argument, tuple):
             _budget.get().take(_size(argument))
         return super().getitem(obj, argument)

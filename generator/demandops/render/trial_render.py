@@ -1,4 +1,4 @@
-"""A check of a new configuration: render it for invented demands before real ones arrive."""
+"""Checks a new configuration by rendering invented demands, before real demands arrive."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return appdef → the releases of its services for a trial demand, without overrides.
+    """Return a map from each appdef to the releases that a trial demand for the appdef gives.
 
-    Each trial demand names the first suitable node (:func:`_trial_node`). Without a node in an
-    access domain there are no trials.
+    Overrides do not apply. Each trial demand names the first suitable node (:func:`_trial_node`).
+    If no node is in an access domain, there are no trial demands.
 
     Raises:
         Refused: if a service cannot be planned.
@@ -85,7 +85,7 @@ def _services(
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases that an override may select, with its effects except ``hold``."""
+    """Yield the trial releases that an override may select, changed by its effects but ``hold``."""
     for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(
@@ -105,8 +105,8 @@ def render_trial_demands(world: World, engine: Engine) -> None:
     An override counts as faulty only if no appdef that it applies to can be rendered with it.
 
     Raises:
-        Refused, InvalidInput: if a service cannot be planned or rendered; it names the template,
-            the values or the override at fault.
+        Refused, InvalidInput: if a service cannot be planned or rendered. The error names the
+            template, the values or the override at fault.
     """
     config = world.config
     invented = trial_releases(config)

@@ -34,7 +34,7 @@ _TOO_MUCH = (
 
 @lru_cache(maxsize=256)
 def validator(text: str, file: str) -> Any:  # noqa: ANN401
-    """Return the validator for a schema, given the text and the path of its file.
+    """Return the validator for a schema, given the text and the path of the schema's file.
 
     Raises:
         InvalidInput: if ``text`` is not a valid schema, refers to another document, or applies too
@@ -93,7 +93,7 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return the highest number of schemas that ``schema`` applies to values of this depth.
+        """Return the most schemas that ``schema`` may apply to a value of ``depth`` nested levels.
 
         Raises:
             RecursionError: if a schema applies itself to the same value, or the number is too high.
@@ -102,7 +102,7 @@ class _Work:
             return 1
         key = (id(schema), depth)
         if key not in self._known:
-            # above the limit while it is computed, so that a schema that applies itself is refused
+            # above the limit while the number is computed, to refuse a schema that applies itself
             self._known[key] = _MAX_WORK + 1
             self._known[key] = self._counted(schema, depth)
         work = self._known[key]
@@ -128,7 +128,8 @@ class _Work:
     def _target(self, reference: object) -> object:
         """Return the schema that a reference names.
 
-        A path (``#/…``) to nothing gives None. An unknown anchor gives the whole document.
+        For a path (``#/…``) to nothing, return None. For an unknown anchor, return the whole
+        document.
         """
         found = self._anchors.get(str(reference), self._document)
         if not isinstance(reference, str) or not reference.startswith("#/"):

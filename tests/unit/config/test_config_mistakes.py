@@ -46,7 +46,7 @@ def argocd(**section: object) -> dict[str, str]:
 
 
 def second_definition(*edits: tuple[str, str]) -> dict[str, str]:
-    """Return a copy of the application definition in another folder, with texts replaced."""
+    """Return a copy of the application definition in the folder ``copy``, with edits."""
     copy = {
         path.replace("object-detection-fusion/", "copy/", 1): text
         for path, text in skeleton().items()
@@ -72,7 +72,7 @@ TWICE = second_definition(
     ("prefix: of", "prefix: cp"),
     ("object-fusion:\n", "copy-fusion:\n"),
 )
-"""A second application definition; it too defines the detection service of the first one."""
+"""A second application definition that also defines the detection service of the first one."""
 SERVICE = "appdefs/driver/service.yaml"
 
 
@@ -81,9 +81,9 @@ def shared(
     uses: str = "{cloud: point_cloud}",
     more: Mapping[str, str] | None = None,
 ) -> dict[str, str]:
-    """Return the files of a shared service that the application uses.
+    """Return the files of a shared service, and of the application definition that uses it.
 
-    ``edits`` replace texts in the definition of the service.
+    ``edits`` replace texts in the definition of the service. ``more`` are further files.
     """
     definition = """
 apiVersion: demandops/v1
@@ -280,7 +280,7 @@ _SCALING: dict[str, str] = {
 
 
 def scaled(scaling: str) -> Mapping[str, str | None]:
-    """Return the application definition with two parameters and this ``scaling`` of the fusion."""
+    """Return the application definition with two parameters, and ``scaling`` for the fusion."""
     parameters = "parameters: {size: {default: s}, rate: {default: s, merge: max}}\nservices:\n"
     text = edited(APPDEF, "services:\n", parameters)[APPDEF]
     return {APPDEF: text.replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")}
@@ -308,7 +308,7 @@ MISTAKES: dict[str, Mapping[str, str | None]] = {
         f"{_FUSION}    place:\n"
         "      properties: {a: {min: 8, max: 7}, b: {least: 1}, c: {min: x}}\n",
     ),
-    # several places or files
+    # mistakes at several places or in several files
     "a chart without metadata": {f"{CHART}/Chart.yaml": "version: [\n"},
     "every node of an unknown cluster": {
         CLUSTERS: "apiVersion: demandops/v1\nkind: Clusters\nclusters: [{name: west}]\n"
@@ -408,7 +408,7 @@ uses:
         },
     ),
 }
-"""Configurations that are refused: for each, the files that differ from the skeleton's."""
+"""Name of a mistake → the files that differ from the skeleton; the configuration is refused."""
 
 
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
@@ -420,7 +420,7 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
 
 @pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
 def test_an_id_that_is_no_label_needs_a_selector(id: str) -> None:
-    """Without a selector, a release would select ``node_id: <id>``; the API server refuses that."""
+    """Without a selector, a release selects ``node_id: <id>``, which the API server refuses."""
     (found,) = refused(edited(NODES, V1, f'- id: "{id}"\n'))
     assert found.file == NODES
     assert "selector" in str(found)

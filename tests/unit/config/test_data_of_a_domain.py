@@ -32,7 +32,11 @@ CONNECTION = {
 
 
 def domains(fleet: str = "", city: str = "") -> dict[str, str]:
-    """Return a policy with the access domains `fleet` and `city`; each text adds fields to one."""
+    """Return a policy with the access domains `fleet` and `city`.
+
+    ``fleet`` and ``city`` are further fields of these domains. By default, these fields are rules
+    that permit everything.
+    """
     return {
         DOMAINS: f"""
 apiVersion: demandops/v1
@@ -45,7 +49,7 @@ domains:
 
 
 def clients(files: dict[str, str]) -> dict[str, Any]:
-    """Return the pod spec of each end of a connection between both domains, by node."""
+    """Send a demand for a connection between both domains. Return each end's pod spec, by node."""
     books = MemoryRepo(files)
     books.send(CONNECTION)
     pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]

@@ -36,7 +36,7 @@ PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
 
 
 def domain(**fields: Any) -> dict[str, str]:
-    """Return the policy, with these fields added to its access domain."""
+    """Return the skeleton's policy, with these fields added to its access domain."""
     text = "".join(f"\n    {name}: {value}" for name, value in fields.items())
     return edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]{text}')
 
@@ -110,12 +110,13 @@ def test_the_list_of_the_documentation_is_taken() -> None:
     [
         (
             {"kinds": "[ConfigMap, Deployment, Secrets]"},
-            ".kinds[2]: 'Secrets' is not a kind that is known by its name; give kind, group and "
+            ".kinds[2]: 'Secrets' is not a kind that one word can name; give kind, group and "
             "resource; did you mean 'Secret'?",
         ),
         (
             {"kinds": "[ConfigMap]"},
-            ": kinds: needs Deployment and Secret for connections and Helm's releases; add it",
+            ": kinds: lacks Deployment and Secret, but connections and Helm's releases need them; "
+            "add what is missing",
         ),
         (
             {"kinds": f"[{', '.join(KINDS)}]", "network": "namespace"},

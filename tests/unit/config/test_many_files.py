@@ -1,4 +1,4 @@
-"""A collection may be in one file or in many: its entries and their faults are the same.
+"""A collection may be in one file or in many, without any difference for entries and faults.
 
 The examples come from docs/inventory.md.
 """
@@ -44,7 +44,7 @@ def faults(changed: Mapping[str, str | None]) -> str:
 
 
 def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
-    """Move entries of each collection at random to other files in the collection's folder."""
+    """Move random entries of each collection to other files in the collection's folder."""
     result = dict(files)
     for path in {*COLLECTIONS} & {*files}:
         data, parts = plain_yaml.load(result.pop(path)), dict[str, dict[str, Any]]()
@@ -52,7 +52,8 @@ def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
         head = {name: data.pop(name) for name in heads if name in data}
         for name, entries in data.items():
             for key in entries if isinstance(entries, dict) else range(len(entries)):
-                if path != CLIENTS_FILE or key == next(iter(entries)):  # a type stays in one file
+                # the settings of a connection type must stay in one file
+                if path != CLIENTS_FILE or key == next(iter(entries)):
                     place = path.replace(".yaml", random.choice([".yaml", "/a.yaml", "/b.yaml"]))
                 part = parts.setdefault(place, dict(head))
                 if isinstance(entries, dict):
@@ -142,7 +143,7 @@ def test_a_fault_in_one_of_many_files_names_the_file_and_the_field() -> None:
     second = "policy/access-domains/other.yaml"
     assert faults({second: domains}) == (
         f"{second}: domains[0].namespace: 'perception' is already the namespace of 'perception'; "
-        "give each its own\n"
+        "give each its own namespace\n"
     )
 
 

@@ -36,7 +36,7 @@ def form_of(file: str) -> Form:
 
 
 class Loader:
-    """Loads a configuration with one file given as parsed data, and parses the others only once."""
+    """Loads a configuration with one file given as parsed data. Parses other files only once."""
 
     def __init__(self, files: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
         self._files = files
@@ -71,7 +71,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
     problems = []
     for mutation in mutations.mutations(document, form_of(file).limits()):
         found = loader.faults(file, mutation.document)
-        if file == DOMAINS:  # an invalid domain has no nodes, and overrides report that too
+        if file == DOMAINS:  # an invalid domain has no nodes, so overrides have faults too
             found = [one for one in found if one.file == file or "access domain" not in one.message]
         free = FREE_PLACES if file != "registry/charts.yaml" else ()
         problems.append(mutations.problem(mutation, found, form_of(file), free=free, file=file))
@@ -79,7 +79,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
 
 
 def test_every_field_of_every_file_is_tried() -> None:
-    # they belong to a scope that the rich configuration lacks; tests/unit/plan tries them
+    # these two belong to scopes that the rich configuration lacks; tests/unit/plan tries them
     tried = {"ServiceDefinition.nodes", "ServiceDefinition.place"}
     for files, file in DOCUMENTS:
         tried |= form_of(file).fields_in(strict_yaml.load(files()[file]))

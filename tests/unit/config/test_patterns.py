@@ -1,4 +1,4 @@
-"""Each field that has a pattern also describes in words which values it accepts."""
+"""For each pattern of a field, ``PATTERN_WORDS`` says in words which values match."""
 
 from __future__ import annotations
 

@@ -180,19 +180,19 @@ def test_a_node_that_leaves_leaves_all_its_domains() -> None:
         (
             [{"name": "fleet"}],
             (FLEET, CITY),
-            "accessDomains[0].name: 'edge' is in 'fleet' already, or 'edge@fleet' is a node; "
-            "remove this, or the other",
+            "accessDomains[0].name: 'edge' is already in 'fleet', or a node has the id "
+            "'edge@fleet'; remove this entry or the other one",
         ),
         (
             [{"name": "city"}, {"name": "city"}],
             (FLEET, CITY),
-            "accessDomains[1].name: 'edge' is in 'city' already, or 'edge@city' is a node; "
-            "remove this, or the other",
+            "accessDomains[1].name: 'edge' is already in 'city', or a node has the id "
+            "'edge@city'; remove this entry or the other one",
         ),
         (
             [{"name": "city"}],
             ({**FLEET, "nodes": ["vehicle*"]}, CITY),
-            "accessDomains[0]: 'edge' is in the nodes of no access domain; add it to one",
+            "accessDomains[0]: no access domain has 'edge' in its nodes; add it to one",
         ),
         (
             [{"name": "city"}],

@@ -1,4 +1,4 @@
-"""For a mistake in an appdef's values template, the message names the template and the line."""
+"""The message about a mistake in an appdef's values template names the template and the line."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
 TOPIC = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 LAST = skeleton()[TEMPLATE].count("\n") + 1
-"""The line number of a text that is appended to the template."""
+"""The number of the line that is appended to the template."""
 
 
 def faults(template: str) -> list[str]:
-    """Send a demand that needs this template; return the faults of the refusal."""
+    """Send a demand that needs this template, and return the faults for which it is refused."""
     books = MemoryRepo({TEMPLATE: template})
     before = dict(books.files)
     with pytest.raises(InvalidInput) as invalid:
@@ -33,7 +33,7 @@ def faults(template: str) -> list[str]:
 
 
 def appended(text: str) -> list[str]:
-    """Return the faults of the skeleton's template with this text at its end."""
+    """Return the faults of the skeleton's template with ``text`` appended."""
     return faults(skeleton()[TEMPLATE] + text)
 
 
@@ -83,7 +83,7 @@ TOO_LARGE = [
     *("'a' | center(1000000000)", "'a' | indent(1000000000, true)"),
     *("[1] | batch(1000000000, 'x') | list", "[1] | slice(1000000000) | list"),
 ]
-"""Expressions whose values would fill the memory; they are refused before they are evaluated."""
+"""Expressions whose values would fill the memory, so they are refused before their evaluation."""
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ class TestValues:
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
-        """A value is written as JSON, in quotes, which become a part of it after other text."""
+        """A template writes a text as JSON, in quotes, which become content after other text."""
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(

@@ -1,8 +1,8 @@
 """A fourth connection type needs one module, its templates, and an entry in the list of types.
 
 This test module is that module. Its client is a relay, which runs at the target and fetches the
-topics of all sources. Nothing else in the program knows the type, but demands for it are booked,
-planned, rendered and explained.
+topics of all sources. Although nothing else in the program knows the type, demands for connections
+of this type are booked, planned, rendered and explained.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class RelayType(ConnectionType):
 
 @dataclass(frozen=True, slots=True)
 class Relay(Client):
-    """The relay of a node, with the topics that it fetches and the names that it gives them."""
+    """The relay of a node. ``fetch`` maps each topic that it fetches to the name at the target."""
 
     fetch: dict[str, str]
 

@@ -1,4 +1,4 @@
-"""`registry/clients.yaml`, an image registry, prefixes and overrides set how clients run."""
+"""The registry, the inventory and overrides decide how clients run."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class World(MemoryRepo):
-    """A state repo in memory, which takes demands in short form, with options for routes."""
+    """A state repo in memory that takes demands in the short form of :func:`demand`."""
 
     def __init__(self, before: State) -> None:
         super().__init__(state=before)
@@ -40,11 +40,11 @@ class World(MemoryRepo):
         return decision
 
     def clients(self) -> dict[str, Any]:
-        """Return the configuration of each client by the client's name."""
+        """Return each client's configuration, by the client's name."""
         return {name: documents[0]["data"] for name, documents in self._pods().items()}
 
     def checksums(self) -> dict[str, str]:
-        """Return each client's checksum by its name; a new checksum restarts the client."""
+        """Return each client's checksum, by name. A new checksum restarts the client."""
         return {
             name: pod["spec"]["template"]["metadata"]["annotations"]["demandops/config-checksum"]
             for name, (_, pod) in self._pods().items()
@@ -190,7 +190,7 @@ class TestRos:
 
 
 class TestMqtt:
-    """Each setting is at the right end of a connection; tests/golden has the options."""
+    """Each setting is at the right end of a connection. tests/golden tests the options."""
 
     def test_a_connection_that_only_brings_back_has_its_ends_turned(self) -> None:
         world = World(state())
@@ -227,7 +227,7 @@ BRIDGED: dict[str, Any] = {"bridged": {"edge": ["/a"]}}
 
 
 class TestBridgedAlready:
-    """Clients carry no topic that the inventory lists as bridged; each client has a topic."""
+    """No client carries a topic that is bridged already, and each client has at least one topic."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_no_client_without_a_topic(self, kind: str) -> None:
@@ -253,7 +253,7 @@ class TestBridgedAlready:
 
 
 class TestWhatPeopleDidInGit:
-    """A person's edit of a claim or the inventory may leave a type unable to carry a connection."""
+    """A person edits a claim or the inventory so that the type cannot carry the connection."""
 
     NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
 
@@ -299,7 +299,7 @@ class TestWhatPeopleDidInGit:
 
 
 class TestSchemas:
-    """A client's configuration with a field that its schema does not know is never committed."""
+    """A client's configuration is not committed if its schema does not know one of the fields."""
 
     @pytest.mark.parametrize("kind", ["mqtt", "zenoh", "ros"])
     def test_a_field_more_anywhere_is_refused(self, kind: str) -> None:

@@ -94,7 +94,7 @@ REFUSED: dict[str, tuple[State, dict[str, Any]]] = {
 
 
 class TestAutomaticChoice:
-    """The type is Zenoh if both nodes speak it, else MQTT with a broker, else ROS, else none."""
+    """A connection without a type gets the first of Zenoh, MQTT and ROS that can carry it."""
 
     @pytest.mark.parametrize(
         ("before", "asked", "chosen"),

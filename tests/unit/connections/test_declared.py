@@ -1,6 +1,7 @@
-"""Clients get only parameters that their programs declare; `declared.yaml` lists the declarations.
+"""Clients get only parameters that their programs declare, as `declared.yaml` lists them.
 
-Each connection has every option of its type in both directions, so that every field is written.
+Each tested connection has every option of its type in both directions, so that the clients get
+every parameter.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def with_all_options(kind: str) -> State:
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and the name of the type of each value in nested mappings and lists."""
+    """Yield (path, name of the Python type) for each value in nested mappings and lists."""
     if isinstance(value, dict):
         for key, item in value.items():
             name = "{}" if "/" in key else key

@@ -14,7 +14,7 @@ LISTS = {"ros2mqtt": "ros_topics", "mqtt2ros": "mqtt_topics"}
 
 
 def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
-    """Return the parameters of each client by the client's id."""
+    """Return each client's parameters, by the client's name."""
     found = {}
     for name, config in books.objects("ConfigMap").items():
         whole = yaml.safe_load(config["data"]["params.yaml"])
@@ -25,9 +25,10 @@ def ends(books: MemoryRepo) -> dict[str, dict[str, Any]]:
 
 
 def carried(books: MemoryRepo) -> dict[str, dict[tuple[str, str], str]]:
-    """Follow each topic through both clients of its connection.
+    """Follow each topic through both clients of its connection, and return where it arrives.
 
-    Return connection → (ROS topic at the source, MQTT topic) → ROS topic at the target.
+    The result maps each connection to a map from (ROS topic at the source, MQTT topic) to the ROS
+    topic at the target.
     """
     deployments = books.objects("Deployment")
     ways: dict[str, dict[str, dict[str, str]]] = {}

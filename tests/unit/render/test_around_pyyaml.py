@@ -1,4 +1,4 @@
-"""Our shortcuts that write simple values and read long lists give the same result as PyYAML."""
+"""``strict_yaml`` writes simple values and reads long lists itself, with PyYAML's results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files below ``clusters/`` are valid, name no requesters, and change only if they must."""
+"""Files below ``clusters/`` are valid, name no requesters, and are apart for each domain."""
 
 from __future__ import annotations
 

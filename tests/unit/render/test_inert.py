@@ -1,4 +1,4 @@
-"""Text stays text: every parser reads any id, selector or toleration back as it was.
+"""Every YAML parser reads any id, selector or toleration back as the text that it was.
 
 PyYAML reads YAML 1.1, and ``Core`` below reads the core schema of YAML 1.2. Go's parsers read a
 mixture of both, so a scalar without quotes must be text in both.
@@ -47,7 +47,7 @@ UNSEEN = [
 
 
 class Core(FAST):  # type: ignore[misc]
-    """Reads YAML by the core schema of YAML 1.2.2, section 10.3.2."""
+    """Reads YAML by the core schema of YAML 1.2.2 (section 10.3.2)."""
 
 
 Core.yaml_implicit_resolvers = {}
@@ -95,12 +95,15 @@ def assert_unmistakable(text: str) -> None:
 
 
 def quoted(text: str) -> str:
-    """Return a text as a YAML scalar that has only escapes in ASCII characters."""
+    """Return a text as a YAML scalar in quotes, with each character written as an escape."""
     return '"' + "".join(f"\\U{ord(char):08X}" for char in text) + '"'
 
 
 def inventory(lines: Iterable[str]) -> MemoryRepo:
-    """Return a state repo with further vehicles; each of ``lines`` has the other fields of one."""
+    """Return a state repo with one more vehicle for each item of ``lines``.
+
+    An item has the fields of the vehicle besides type and cluster.
+    """
     entries = "".join(f"  - type: vehicle\n    cluster: c-its\n{line}" for line in lines)
     return MemoryRepo({NODES: skeleton()[NODES] + entries})
 
@@ -136,12 +139,12 @@ def test_ids_are_read_back_as_they_were() -> None:
 ANY_TEXT = [
     text for text in (*TRAPS, *UNSEEN) if not control_character(re.sub(r"[\n\t]", " ", text))
 ]
-"""The texts that the configuration accepts; tests/unit/config shows that it refuses the others."""
+"""The texts that the configuration accepts. tests/unit/config tests that it refuses the others."""
 LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true", "12", "1.5"]
 
 
 def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
-    """A toleration may have any text; a selector must be text to every parser."""
+    """A toleration may have any text. The values of a selector must be text for every parser."""
     tolerations = [{"key": text, "value": text} for text in ANY_TEXT]
     selector = {label: label for label in LABELS} | {"a": ""}
     texts = ", ".join(f"{{key: {quoted(text)}, value: {quoted(text)}}}" for text in ANY_TEXT)
@@ -163,7 +166,7 @@ def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
 
 @pytest.mark.parametrize("name", ["null", "y", "1e3", "12", "0x1f", "010", "true", "on"])
 def test_names_that_kubernetes_takes_and_yaml_misreads(name: str) -> None:
-    """Each name is that of a namespace, an account, a secret and a cluster."""
+    """A namespace, an account, a secret and a cluster all have this name."""
     domains = (
         "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
         f'  - {{name: "{name}", namespace: "{name}", serviceAccount: "{name}", nodes: ["*"]}}\n'

@@ -1,7 +1,7 @@
 """The bootstrap files' rules for the pods of an access domain.
 
-`tests/e2e` shows what a cluster refuses by these rules. These tests translate the rule for node
-selectors from CEL to Python and evaluate it.
+`tests/e2e` shows what a cluster refuses by these rules. The tests here translate the rule for node
+selectors from CEL to Python and evaluate the result.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def test_a_node_without_labels_to_select_is_any() -> None:
 
 def bootstrap(files: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     text = rendered_files(MemoryRepo(files).state)[BOOTSTRAP].split("\n---\n", 1)[1]
-    check_files({BOOTSTRAP: text})  # against the schemas of Kubernetes
+    check_files({BOOTSTRAP: text})  # it compares the objects with the schemas of Kubernetes
     return {item["kind"]: item for item in yaml.safe_load_all(text)}
 
 
@@ -103,7 +103,7 @@ def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> N
 
 
 def test_a_chart_in_a_new_folder_changes_nothing_that_someone_applied() -> None:
-    """Otherwise Flux would read the chart only after somebody applied the bootstrap file again."""
+    """Flux must be able to read the chart although nobody applies the bootstrap file again."""
     folder = "appdefs/new/charts/new"
     charts = skeleton()["registry/charts.yaml"]
     added = {

@@ -20,16 +20,16 @@ VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]
 
 ``refuse``: the later demand is refused. ``separate``: a version other than the default runs in an
 instance of its own (:mod:`demandops.demand.separate_instance`). ``update``: the newest version
-runs; another major version needs a person's approval. ``upgrade``: the newest version runs, even if
-its major version is another one.
+runs, but a person must approve a change of the major version. ``upgrade``: the newest version runs,
+even if the major version changes.
 """
 
 
 class WireNames(CamelModel):
-    """The names of this application in the reference's ``DeploymentRequest``.
+    """How the reference's ``DeploymentRequest`` names applications of this appdef.
 
-    ``type`` is the number in ``Application.type``. ``inputs`` maps each topic list in the message's
-    body to a role of the appdef.
+    ``type`` is their number in the field ``Application.type``. ``inputs`` maps a topic list in the
+    message to the input of the appdef that gets these topics.
     """
 
     type: Annotated[int, Field(ge=1, le=255)]
@@ -39,7 +39,7 @@ class WireNames(CamelModel):
 class ApplicationDefinition(FileModel):
     """One type of application: ``appdefs/<name>/appdef.yaml``.
 
-    ``uses`` maps each shared service to where its inputs come from.
+    ``uses`` lists the shared services, and where each input of a shared service comes from.
     """
 
     kind: Literal["ApplicationDefinition"]
@@ -61,7 +61,7 @@ class ApplicationDefinition(FileModel):
             if role not in self.inputs
         ]
         problems += [
-            f"uses.{name}: 'services' has a service of this name too; rename that service"
+            f"uses.{name}: 'services' defines a service of this name too; rename that service"
             for name in self.uses
             if name in self.services
         ]
@@ -71,7 +71,7 @@ class ApplicationDefinition(FileModel):
             for problem in size_problems(service.scaling, self.parameters)
         ]
         if not self.services and not self.uses:
-            problems.append("services: is empty; list one, or name a shared one under uses")
+            problems.append("services: is empty; define a service, or name a shared one under uses")
         if problems:
             raise ValueError(sentences(problems))
         return self

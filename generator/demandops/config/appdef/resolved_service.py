@@ -1,4 +1,4 @@
-"""The services of an appdef, each with the origins of its inputs."""
+"""The services of an appdef, and where the inputs of each service come from."""
 
 from __future__ import annotations
 
@@ -22,11 +22,15 @@ from demandops.errors import suggestion
 class Service(Deployed):
     """A service of one appdef, with the origins of its inputs.
 
-    ``folder`` is the folder of its definition in ``appdefs/``. ``inputs`` maps each input to a role
-    of the appdef or to ``<service>.<output>``. A service with ``each`` runs once for each topic of
-    the role ``root``. If an instance serves a single source, ``roots`` are the roles whose topics
-    of this source it reads, directly or through other services. If the service runs once for each
-    cluster, ``runs_at`` maps the node of an application to the node of the service.
+    ``folder`` is the folder in ``appdefs/`` that has the service's definition. ``inputs`` maps each
+    input of the service to its origin: a role of the appdef, or ``<service>.<output>``. A service
+    with ``each`` runs once for each topic of the role ``root``. ``roots`` is set if each instance
+    serves a single source. These are the roles whose topics the instance reads from this source,
+    directly or through other services.
+
+    ``nodes`` and ``runs_at`` are set if the service runs once for each cluster. ``nodes`` maps a
+    cluster to the node where the service runs. ``runs_at`` maps the node of an application to the
+    node of the service in the same cluster.
     """
 
     name: str
@@ -52,10 +56,10 @@ class Service(Deployed):
 
     @property
     def is_placeable(self) -> bool:
-        """Whether a node may be chosen for the service alone, apart from its application.
+        """Whether the generator may choose a node for the service, apart from the application's.
 
-        An instance of such a service serves applications of only one appdef, and the service does
-        not run at its sources.
+        The result is true if each instance serves applications of only one appdef, and the service
+        does not run at its sources.
         """
         return self.scope == "application" or not (self.shared or self.at_source)
 
@@ -66,18 +70,19 @@ class Service(Deployed):
 
 
 Services: TypeAlias = "Mapping[str, Service]"
-"""The services of an appdef, its own and those that it uses, by name."""
+"""All services of an appdef, by name: those that it defines, and the shared ones that it uses."""
 
 Problem: TypeAlias = "tuple[str, str]"
-"""A field of an appdef, and the message about it."""
+"""The path of a field of an appdef, and a message about the field."""
 
 
 def resolved_services(
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> tuple[Services, list[Problem]]:
-    """Return the services of an appdef, its own and those that it uses, and the problems.
+    """Return all services of an appdef, and the problems that its services have.
 
-    If there is a problem, no service is returned.
+    All services are those that the appdef defines, and the shared ones that it uses. If there is a
+    problem, no service is returned.
     """
     services = {
         name: Service.model_construct(
@@ -105,7 +110,8 @@ def resolved_services(
         order = list(TopologicalSorter(graph).static_order())
     except CycleError as error:
         circle = " reads ".join(f"'{name}'" for name in reversed(error.args[1]))
-        return {}, [("services", f"read in a circle: {circle}; remove one of these inputs")]
+        problem = f"read each other in a circle: {circle}; remove one of these inputs"
+        return {}, [("services", problem)]
     for name in order:
         problems += _set_roots(name, services)
     return ({}, problems) if problems else (services, [])
@@ -125,10 +131,13 @@ def _unbound(
             continue
         inputs = definitions[name].inputs
         for role in inputs.keys() - bound.keys():
-            yield f"uses.{name}.{role}", "is missing; name an input, or an output of a service"
+            yield (
+                f"uses.{name}.{role}",
+                "is missing; say what it reads: an input of this definition, or <service>.<output>",
+            )
         for role in bound.keys() - inputs.keys():
             known = suggestion(role, inputs)
-            yield f"uses.{name}.{role}", f"'{name}' has no such input; leave it out{known}"
+            yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{known}"
 
 
 def _unknown(appdef: ApplicationDefinition, services: Services) -> Iterator[Problem]:
@@ -167,22 +176,22 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
         apart = service.at_source or service.nodes
         if apart and producer and producer.root and not producer.at_source:
             other = (
-                "give this one another scope"
+                f"give '{name}' another scope"
                 if service.nodes
-                else "this one at the application's node"
+                else f"run '{name}' at the application's node"
             )
             yield (
                 _place(service, role),
-                f"'{origin}' is made at the node of each application, so several nodes may make it "
-                f"under one name; run '{producer.name}' at the source, or {other}",
+                f"'{origin}' is published at the node of each application, so several nodes may "
+                f"publish it under one name; run '{producer.name}' at the source, or {other}",
             )
         if role == service.each:
             root = producer.root if producer else origin
             if root is None:
                 yield (
                     _place(service, role),
-                    f"'{origin}' is made once for the application or the node, not for each topic; "
-                    "name another input in 'each', or leave it out",
+                    f"'{origin}' is published once for the application or the node, not for each "
+                    "topic; name another input in 'each', or leave out 'each'",
                 )
                 return
     roots: tuple[str, ...] = ()
@@ -193,15 +202,16 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
                 yield (
                     _place(service, role),
                     f"the service runs once for each topic of '{root}', but "
-                    f"'{service.inputs[role]}' does not belong to one of them; read it in a "
-                    "service that runs once for the application or the node",
+                    f"'{service.inputs[role]}' does not belong to a single one of these topics; "
+                    f"read '{service.inputs[role]}' in a service that runs once for the "
+                    "application or the node",
                 )
     elif service.at_source:
         roots = tuple(sorted({one for of in made_from.values() for one in of}))
         if not roots:
             yield (
                 f"uses.{name}",
-                "runs at the sources of its inputs, but none of them has a source; bind one to an "
-                "input of the application",
+                "runs at the sources of its inputs, but none of its inputs has a source; connect "
+                "at least one input to an input of the application",
             )
     services[name] = service.model_copy(update={"root": root, "roots": roots})

@@ -24,7 +24,10 @@ It may be above 100, because a pod may use more than it requests.
 """
 
 Measure = Literal["topics", "sources", "claims", "requesters"]
-"""What is counted to get the number of replicas; each replica serves a fixed number of these."""
+"""What the generator counts to get the number of replicas.
+
+Each replica serves up to a fixed number of the counted things.
+"""
 
 Resource = Literal["cpu", "memory"]
 """The resource whose usage an autoscaler measures."""
@@ -39,8 +42,8 @@ class Sizes(CamelModel):
     def replicas_for(self, value: object) -> int | None:
         """Return the number of replicas for a parameter's value.
 
-        A list of sizes gets the replicas of its largest size. Return ``None`` if the value, or an
-        item of the list, is not a size.
+        For a list of sizes, return the number for the largest size. Return ``None`` if the value,
+        or an item of the list, is not a size.
         """
         names = value if isinstance(value, list) else [value]
         known = [self.replicas[name] for name in names if name in [*self.replicas]]
@@ -50,14 +53,14 @@ class Sizes(CamelModel):
 class Scaling(CamelModel):
     """How many replicas a service has.
 
-    A service has ``min`` replicas unless one of three fields decides. ``per`` gives one replica for
-    a number of topics, sources, claims or requesters. ``sizes`` gives the replicas of the size that
-    a parameter names. ``autoscaler`` has the targets of a HorizontalPodAutoscaler, in percent of
-    what the pods request.
+    A service has ``min`` replicas unless one of three fields decides the number. With ``per``, each
+    replica serves up to the given number of topics, sources, claims or requesters. ``sizes`` gives
+    the replicas of the size that a parameter names. ``autoscaler`` has the targets of a
+    HorizontalPodAutoscaler, in percent of what the pods request.
 
-    ``divides_work`` says that no two replicas publish the same data. Further replicas start without
-    delay. With ``down_after`` the service keeps them for that time after the last demand that
-    needed them has ended (:mod:`demandops.ledger.kept_replicas`).
+    ``divides_work`` says that no two replicas publish the same data. Additional replicas start
+    without delay. With ``down_after``, the service keeps additional replicas for this time after
+    the last demand that needed them has ended (:mod:`demandops.ledger.kept_replicas`).
     """
 
     min: Count = 1
@@ -91,7 +94,7 @@ class Scaling(CamelModel):
         if len(deciding) > 1:
             yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
         for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
-            yield f"sizes list every number of replicas, so {name} does nothing; remove it"
+            yield f"sizes lists all numbers of replicas, so {name} does nothing; remove {name}"
         for name in ("per", "autoscaler"):
             if getattr(self, name) and self.min == self.max:
                 yield f"{name} has no choice between min {self.min} and max {self.max}; raise max"
@@ -100,20 +103,20 @@ class Scaling(CamelModel):
         by_requesters = "requesters" in (self.per or {})
         if by_requesters and not self.may_depend_on_requesters:
             yield (
-                "per: requesters shows in the rendered files how many requesters there are; allow "
-                "it with mayDependOnRequesters: true"
+                "with per: requesters, the rendered files show how many requesters there are; "
+                "allow this with mayDependOnRequesters: true"
             )
         if self.may_depend_on_requesters and not by_requesters:
             yield "mayDependOnRequesters does nothing without per: requesters; remove it"
         if self.down_after and not (self.per or self.sizes):
-            own = "; an autoscaler has a time of its own" if self.autoscaler else ""
-            yield f"downAfter does nothing without per or sizes{own}; remove it"
+            own = " (an autoscaler has a delay of its own)" if self.autoscaler else ""
+            yield f"downAfter does nothing without per or sizes{own}; remove downAfter"
         if self.down_after and seconds_of(self.down_after) < 1:
             yield "downAfter is zero; leave it out"
 
     @property
     def kept_for(self) -> timedelta | None:
-        """The time for which a service keeps replicas that no demand needs, or ``None``."""
+        """How long a service keeps replicas that no demand needs any more; ``None`` for no time."""
         return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
 
     @property

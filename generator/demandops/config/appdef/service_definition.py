@@ -1,4 +1,4 @@
-"""Services as people define them: services of one appdef, and services that several use."""
+"""Services as people define them: services of one appdef, and services that several appdefs use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ TopicPattern = Annotated[
         pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
     ),
 ]
-"""A topic name; ``{instance}`` is replaced by the service's source or application."""
+"""The name of an output's topic.
+
+``{instance}`` stands for the source, the application or the node that the service runs for.
+"""
 
 Scope = Literal["application", "topic", "node", "cluster"]
 """The scope of a service: what each of its instances is for."""
@@ -29,8 +32,8 @@ Scope = Literal["application", "topic", "node", "cluster"]
 class Place(CamelModel):
     """Requirements on a service's node: type, labels of its selector, capabilities, properties.
 
-    ``properties`` maps the name of a property to the value that it must have, or to the bounds of
-    its number: ``{min: 8}``.
+    ``properties`` maps the name of a property to the value that the property must have. For a
+    number, there may be bounds instead of a value: ``{min: 8}``.
     """
 
     role: Word | Literal[""] = ""
@@ -40,7 +43,11 @@ class Place(CamelModel):
 
 
 class Input(CamelModel):
-    """An input role, for example ``point_cloud``, to which a demand assigns topics."""
+    """An input, for example ``point_cloud``.
+
+    A demand gives topics to an input of an appdef. An appdef says where an input of a shared
+    service comes from.
+    """
 
     description: Text = ""
     type: Text = ""
@@ -55,7 +62,7 @@ class Parameter(CamelModel):
 
 
 class Deployed(CamelModel):
-    """How a service runs: its releases' names, chart and values, and what it publishes.
+    """How a service runs (the names, chart and values of its releases), and what it publishes.
 
     If ``each`` names an input, the service runs once for every topic of this input. ``place`` has
     the requirements on the node, if the generator chooses a node for the service
@@ -80,15 +87,17 @@ class Deployed(CamelModel):
         if self.outputs and self.scaling.most > 1 and not self.scaling.divides_work:
             raise ValueError(
                 f"scaling: gives up to {self.scaling.most} replicas, each of which would publish "
-                "every output; keep one, or say dividesWork: true if the program divides its work"
+                "every output; allow only one replica, or say dividesWork: true if the program "
+                "divides its work"
             )
         return self
 
 
 class OwnService(Deployed):
-    """A service of one appdef. Its ``inputs`` name roles of the appdef or ``<service>.<output>``.
+    """A service of one appdef.
 
-    ``each`` names one of these inputs, or a role of the appdef. That role then becomes an input.
+    ``inputs`` maps each input to its origin: a role of the appdef, or ``<service>.<output>``.
+    ``each`` names one of these inputs, or a role of the appdef, which then becomes an input too.
     """
 
     inputs: dict[Word, str] = Field(default_factory=dict)
@@ -96,7 +105,9 @@ class OwnService(Deployed):
     @model_validator(mode="after")
     def _consistent(self) -> OwnService:
         if self.placement == "source" and not self.each:
-            raise ValueError("placement 'source' needs 'each': an application has no single source")
+            raise ValueError(
+                "placement 'source' needs 'each', because an application has no single source"
+            )
         if self.placement == "source" and self.place:
             raise ValueError("place and placement 'source' both choose the node; keep one")
         return self
@@ -119,8 +130,8 @@ class ServiceDefinition(Deployed, FileModel):
     def _consistent(self) -> ServiceDefinition:
         if bool(self.nodes) is not (self.scope == "cluster"):
             raise ValueError(
-                "scope 'cluster' needs 'nodes', the node of each cluster, and no other scope may "
-                "have 'nodes'"
+                "scope 'cluster' needs 'nodes' (the service's node in each cluster), and no other "
+                "scope may have 'nodes'"
             )
         if self.placement == "source" and self.scope == "cluster":
             raise ValueError(
@@ -135,8 +146,8 @@ class ServiceDefinition(Deployed, FileModel):
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
         if self.place and self.scope != "application":
             raise ValueError(
-                "place needs the scope 'application': with any other, one instance serves "
-                "applications that would choose different nodes"
+                "place needs the scope 'application', because with any other scope one instance "
+                "serves several applications, which could need different nodes"
             )
         if problems := [*size_problems(self.scaling, self.parameters)]:
             raise ValueError(sentences(problems))
@@ -155,8 +166,8 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         return
     if parameter.merge in ("max", "min"):
         yield (
-            f"{place}: '{name}' has merge: {parameter.merge}, which is for numbers; use union, "
-            "with which the largest size counts"
+            f"{place}: '{name}' has merge: {parameter.merge}, which compares numbers; use merge: "
+            "union, so that the largest size counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)

@@ -31,7 +31,7 @@ from demandops.errors import InvalidInput, suggestion
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    """Add every fault across files or entries to the reader."""
+    """Run all checks, and add the faults that they find to the reader."""
     for check in (
         _check_inventory,
         _check_domains,
@@ -59,7 +59,8 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
             kind, first = config.property_kinds[name]
             if kind_of(value) != kind and node.id not in config.hosts:
                 where = f"at '{first}' in {config.file_of(NODES_FILE, first)}"
-                message = f"is {kind_of(value)}, but {kind} {where}; give all nodes one type"
+                message = f"is {kind_of(value)}, but the property is {kind} {where}"
+                message += "; give it the same type on all nodes"
                 reader.add_fault(file, f"{place}.properties.{name}", message)
         for role in node.topics:
             if roles and role not in roles:
@@ -83,14 +84,15 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 file,
                 f"{place}.namespace",
-                f"'{domain.namespace}' is already the namespace of '{other}'; give each its own",
+                f"'{domain.namespace}' is already the namespace of '{other}'; give each its own "
+                "namespace",
             )
         if argocd and domain.namespace == argocd.namespace:
             reader.add_fault(
                 file,
                 f"{place}.namespace",
                 f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
-                "all that Argo CD may; choose another",
+                "all that Argo CD may; choose another namespace",
             )
 
 
@@ -165,12 +167,12 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
             if kind and comparable_kind(value) != kind:
                 registry = config.file_of(NODES_FILE, first)
                 message = (
-                    f"asks for {comparable_kind(value)}, but is {kind} at '{first}' in {registry}"
+                    f"asks for {comparable_kind(value)}, but the property is {kind} at '{first}' "
+                    f"in {registry}; ask for {kind}"
                 )
-                message += f"; ask for {kind}"
                 reader.add_fault(file, f"{where}place.properties.{word}", message)
         if service.prefix in words:
-            message = f"'{service.prefix}' is the prefix of connections; choose another"
+            message = f"'{service.prefix}' is the prefix of connections; choose another prefix"
             reader.add_fault(file, f"{where}prefix", message)
             continue
         if service.each or isinstance(service, ServiceDefinition):
@@ -185,12 +187,14 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                 continue
         known = prefixes.setdefault(service.prefix, (file, name))
         if known != (file, name):
-            message = f"'{service.prefix}' is used by '{known[1]}' already; choose another"
+            message = (
+                f"'{service.prefix}' is already the prefix of '{known[1]}'; choose another prefix"
+            )
             reader.add_fault(file, f"{where}prefix", message)
 
 
 def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    """Yield (file, prefix of its fields, name, definition) for each service that is defined."""
+    """Yield (file, start of the paths of its fields, name, definition) for each service."""
     for appdef in config.appdefs.values():
         for name, service in appdef.services.items():
             yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
@@ -199,9 +203,10 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Add the faults of shared services: of their nodes, and of the origins of their inputs.
+    """Add the faults in the nodes of shared services and in the origins of their inputs.
 
-    All appdefs that use a shared service with ``each`` must give this input the same origin.
+    If a shared service has ``each``, all appdefs that use the service must give the same origin to
+    the input that ``each`` names.
     """
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
@@ -223,8 +228,8 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                 reader.add_fault(
                     f"appdefs/{appdef}/appdef.yaml",
                     f"uses.{name}.{service.each}",
-                    f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; one service "
-                    "runs for both, so use one name in both",
+                    f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; both share the "
+                    "service, so use the same name in both",
                 )
 
 
@@ -235,7 +240,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
                 f"appdefs/{name}/appdef.yaml",
                 "versions",
                 f"is {appdef.versions}, but {config.place_of(VERSIONS_FILE)} does not list the "
-                f"versions of '{name}' and their order; add them, or remove this",
+                f"versions of '{name}'; add them there, or remove 'versions'",
             )
         if appdef.versions == "separate":
             _check_separate(name, config, reader)
@@ -268,10 +273,10 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault for each shared service whose ``each`` names an output of an unshared service.
+    """Add a fault for each shared service whose input in ``each`` is an output of an unshared one.
 
-    With ``versions: separate``, each version has an unshared service of its own. The shared service
-    runs once for all versions.
+    With ``versions: separate``, each version has its own instance of the unshared service, but the
+    shared service runs once for all versions.
     """
     services = config.services.get(appdef, {})
     for name, service in services.items():
@@ -281,14 +286,14 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 f"appdefs/{appdef}/appdef.yaml",
                 f"uses.{name}.{service.each}",
-                f"is '{origin}', which each version makes on its own (versions: separate), but "
-                f"'{name}' runs once for all; make '{name}' a service of this definition, or share "
-                f"'{producer.name}' too",
+                f"is '{origin}', but with versions: separate each version has its own "
+                f"'{producer.name}', and the shared service '{name}' runs once for all versions; "
+                f"define '{name}' in this appdef, or make '{producer.name}' a shared service too",
             )
 
 
 def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
-    """Return whether the versions file has no entry for an appdef, not even an invalid one."""
+    """Return whether no file lists versions of an appdef, not even in an invalid entry."""
     return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
 
 
@@ -338,8 +343,8 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 override.path,
                 "version",
-                f"'{override.version}' is not a version or channel in "
-                f"{config.place_of(CHARTS_FILE)} of a selected chart"
+                f"'{override.version}' is not a version or channel that "
+                f"{config.place_of(CHARTS_FILE)} has for a selected chart"
                 f"{suggestion(override.version, versions)}",
             )
 
@@ -354,8 +359,8 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
     ]
     if selected and not any(service.is_movable for service in selected):
         message = (
-            f"moves nothing: {selected[0].name} runs at its sources, or at the nodes of its "
-            "definition; change its definition, or remove node"
+            f"moves nothing, because {selected[0].name} runs at its sources or at the nodes that "
+            "its definition lists; change its definition, or remove node"
         )
         reader.add_fault(override.path, "node", message)
     if node in config.nodes and node not in config.domain_of and config.domains:

@@ -1,7 +1,7 @@
 """Refuses two overrides of equal priority that could change one release differently.
 
-Only different priorities give such a pair an order. A pair is also refused if no release matches
-both overrides yet but a later demand could add one.
+Such a pair needs an order, and only different priorities give one. A pair is also refused if no
+release matches both overrides yet, because a later demand could add such a release.
 
 Two selectors cannot match the same release if they exclude each other in a field for which a
 release has only one value, like service or node. A shared service has many applications and
@@ -77,7 +77,7 @@ def patches_commute(one: object, other: object) -> bool:
 def may_select_same_release(
     one: Iterable[Selector], other: Iterable[Selector], config: Config
 ) -> bool:
-    """Return whether one release, now or later, may match selectors of both overrides."""
+    """Return whether one release, now or later, may match a selector of each override."""
     others = list(other)
     return any(_may_match_same_release(left, right, config) for left in one for right in others)
 
@@ -118,8 +118,11 @@ def _shared(one: Selector, other: Selector, services: Services) -> bool:
 
 
 def patterns_overlap(one: str, other: str) -> bool:
-    """Return whether any text matches both patterns (``*`` any characters, ``?`` one)."""
-    # row[i]: whether the part of ``one`` that is read overlaps with the first i characters of other
+    """Return whether some text matches both patterns.
+
+    ``*`` stands for any number of characters, and ``?`` for one character.
+    """
+    # row[i]: whether the part of ``one`` read so far overlaps with the first i characters of other
     row = [not other[:length].strip("*") for length in range(len(other) + 1)]
     for a in one:
         after = [row[0] and a == "*"]

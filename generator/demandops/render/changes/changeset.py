@@ -28,10 +28,10 @@ from demandops.render.output_check import check_files
 Change = Literal["start", "change", "stop"]
 
 CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
-"""The kinds of changes, in the order in which lists show them."""
+"""The kinds of changes, in the order in which lists of changes show them."""
 
 FileReader = Callable[[str], str | None]
-"""A function that returns the text of a file of the state repo; None if the file is missing."""
+"""A function that returns the text of a state repo's file, or None if the file is missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class ReleaseChange:
 
 @dataclass(frozen=True, slots=True)
 class Changeset:
-    """The files to write and the releases that change. The text None means to remove the file."""
+    """The files to write and the releases that change. A file whose text is None is removed."""
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
@@ -78,8 +78,8 @@ def build_changeset(
     """Return the changes in the state repo that follow from a change of the ledger.
 
     Args:
-        before, after: the world before and after; both have the same configuration.
-        changes: what differs in the ledger.
+        before, after: the world before and after the change, with the same configuration.
+        changes: the differences between both ledgers.
         keys: the keys of the releases that may differ
             (:func:`demandops.plan.release_keys.affected_keys`).
         engine: the engine of the configuration.
@@ -140,8 +140,8 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
         if size > max(most, len((read(path) or "").encode()) if size > most else 0):
             message = (
-                f"would have {size} bytes; at most {most} are allowed; demand less of it, or ask "
-                f"a platform engineer to raise limits.fileBytes in {ROOT_FILE}"
+                f"would have {size} bytes, but at most {most} are allowed; demand less, or ask a "
+                f"platform engineer to raise limits.fileBytes in {ROOT_FILE}"
             )
             faults.append(fault("", message, code="too-large").within(path))
     if faults:
@@ -173,7 +173,7 @@ def render_all(
 
 
 def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
-    """Return the release of a former world; None if the release can no longer be planned."""
+    """Return the release of a former world, or None if the release cannot be planned any more."""
     try:
         return plan(world, key)
     except Refused:
@@ -191,7 +191,7 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
 
 def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
     before, after = _overrides(old), _overrides(new)
-    if not new.shaping.held:  # in a held file, only the comments change
+    if not new.shaping.held:  # in a held file, only the comments that name overrides change
         before = (old.facts() if old else []) + before
         after = new.facts() + after
     old_facts, new_facts = frozenset(before), frozenset(after)
@@ -201,7 +201,7 @@ def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
 
 
 def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
-    """Yield a warning if a held release would otherwise change."""
+    """Yield a warning if a hold keeps a release from changing."""
     if new is None or not new.shaping.held or (old and old.facts()) == new.facts():
         return
     by = " and ".join(override.path for override, effects in new.shaping.by if "hold" in effects)

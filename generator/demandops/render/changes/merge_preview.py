@@ -1,8 +1,9 @@
-"""The releases and files that differ between two commits, or before and after a merge. Pure.
+"""The releases and files that differ between two commits, or before and after a merge.
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
 may affect any release, so this module compares all releases. The files decide whether a release
 differs, because the clusters follow the files. The plans of both sides describe the difference.
+The functions here are pure.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ ABSENT = object()
 
 @dataclass(frozen=True, slots=True)
 class FileChange:
-    """The text of a generated file before and after; None where the file does not exist."""
+    """The text of a generated file before and after a change; None if there is no such file."""
 
     path: str
     before: str | None
@@ -69,7 +70,7 @@ class MergePreview:
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return key → release for all releases that can be planned."""
+    """Return all releases that can be planned, by key."""
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         try:
@@ -84,9 +85,9 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
 def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
     """Return the faults that keep releases from being planned or rendered.
 
-    Each fault names one file. If the claims that need the release include a file in ``edited``, the
-    fault names this file. Otherwise it keeps its own file or, without one, names the file of the
-    first claim.
+    Each fault names one file. If a claim that needs the release is in a file in ``edited``, the
+    fault names that file. Otherwise the fault keeps the file that it names. A fault that names no
+    file gets the file of the first claim that needs the release.
     """
     faults: list[Fault] = []
     files: dict[ReleaseKey, list[str]] = {}
@@ -105,7 +106,7 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
 
 def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
-    """Return key of a release → the files of the claims that need the release."""
+    """Return a map from each release's key to the files of the claims that need the release."""
     by_release: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
         paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
@@ -158,9 +159,9 @@ def preview(
 def _pairs(
     old: Mapping[ReleaseKey, Release], new: Mapping[ReleaseKey, Release]
 ) -> Iterator[tuple[Release | None, Release | None]]:
-    """Yield each release before and after; None where it does not exist.
+    """Yield (release before, release after); None stands for a release that does not exist.
 
-    A release whose key changes is paired by its name.
+    A release whose key changes is paired with the former release of the same name.
     """
     gone = {release.name: release for key, release in old.items() if key not in new}
     for key, release in new.items():
@@ -169,7 +170,7 @@ def _pairs(
 
 
 def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield texts for the first differences between two manifests, then a count of the rest."""
+    """Yield texts for the first differences between two manifests, and then a count of the rest."""
     try:
         differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:

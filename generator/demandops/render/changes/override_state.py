@@ -1,4 +1,4 @@
-"""The state of an override. It is in force only when the files that it changes are written."""
+"""The state of an override, which is in force only once the files that it changes are written."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def render(
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return path → text of the bootstrap files and of a placeholder for each access domain."""
+    """Return the bootstrap files and a placeholder for each access domain, by path."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
         for cluster, domains in domains_by_cluster(config).items()
@@ -85,7 +85,7 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine
 
 
 def _sources(config: Config) -> list[str]:
-    """Return the URLs that Applications may use as a source: the state repo's and the charts'."""
+    """Return the URLs that Applications may fetch from: those of the state repo and of charts."""
     section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - required when gitops is "argocd"
     charts = {

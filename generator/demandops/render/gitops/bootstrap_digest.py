@@ -1,8 +1,8 @@
-"""The digest of a bootstrap file: an annotation that shows which version a cluster has. Pure.
+"""The digest of a bootstrap file, an annotation that shows which version a cluster has.
 
-A person applies the file, so the cluster may have an older version. The object that applies
-an access domain's folder carries the digest. ``demandops status`` compares this digest
-with that of the file.
+A person applies the file, so the cluster may have an older version of it. The object that applies
+an access domain's folder carries the digest of the applied file. ``demandops status`` compares this
+digest with that of the file in the state repo. The functions here are pure.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _LENGTH = 16
 def with_digest(render: Callable[[str], str]) -> str:
     """Return the text of a bootstrap file that contains its own digest.
 
-    ``render`` returns the text with a given digest. The digest does not cover comments.
+    ``render`` returns the text with a given digest. The digest covers neither itself nor comments.
     """
     return render(_digest(render("")))
 
@@ -40,7 +40,7 @@ def digest_of(item: Mapping[str, Any]) -> str:
     return str(annotations.get(ANNOTATION, ""))
 
 
-@lru_cache(maxsize=1024)  # the web page asks repeatedly
+@lru_cache(maxsize=1024)  # the web page asks for the same files repeatedly
 def digest_in(text: str) -> str:
     """Return the digest in the text of a bootstrap file; empty if there is none."""
     try:

@@ -1,9 +1,9 @@
 """The steps on the clusters when a state repo is upgraded, or switches to Flux or Argo CD.
 
-Pure: this module returns instructions and commands for a person. Their order matters. First the
-person stops the old controller, because it would remove the workloads when its releases leave the
-state repo. The person deletes the old controller's objects only after the new controller has taken
-over.
+This module runs nothing. It returns instructions and commands for a person, and their order
+matters. First the person stops the old controller, because it would remove the workloads when its
+releases leave the state repo. The person suspends Flux, and deletes its objects only after Argo CD
+has taken over. The person deletes Argo CD's Applications at once, but without their finalizers.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def _finish_switch_to_argocd(config: Config) -> Iterator[Step]:
         commands = []
         for domain in domains:
             kubectl = f"kubectl -n {domain.namespace}"
-            commands.append(  # Helm's records of releases, from which a later Flux would continue
+            # delete Helm's records of releases, because a later Flux would continue from them
+            commands.append(
                 f"{kubectl} get helmrelease -l {_label(domain)} -o name | sed s,.*/,, | "
                 f"xargs -r -I NAME {kubectl} delete secret -l owner=helm,name=NAME"
             )
@@ -121,7 +122,10 @@ def _delete_applications(config: Config) -> Iterator[Step]:
             f"{project_of(domain, config.repo_settings)}"
             for domain in domains
         ]
-        description = "delete Argo CD's Applications but not their workloads: finalizers first"
+        description = (
+            "remove the finalizers of Argo CD's Applications, so that their workloads stay; then "
+            "delete the Applications and AppProjects"
+        )
         yield Step(cluster, description, (*commands,))
 
 

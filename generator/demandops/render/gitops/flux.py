@@ -44,7 +44,7 @@ def chart_object(name: str, chart: ChartSource) -> str:
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return path → text of the files that do not depend on demands.
+    """Return the files that do not depend on demands, by path.
 
     These are the bootstrap files, and a placeholder and the chart sources for each access domain.
     """

@@ -30,11 +30,11 @@ def render(release: Release, config: Config, engine: Engine) -> str:
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return path → text of the files that exist even without demands.
+    """Return the files that exist even without demands, by path.
 
-    Each cluster has a bootstrap file, with which its controller follows the repo. Each access
-    domain of a cluster has a placeholder file, which keeps the domain's folder in Git. Without the
-    folder, Flux and Argo CD would fail instead of removing what is no longer demanded.
+    Each cluster has a bootstrap file, which makes the cluster's controller follow the repo. Each
+    access domain of a cluster has a placeholder file, which keeps the domain's folder in Git.
+    Without the folder, Flux and Argo CD would fail instead of removing what is no longer demanded.
     """
     if config.repo_settings.gitops == "argocd":
         return argocd.base_files(config, engine)

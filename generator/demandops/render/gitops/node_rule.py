@@ -48,7 +48,10 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
 
 
 def expression_of(pattern: str) -> str:
-    """Return a pattern of the policy, with ``*`` and ``?``, as a regular expression of RE2."""
+    """Return a pattern of the policy as a regular expression of RE2.
+
+    The pattern may contain ``*`` and ``?``.
+    """
     return "".join({"*": ".*", "?": "."}.get(one, re.escape(one)) for one in pattern)
 
 

@@ -1,6 +1,6 @@
 """The paths of generated files, the same for both controllers.
 
-Other programs rely on these paths. A folder holds one access domain's part of one cluster.
+Other programs rely on these paths. There is one folder for each access domain of each cluster.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def bootstrap_path(cluster: str) -> str:
 
 
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
-    """Return each pair of a cluster and an access domain with nodes in it, sorted by name."""
+    """Return (cluster, access domain) for each domain with nodes in the cluster, sorted by name."""
     pairs = {
         (node.cluster, config.domain_of[node.id].name)
         for node in config.nodes.values()
@@ -41,7 +41,7 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
 
 
 def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return cluster → the access domains that have nodes in it."""
+    """Return a map from each cluster to the access domains that have nodes in the cluster."""
     domains: dict[str, list[AccessDomain]] = {}
     for cluster, domain in domains_in_use(config):
         domains.setdefault(cluster, []).append(domain)
