@@ -189,8 +189,8 @@ def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_pa
     expect(8)
     assert detecting.stop() == 0
     log = detecting.log.read_text()
-    assert "vehicle01 was not seen since the start" in log
-    assert "vehicle03 is silent for 5 s" in log
+    assert "vehicle01 has not been seen since the start" in log
+    assert "vehicle03 has been silent for 5 s" in log
     assert commits(served) == ["init", *["join"] * 4, *["shutdown"] * 4]
 
 

@@ -27,7 +27,7 @@ def test_an_event_says_what_has_happened() -> None:
     assert event.why == "a is 50.0 m from the area"
     assert event.values == {"rule": "near", "entity": "a", "x": 30, "y": 40, "distance": 50}
     (event,) = run.step(9)
-    assert (event.why, event.at) == ("a is silent for 3 s", 4)
+    assert (event.why, event.at) == ("a has been silent for 3 s", 4)
 
 
 def test_a_polygon_with_a_notch_is_left_there() -> None:
