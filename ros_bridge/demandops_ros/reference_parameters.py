@@ -54,7 +54,10 @@ def read(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` without effect; it names the replacement."""
+    """Yield a warning for each parameter in ``values`` that has no effect.
+
+    The warning says what replaces the parameter.
+    """
     for name in dict.fromkeys(each.partition(".")[0] for each in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"

@@ -103,8 +103,8 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
         if not own:
             known = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
-                f"no rule of access domain '{domain.name}' is for '{requester}', only {known}; "
-                "ask for a change of policy/"
+                f"no rule of access domain '{domain.name}' is for '{requester}'; its rules are "
+                f"{known}; ask for a change of policy/"
             )
         else:
             reasons = "; ".join(

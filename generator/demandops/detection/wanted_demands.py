@@ -201,7 +201,7 @@ class WantedDemands:
         return len(self._entries)
 
     def unanswered(self) -> int:
-        """Return how many events have a demand that is not yet booked or released as wanted."""
+        """Return how many events have a demand that is still to be booked or released."""
         return sum(one.wanted != one.held or not one.is_sure for one in self._entries.values())
 
     def refusals(self) -> Iterator[tuple[Key, str]]:

@@ -51,7 +51,8 @@ class Proposal:
 
     ``reasons`` say why approval is needed. ``searched_to`` is the commit of main up to which the
     history was searched for merged demands. ``checked_at`` is the commit of main at the last check;
-    it is empty if the proposal must be checked again. ``edited``: a person committed to the branch.
+    it is empty if the proposal must be checked again. ``edited`` is true if a person committed to
+    the branch.
     """
 
     key: Key
