@@ -18,8 +18,8 @@ from unique_identifier_msgs.msg import UUID
 from demandops_ros.ros_process import ExecutorThread
 
 DEEP_QOS = QoSProfile(depth=2000)
-"""The queues for goals, results, cancels and feedback. ROS's default of 10 is too small
-for a burst, because a client's queue also gets the answers to other clients."""
+"""The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
+small for a burst, because a client's queue also gets the answers to other clients."""
 
 _UNHEARD_S = 5.0
 """How many seconds to wait for the node's response to a goal before the goal is sent again. A node
@@ -32,7 +32,7 @@ _WITH_GOAL_S = 10
 _RESULT_S = 900
 """How many seconds longer :class:`LastingResults` keeps the goal's result."""
 _MOST_RESULTS = 2_000
-"""How many results :class:`LastingResults` keeps at most; then it forgets the oldest."""
+"""How many results :class:`LastingResults` keeps; of more results, it forgets the oldest."""
 
 
 class DemandError(Exception):

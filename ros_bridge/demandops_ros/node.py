@@ -86,7 +86,7 @@ class DemandNode(Node):  # type: ignore[misc]
             generator: takes the demands.
             action_name, demand_action_name: the names of the two actions.
             level: the level at which to answer a goal that names no level.
-            timeout_s: how many seconds a rollout may take to reach its level; then its goal fails.
+            timeout_s: how many seconds a rollout may take to reach its level before its goal fails.
             status: watches rollouts; None without access to the clusters.
         """
         super().__init__("demandops")
@@ -141,9 +141,9 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer a call of the service in another thread, because the call may take seconds.
+        """Answer a call of the service in another thread.
 
-        It does so if it reads an old revision.
+        A call that reads an old revision may take seconds, and must not block the executor.
         """
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"

@@ -68,9 +68,10 @@ class Lease:
         return self.expires_at < now
 
     def renewed(self, term: Term, now: datetime) -> Lease:
-        """Return the lease after a renewal; it is unchanged if the slack covers the renewal.
+        """Return the lease after a renewal.
 
-        The end never moves to an earlier time, because the clock may have been set back.
+        If the slack covers the renewal, the lease stays the same. The end never moves to an earlier
+        time, because the clock may have been set back.
         """
         wanted = term.lease_from(now)
         if (self.seconds, self.slack) == (

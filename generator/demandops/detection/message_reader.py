@@ -29,7 +29,7 @@ class MessageReader:
     """Reads the messages of one source."""
 
     def __init__(self, file: RuleFile, source: str) -> None:
-        """Make a reader of the messages of ``source``; it reads the fields that ``file`` needs."""
+        """Make a reader of those fields of the messages of ``source`` that ``file`` needs."""
         definition = file.sources[source]
         self._source = source
         self._entity = definition.entity and _getter(definition.entity)

@@ -39,7 +39,7 @@ _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
 
 
 class PushWebhook:
-    """The server of the webhook, in a thread of its own; it answers ``/`` for health checks."""
+    """The webhook's server, in a thread of its own; a request for ``/`` is a health check."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
         """Start the server.

@@ -43,8 +43,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near={**NEAR, "source": "batteries"}),
-            "rules.yaml:22: rules[0].near.source: 'batteries' has no position; name its fields in "
-            "sources.batteries.x and y",
+            "rules.yaml:22: rules[0].near.source: source 'batteries' has no position; name the "
+            "fields of its position in sources.batteries.x and y",
         ),
         (
             rule("a", near=NEAR, count=None, threshold={"source": "cars", "field": "x..y"}),

@@ -25,7 +25,7 @@ class Facts(NamedTuple):
 
 
 class CompiledRule:
-    """The base class of all compiled rules."""
+    """The base class of rules in the form that checks observations."""
 
     def __init__(self, rule: Rule) -> None:
         self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
@@ -204,7 +204,7 @@ def distance(one: Observation, other: Observation) -> float:
 
 
 def compiled(rule: Rule) -> CompiledRule:
-    """Return a rule, compiled to the class for its kind of condition."""
+    """Return a rule in the form that checks observations, by the rule's kind of condition."""
     condition = rule.condition
     if isinstance(condition, Near | Count):
         return AreaRule(rule, condition)

@@ -58,7 +58,7 @@ def faults_of_demand(
 
 
 def _number_for_text(text: str) -> str:
-    """Return why a text such as ``{x}``, only the name of a number, cannot stand in a text field.
+    """Return a message if ``text`` is only the name of a number in braces, such as ``{x}``.
 
     The result is empty for other texts.
     """

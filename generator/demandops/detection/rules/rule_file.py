@@ -191,7 +191,10 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                 known = suggestion(name, rules.sources)
                 yield fault(f"{where}.{kind}.{part}", f"'{name}' is not in sources{known}")
             elif name is not None and kind != "threshold" and not rules.sources[name].position:
-                message = f"'{name}' has no position; name its fields in sources.{name}.x and y"
+                message = (
+                    f"source '{name}' has no position; name the fields of its position in "
+                    f"sources.{name}.x and y"
+                )
                 yield fault(f"{where}.{kind}.{part}", message)
         field = "demand" if rule.demand is not None else "deploymentRequest"
         yield from faults_of_demand(

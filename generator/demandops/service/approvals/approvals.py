@@ -57,7 +57,7 @@ from demandops.staterepo.write.proposal_branch import (
 log = logging.getLogger("demandops")
 
 _LONGEST_CHECK_S = 0.5
-"""How many seconds a check may go on while a demand waits; it may push many branches."""
+"""How many seconds a check, which may push many branches, goes on while a demand waits."""
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -428,7 +428,7 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return a demand's request if it is a release that can be carried out, else None.
+    """Return a demand's request if it is a release that can be carried out, or None if it is not.
 
     A demand that is withdrawn, or whose goal is refused, cannot be carried out.
     """

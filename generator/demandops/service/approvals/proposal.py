@@ -217,10 +217,10 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 
 
 def pull_request_body(message: str, reasons: Iterable[str]) -> str:
-    """Return the text of a pull request; it contains the commit's message.
+    """Return the text of a pull request, which contains the commit's message in a code block.
 
-    The message is in a code block, because requesters choose the ids in it. Outside of a code
-    block, an id could become a link or a mention.
+    Requesters choose the ids in the message. Outside of a code block, an id could become a link or
+    a mention.
     """
     fence = _fence(message, 3)
     return (
