@@ -1,4 +1,4 @@
-"""The ends of actions: a client that sends goals, a server, and a search for other servers."""
+"""Parts for ROS actions: a client that sends goals, a server, and a search for other servers."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from unique_identifier_msgs.msg import UUID
 from demandops_ros.ros_process import ExecutorThread
 
 DEEP_QOS = QoSProfile(depth=2000)
-"""The queues for goals, results, cancels and feedback. ROS's default of 10 is too small
-for a burst, because a client's queue also gets the answers to other clients."""
+"""The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
+small for a burst, because a client's queue also gets the answers to other clients."""
 
 _UNHEARD_S = 5.0
 """How many seconds to wait for the node's response to a goal before the goal is sent again. A node
@@ -32,7 +32,7 @@ _WITH_GOAL_S = 10
 _RESULT_S = 900
 """How many seconds longer :class:`LastingResults` keeps the goal's result."""
 _MOST_RESULTS = 2_000
-"""How many results :class:`LastingResults` keeps at most; then it forgets the oldest."""
+"""How many results :class:`LastingResults` keeps; of more results, it forgets the oldest."""
 
 
 class DemandError(Exception):
@@ -83,7 +83,7 @@ class GoalSender:
         self._action_name = action_name
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain_id)
-        # a launch file renames every node of the process; a rule of the node's own comes first
+        # a launch file renames every node of the process, but the node's own rule has precedence
         own_name = ["--ros-args", "-r", f"__node:={node_name}"]
         self._node = rclpy.create_node(node_name, context=self._context, cli_args=own_name)
         self._client = ActionClient(
@@ -127,7 +127,7 @@ class GoalSender:
         self._wait_until_discovered(deadline)
         handle, lost = self._send_until_heard(goal, on_feedback, deadline)
         if not handle.accepted:
-            message = "the node accepts no demands now, and its log says why; send it again later"
+            message = "the node accepts no demands now (its log says why); send the demand later"
             raise DemandError("rejected", message)
         answer = self._await(handle.get_result_async(), deadline)
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
@@ -150,7 +150,7 @@ class GoalSender:
         """Send a goal until a node responds; return its handle, and whether an attempt was lost.
 
         A response is lost if a new node replaced the old one and has not yet discovered this
-        client. Sending the goal again is harmless: a demand that is put twice counts once.
+        client. Sending the goal again is harmless, because a demand that is put twice counts once.
         """
         lost = False
         while True:
@@ -168,10 +168,11 @@ class GoalSender:
         on_feedback: Callable[[Any], None],
         deadline: float,
     ) -> Any:  # noqa: ANN401 - a future of rclpy
-        """Send a goal from the thread that receives; return the future of the node's response.
+        """Send a goal in the thread that also receives; return the future of the node's response.
 
-        rclpy 9.1 registers the future of a goal twice. If another thread sends, a response that
-        arrives in between resolves the first future only, and no caller has that.
+        rclpy 9.1 registers two futures for a goal, one after the other, and returns the second. If
+        another thread sent the goal, a response could arrive in between. It would resolve only the
+        first future, for which nobody waits.
         """
         sent: list[Any] = []
         done = REAL.event()
@@ -204,12 +205,12 @@ class GoalSender:
 class LastingResults(ActionServer):  # type: ignore[misc]
     """An action server that keeps results longer than goals, for clients that ask late.
 
-    Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each goal that
-    it keeps makes every other goal slower, here and in every client. Therefore ROS keeps goals for
-    ten seconds only, as by default, and this class keeps their results.
+    Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each kept goal
+    slows down every other goal, in the server and in every client. Therefore ROS keeps a goal for
+    only ten seconds, which is its default, and this class keeps the goal's result for longer.
 
-    The class overrides methods that rclpy calls internally. If a version of rclpy does not call
-    them, results are kept for ten seconds.
+    The class overrides methods that rclpy calls internally. With a version of rclpy that does not
+    call them, results are kept for ten seconds.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401

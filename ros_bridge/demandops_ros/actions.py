@@ -62,7 +62,7 @@ class DeploymentRequestAdapter:
 
         Args:
             outcome: the receipt, or the error.
-            reached: the level that the demand's releases reached.
+            reached: how far the demand's releases came: ``pushed``, ``reconciled`` or ``healthy``.
         """
         return DeploymentRequest.Result(message=_text(outcome))
 

@@ -1,6 +1,6 @@
 """Offers the bookkeeping over ROS 2, by a ROS service and on a latched topic.
 
-Both carry the JSON that ``demandops bookkeeping --output json`` prints.
+The service and the topic carry the JSON that ``demandops bookkeeping --output json`` prints.
 """
 
 from __future__ import annotations

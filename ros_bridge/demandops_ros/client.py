@@ -108,7 +108,8 @@ class DemandClient:
         Args:
             demand: the demand's id.
             applications, connections: as in a YAML document of the kind ``Demand``.
-            answer: when to return: once the change is pushed, reconciled or healthy.
+            answer: when the call returns: once the change is ``pushed``, ``reconciled`` or
+                ``healthy``.
             lease: seconds, or a duration like ``10m``; by default the access domain's lease.
             request: free text for the commit.
             on_stage: called with each stage and its text.

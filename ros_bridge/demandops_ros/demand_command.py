@@ -20,7 +20,7 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
 
 @click.command()
 @click.argument("file", metavar="FILE")
-@click.option("--hold", is_flag=True, help="Keep it renewed until Ctrl-C, then release it.")
+@click.option("--hold", is_flag=True, help="Renew the demand until Ctrl-C, then release it.")
 @click.option("--release", is_flag=True, help="Release the demand of the file instead.")
 @click.option("--renew", is_flag=True, help="Renew the demand of the file instead.")
 @click.option(

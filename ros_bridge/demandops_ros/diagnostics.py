@@ -1,8 +1,8 @@
 """The node's status on ``/diagnostics``, for ROS 2's own tools.
 
-It publishes four statuses once a second: whether the state repo can be reached and written, whether
-its configuration is valid, whether all parts of the generator work, and whether this node alone
-serves its actions.
+The node publishes four statuses once a second: whether the state repo can be reached and written,
+whether the configuration is valid, whether all parts of the generator work, and whether no other
+node serves the node's actions.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def _of_state_repo(generator: Generator) -> DiagnosticStatus:
     if remote.push_denied:
         level, text = DiagnosticStatus.ERROR, remote.push_denied
     if remote.unreachable:
-        # while no demand waits, an unreachable repo delays only people's changes: no error
+        # while no demand waits, an unreachable repo delays only people's changes: just a warning
         level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
         text = remote.unreachable
     values = {

@@ -1,4 +1,4 @@
-"""Converts ROS messages to plain data and back; it imports message packages, but not rclpy."""
+"""Converts ROS messages to plain data and back, with message packages only, without rclpy."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _OPERATIONS = ("put", "release", "renew")
 _TYPES = ("auto", "mqtt", "zenoh", "ros", "none")
 ANSWER_LEVELS: tuple[Level, ...] = ("pushed", "reconciled", "healthy")
 
-# name of a document's field → name of the message's field
+# each mapping: the name of a field in a document → the name of the field in the message
 _DEMAND = {
     "demand": "demand_id",
     "request": "request_id",

@@ -1,9 +1,9 @@
 """The ROS 2 node: action servers that submit demands to the generator.
 
 A goal is accepted once its demand is in the generator's journal. Many goals may be open without
-blocking the executor: events from the generator's threads are queued, and a guard condition wakes
-the executor to handle them. The execute callback of a goal runs only once the goal's outcome is
-known.
+blocking the executor, because events from the generator's threads are queued, and a guard condition
+wakes the executor to handle them. The execute callback of a goal runs only once the goal's outcome
+is known.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _SHALLOW = (
 _MOST_READERS = 4
 """How many calls of the bookkeeping service may wait for their answers.
 
-Each may read the whole history. One is answered after the other, because several threads that
-compute would hold up the demands much longer.
+Each call may read the whole history. The calls are answered one after the other, because several
+computing threads would delay the demands much longer.
 """
 
 
@@ -86,7 +86,7 @@ class DemandNode(Node):  # type: ignore[misc]
             generator: takes the demands.
             action_name, demand_action_name: the names of the two actions.
             level: the level at which to answer a goal that names no level.
-            timeout_s: how many seconds a rollout may take to reach its level; then its goal fails.
+            timeout_s: how many seconds a rollout may take to reach its level before its goal fails.
             status: watches rollouts; None without access to the clusters.
         """
         super().__init__("demandops")
@@ -143,7 +143,7 @@ class DemandNode(Node):  # type: ignore[misc]
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
         """Answer a call of the service in another thread.
 
-        The call may take seconds, if it reads an old revision.
+        A call that reads an old revision may take seconds, and must not block the executor.
         """
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
@@ -187,7 +187,7 @@ class DemandNode(Node):  # type: ignore[misc]
                 lambda future: self._in_executor(partial(journaled.set_result, future.result()))
             )
             if await journaled:
-                if len(self._goals) > _DEFAULT_DEPTH:  # not ==: a burst may be journaled together
+                if len(self._goals) > _DEFAULT_DEPTH:  # not ==, because goals may come in bursts
                     self.get_logger().warning(_SHALLOW, once=True)
                 self.executor.create_task(self._forget_unless_accepted, goal)
                 return GoalResponse.ACCEPT
@@ -203,7 +203,7 @@ class DemandNode(Node):  # type: ignore[misc]
     def _accepted(self, handle: ServerGoalHandle) -> None:
         """Store the handle of an accepted goal, and publish the feedback that was made before.
 
-        rclpy makes the handle only after the goal is accepted.
+        There was no handle before, because rclpy makes the handle only after the acceptance.
         """
         goal = self._goals[id(handle.request)]
         goal.handle = handle
@@ -289,7 +289,7 @@ class DemandNode(Node):  # type: ignore[misc]
             self._finish(goal, receipt, level)
             return
         prefix = f"{health.object}: " if health.object else ""
-        message = f"{prefix}{health.reason}; it is booked in {receipt.commit}"
+        message = f"{prefix}{health.reason}; the demand is booked in {receipt.commit}"
         self._finish(goal, NotReached(level, message))
 
     def _finish(
@@ -301,9 +301,9 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- events that other threads pass to the executor's thread ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Send a stage as feedback, but log a refusal at once.
+        """Send a stage as feedback; if the stage is ``refused``, log the refusal at once instead.
 
-        The result reports the refusal too, but a crash may prevent the result.
+        The result reports the refusal too, but a crash may come before the result.
         """
         if stage == "refused":
             goal.is_refused = True

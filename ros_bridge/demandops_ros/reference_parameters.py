@@ -54,7 +54,10 @@ def read(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` without effect; it names the replacement."""
+    """Yield a warning for each parameter in ``values`` that has no effect.
+
+    The warning says what replaces the parameter.
+    """
     for name in dict.fromkeys(each.partition(".")[0] for each in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"
@@ -62,16 +65,16 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     if values.get("namespace") not in (None, *namespaces):
         yield (
             f"parameter namespace of the reference is not used: {quoted(values['namespace'])} is "
-            f"not a namespace in {config.place_of(DOMAINS_FILE)}; services run in that of their "
-            "access domain"
+            f"not a namespace in {config.place_of(DOMAINS_FILE)}; services run in the namespace of "
+            "their access domain"
         )
     registry = values.get("k3d_image_registry")
     images = config.images.values()
     if registry and not all(image.repository.startswith(f"{registry}/") for image in images):
         yield (
             "parameter k3d_image_registry of the reference is not used: set registry: "
-            f"{registry} in {config.place_of(IMAGES_FILE)}, with the names that its images have "
-            "there (docs/migration.md)"
+            f"{registry} in {config.place_of(IMAGES_FILE)}, and the names that the images have in "
+            "that registry (docs/migration.md)"
         )
     yield from _brokers(values, config)
     topics = values.get("connections.init_comm_topics") or ()

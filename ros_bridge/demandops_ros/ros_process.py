@@ -28,9 +28,9 @@ _LAST_CALLBACK_S = 20.0
 class ExecutorThread:
     """Runs a node's callbacks in a thread that ends before the node is destroyed and Python exits.
 
-    The thread ends itself. rclpy's ``shutdown`` does not wait for running callbacks and destroys
-    what the thread may need. If the thread still waits for ROS when Python exits, the process
-    aborts.
+    The thread ends itself, because rclpy's ``shutdown`` does not wait for running callbacks and
+    destroys what the thread may need. If the thread still waits for ROS when Python exits, the
+    process aborts.
     """
 
     def __init__(self, node: Node, name: str = "executor") -> None:
@@ -73,7 +73,7 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
 
     def wait() -> None:
-        while not over.wait(_POLL_S):  # poll: another thread may get the signal
+        while not over.wait(_POLL_S):  # poll, because another thread may get the signal
             pass
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)

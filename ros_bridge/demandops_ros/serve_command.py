@@ -121,7 +121,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
                 "fetch_interval": fetch_interval,
             }
         )
-        # before the generator starts: it may publish demands of the journal, and then logs them
+        # set up the log first, because the generator may log demands of the journal at its start
         ros_process.log_to(get_logger("demandops"), settings["log_level"])
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = clusters_file.read(access_file).clusters if access_file else {}
@@ -233,7 +233,7 @@ def _drain(
     end = REAL.monotonic() + _TASK_S
     while node.open_goals and REAL.monotonic() < end:
         REAL.sleep(_POLL_S)
-    for _ in range(2):  # results are sent by tasks of the executor: wait until they have run
+    for _ in range(2):  # tasks of the executor send the results, so wait until they have run
         done = REAL.event()
         thread.call(done.set)
         done.wait(_TASK_S)
@@ -245,11 +245,11 @@ def _drain(
 
 
 class _Signals:
-    """Handles Ctrl-C and SIGTERM: the first signal stops the program after its open goals.
+    """Handles Ctrl-C and SIGTERM: the first signal stops the program once its goals are finished.
 
-    A second signal stops the program at once. The kernel may deliver a signal to any thread. Python
-    writes the signal to a wake-up pipe. The main thread reads this pipe, so it notices the signal
-    at once.
+    A second signal stops the program at once. The kernel may deliver a signal to any thread.
+    Therefore Python writes each signal to a wake-up pipe, which the main thread reads. So the main
+    thread notices the signal at once.
     """
 
     def __init__(self) -> None:

@@ -141,8 +141,8 @@ def test_a_generator_without_a_key_warns_once_where_keys_are_listed(
     bare: Path, state: Any, key: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     warning = (
-        "policy/allowed-signers lists who may sign, but this generator has no key; `verify` will "
-        "refuse its commits, and generators will treat them as commits by a person; start the "
+        "policy/allowed-signers lists who may sign, but this generator has no key, so `verify` "
+        "will refuse its commits, and generators will treat them as commits by a person; start the "
         "generator with --signing-key"
     )
     with rig.running(bare) as generator:

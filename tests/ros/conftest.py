@@ -36,7 +36,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
 def servers(
     tmp_path: Path, data_home: Path, ros_domain: int, warm: WarmCommands
 ) -> Iterator[Servers]:
-    """The starter of commands that use ROS; the end of the test kills those that still run."""
+    """The starter of commands that use ROS; the end of the test kills commands that still run."""
     made = Servers(tmp_path, ros_domain, warm)
     yield made
     made.kill()
@@ -59,7 +59,7 @@ def client(ros_domain: int) -> Iterator[Client]:
     made.close()
 
 
-# # ---- one node for all tests that neither restart it nor change its set-up ----
+# ---- one node for all tests that neither restart it nor change its set-up ----
 
 
 @pytest.fixture(scope="session")

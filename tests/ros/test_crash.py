@@ -1,4 +1,4 @@
-"""After kills of the node in bursts of goals, each accepted goal is booked, or refused in the log.
+"""If the node is killed in bursts of goals, each accepted goal is booked, or refused in the log.
 
 The node is killed three times by default, and a hundred times with ``GOAL_KILLS=100``.
 """
@@ -23,7 +23,7 @@ BURST = 40
 
 
 def _goal(number: int) -> rig.Goal:
-    """Return a goal; the node refuses every fourth one, which names an unknown node."""
+    """Return a goal; every fourth goal names an unknown node, so that it is refused."""
     wrong = {} if number % 4 else {"target_node_id": "egde"}
     return {**connection(number % BURST, **wrong), "id": f"request{number}"}
 
@@ -73,7 +73,7 @@ def test_killed_in_a_burst_each_accepted_goal_is_booked_or_refused_in_the_log(
     trailer = "--format=%(trailers:key=Request-Id,valueonly)"
     booked = git(bare, "log", trailer, "main").split()
     log = "".join(path.read_text() for path in served.log.parent.glob("node-*.log"))
-    reasons = ("unknown-node: ", "was refused, but the reason was lost; send it again")
+    reasons = ("unknown-node: ", "the demand was refused, but the reason was lost")
     refused = [line for line in log.splitlines() if any(reason in line for reason in reasons)]
     shown = {n for n in answered if any(f"'request{n}'" in line for line in refused)}
     assert shown == {number for number in answered if number % 4 == 0}

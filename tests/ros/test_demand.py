@@ -82,7 +82,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
         assert books["commit"] == held.commit
     assert shared.bookkeeping()["services"] == {}
     assert operations(shared, before) == ["put", "release"]
-    # an action client may miss the first feedback, and drops any that comes after the result
+    # an action client may miss the first feedback, and drops feedback that comes after the result
     assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
@@ -154,7 +154,9 @@ def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: De
 def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
     shared: Served, vehicle: DemandClient, before: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    vehicle._sender._wait_until_discovered(time.monotonic() + DEADLINE_S)  # not by the goal itself
+    vehicle._sender._wait_until_discovered(
+        time.monotonic() + DEADLINE_S
+    )  # the goal itself does not wait
     known, lost = vehicle._sender._await, [DemandError("timeout", "the response was lost")]
 
     def lose_first(future: Any, deadline: float) -> Any:
@@ -187,7 +189,7 @@ def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
 
 @pytest.fixture
 def short_leases(shared: Served) -> Iterator[None]:
-    """For the length of a test, leases in the access domain end after two seconds."""
+    """Let the leases in the access domain end after two seconds, during the test."""
     repo = GitRepo(Path(shared.state_repo))
     text = repo.files(POLICY)[POLICY]
     policy = yaml.safe_load(text)

@@ -1,4 +1,4 @@
-"""The event detector as a process: vehicles publish their poses, and it demands applications."""
+"""The event detector as a process: vehicles publish their poses, and the detector sends demands."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
 _MOST_AHEAD_S = 2.0
 """How many seconds the simulated time may run ahead of the time that the detector has reported.
 
-The detector takes a vehicle that is silent for 5 s for gone. With this limit, no vehicle looks
-silent on a slow machine.
+If a vehicle has been silent for 5 s, it counts as gone. With this limit, that happens to no vehicle
+only because the machine is slow.
 """
 STATION = (-5352.679, -3363.067)
 S, V0, V1, V2, V3 = paper.S, paper.V0, paper.V1, paper.V2, paper.V3
@@ -58,7 +58,7 @@ class Fleet:
         """The simulated time stops here until the detector has reported a later time."""
         self._since = 0.0
         self.is_timeless = False
-        """Whether the vehicles publish no simulated time."""
+        """Whether the fleet stops publishing the simulated time."""
         self.node.create_timer(0.1, self._publish)
 
     def _hear(self, message: Any) -> None:
@@ -76,7 +76,7 @@ class Fleet:
         self._away[vehicle] = away
 
     def forget(self) -> None:
-        """Discard the last detector's reports, so that `until` waits for those of the next one."""
+        """Discard the last detector's reports, so that `until` waits for the next detector's."""
         self.statuses.clear()
         self._limit, self._since = inf, self._seconds
 
@@ -113,7 +113,7 @@ class Fleet:
                 return False
             found = true()
             took = time.monotonic() - began
-            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles publish between
+            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles publish meanwhile
             return found
 
         wait_until(spun, what, 60)
@@ -177,7 +177,7 @@ def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_pa
     fleet.forget()
     fleet.is_timeless = True
     detecting = detect()
-    fleet.until(lambda: fleet.node.count_subscribers("/demandops/bookkeeping"), "it is heard")
+    fleet.until(lambda: fleet.node.count_subscribers("/demandops/bookkeeping"), "a subscriber")
     fleet.is_timeless = False  # the detector gets the time only after the bookkeeping
     fleet.until(lambda: fleet.entities() == "3", "the others are seen")
     fleet.pace = 10
@@ -189,8 +189,8 @@ def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_pa
     expect(8)
     assert detecting.stop() == 0
     log = detecting.log.read_text()
-    assert "vehicle01 was not seen since the start" in log
-    assert "vehicle03 is silent for 5 s" in log
+    assert "vehicle01 has not been seen since the start" in log
+    assert "vehicle03 has been silent for 5 s" in log
     assert commits(served) == ["init", *["join"] * 4, *["shutdown"] * 4]
 
 
@@ -229,7 +229,7 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
 
     fleet.drive(V0, 50)
     fleet.until(lambda: "unknown-node" in detecting.log.read_text(), "the demand is refused")
-    fleet.until(lambda: served.log.read_text().count("unknown-node") > 2, "it is tried again")
+    fleet.until(lambda: served.log.read_text().count("unknown-node") > 2, "more tries")
     assert detecting.log.read_text().count("unknown-node") == 1, "the refusal must be logged once"
     names = Counter(fleet.node.get_node_names())
     assert names["watcher"] == names["demandops_detector_client"] == 1, names

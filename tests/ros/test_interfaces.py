@@ -1,6 +1,6 @@
 """The ROS 2 interfaces: their wire format, and a goal with its feedback and result.
 
-A test runs this file as a script, `round_trip`, in an environment of its own.
+A test runs this file as a script, which calls `round_trip`, in an environment of its own.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ from tests.kit.ros import Client, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
-    """Delay every push to a repository until its folder has a file ``go``; return its URL."""
+    """Return the URL of a repository that delays every push until its folder has a file ``go``."""
     hook(bare, "pre-receive", "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
 
@@ -51,7 +51,7 @@ def test_the_eight_steps_of_the_paper_give_its_bookkeeping(serve: Serve, client:
         if step == 1:  # the node may not have found the client's subscription to feedback yet
             client.wait(lambda: bool(client.call(experiment(1)).feedback))
         else:
-            client.wait(lambda: len(answer.feedback) == 4)  # noqa: B023 - it may come last
+            client.wait(lambda: len(answer.feedback) == 4)  # noqa: B023 - feedback may be late
         assert answer.feedback == stages[4 - len(answer.feedback) :]
         assert git(served.state_repo, "rev-parse", "main") == commit
         books = served.bookkeeping()
@@ -103,7 +103,7 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
 def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> None:
     """If the executor's thread were still in ROS, Python would abort at the end of the process.
 
-    The program ends once with the thread closed, and once without.
+    One program closes the thread itself, the other leaves that to the end of the process.
     """
     program = (
         "import rclpy, time; from demandops_ros.ros_process import ExecutorThread\n"
@@ -293,7 +293,7 @@ def test_calls_for_the_bookkeeping_are_answered_one_after_the_other(
             caller.executor.spin_once(timeout_sec=0.001)
             most = max(most, len(list(threads.iterdir())))
         answers += [call.result() for call in calls]
-    assert most <= idle + 2, "one reads, and the one before it may still be ending"
+    assert most <= idle + 2, "one thread reads, and the thread before it may still be ending"
     assert sum(answer.ok for answer in answers) >= 40
     refused = {answer.message for answer in answers if not answer.ok}
     assert refused <= {"4 calls are being answered; try again later"}

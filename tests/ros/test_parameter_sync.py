@@ -1,4 +1,4 @@
-"""`demandops parameter-sync` watches a ConfigMap and sets a running node's parameters to it."""
+"""`demandops parameter-sync` keeps a running node's parameters equal to those in a ConfigMap."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ StartFusion = Callable[[], "subprocess.Popen[bytes]"]
 
 @pytest.fixture
 def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
-    """Return a function that starts the stand-in of the fusion; the end of the test kills it."""
+    """Return a function that starts a stand-in of the fusion, which the test's end kills."""
     environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain), "PYTHONFAULTHANDLER": "1"}
     names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
     topics = [f"{name}_topic:=/{name}" for name in names]

@@ -66,7 +66,7 @@ REPLACED = [
     f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; --clusters "
     "gives access for answers at reconciled or healthy",
     f"parameter k3d_image_registry {UNUSED} set registry: k3d-registry.localhost:41671 in "
-    "registry/images.yaml, with the names that its images have there (docs/migration.md)",
+    "registry/images.yaml, and the names that the images have in that registry (docs/migration.md)",
 ]
 
 
@@ -99,7 +99,7 @@ def test_what_the_state_repo_lacks_is_named(ros: None, tmp_path: Path) -> None:
     assert told(tmp_path, text) == [
         REPLACED[0],
         f"parameter namespace {UNUSED} 'default' is not a namespace in "
-        "policy/access-domains.yaml; services run in that of their access domain",
+        "policy/access-domains.yaml; services run in the namespace of their access domain",
         REPLACED[1],
         f"parameter connections.communication_broker_params.edge.host {UNUSED} the broker of node "
         "'edge' at service-mqtt-broker-edge:1994 is not in inventory/brokers.yaml; add it there",

@@ -28,9 +28,10 @@ Poses = list[tuple[float, str, float, float]]
 
 
 def driven(seed: int) -> Poses:
-    """Return poses of vehicles that pass the station on straight lines, ten a second, by time.
+    """Return the poses of vehicles that pass the station on straight lines, sorted by time.
 
-    Some vehicles are silent for a while. The seed decides lines, speeds and silences.
+    Each vehicle reports ten poses a second, but may be silent for a while. The seed decides about
+    lines, speeds and silences.
     """
     chance, poses = random.Random(seed), []
     for vehicle in VEHICLES:
@@ -119,7 +120,7 @@ STATE_FIELDS = "string model\nfloat64[] continuous_state\n"
 def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
     demandops: Run, tmp_path: Path, plugin: StoragePlugin
 ) -> None:
-    """The package of EgoData is not installed; the test defines the fields that it needs."""
+    """The package of EgoData is not installed, so the test defines the fields that it needs."""
     types = get_typestore(Stores.ROS2_KILTED)
     types.register(get_types_from_msg(STATE_FIELDS, "perception_msgs/msg/ObjectState"))
     types.register(get_types_from_msg(EGO_FIELDS, EGO))

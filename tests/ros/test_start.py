@@ -1,4 +1,4 @@
-"""What `demandops serve` refuses at its start, and what a test reports of a start that hangs."""
+"""What `demandops serve` refuses at its start, and what a test reports about a start that hangs."""
 
 from __future__ import annotations
 

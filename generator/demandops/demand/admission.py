@@ -1,6 +1,6 @@
-"""Admission: the check that the configuration can run what a request demands.
+"""Admission: the check that what a request demands can run with the configuration.
 
-It uses appdefs, inventory, brokers and access domains, but not the ledger.
+The check reads appdefs, inventory, brokers and access domains, but not the ledger.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from demandops.quoting import quoted
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
     """Yield every reason why ``request`` cannot be fulfilled, whatever the ledger contains.
 
-    A shutdown may name nodes that are not in the inventory, so that their claims can be released.
+    A shutdown may name nodes that are no longer in the inventory, so that claims on these nodes can
+    be released.
     """
-    # a request without an id of its own has the id of its demand
+    # if the goal gives no request id, the request has the demand's id, which is checked below
     if request.id and request.id != request.demand:
         yield from _id("id" if request.is_reference else "request", request.id)
     if not request.is_reference:
@@ -47,7 +48,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         found = [*_id("id", one.held.id), *_requesters(one.requesters)]
         if isinstance(one.held, Application):
             of_app = _application(one.held, config, request.adds_claims)
-            # if the placement found no node for the application, the placement reports this
+            # the placement itself reports that it found no node, so an empty node is no fault then
             placed = one.held.node or one.held.place is None
             found += [each for each in of_app if placed or each.field != "node"]
         else:
@@ -80,13 +81,13 @@ def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
 
 def _too_large(size: str, limit: str, most: int) -> str:
     return (
-        f"{size}; at most {most} are allowed; a platform engineer may raise limits.{limit} in "
+        f"{size}, but at most {most} are allowed; a platform engineer may raise limits.{limit} in "
         f"{ROOT_FILE}"
     )
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of fields that a Demand has, but a DeploymentRequest has not."""
+    """Yield the faults of the fields that only a Demand has, and not a DeploymentRequest."""
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         message = (
@@ -148,7 +149,7 @@ def _delivery(where: str, delivery: Delivery, services: Services) -> Iterator[Fa
         message = f"{quoted(delivery.output)} is not an output{suggestion(delivery.output, known)}"
         yield fault(f"{where}.output", message)
     elif delivery.topic and service.roots:
-        message = f"{name} may make several topics, so none can have another name; leave it out"
+        message = f"{name} may make several topics, so a delivery cannot rename them; leave it out"
         yield fault(f"{where}.topic", message)
     problem = topic_problem(delivery.topic) if delivery.topic else ""
     if problem:
@@ -170,9 +171,9 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
             cluster = config.nodes[app.node].cluster
             yield fault(
                 "node",
-                f"'{app.node}' is in cluster '{cluster}', where {service.name}, which it needs, "
-                f"has no node; choose a node in {' or '.join(service.nodes)}, or ask for a change "
-                f"of nodes in {service.file}",
+                f"'{app.node}' is in cluster '{cluster}', where the application's service "
+                f"{service.name} has no node; choose a node in {' or '.join(service.nodes)}, or "
+                f"ask for a change of nodes in {service.file}",
                 code="no-node",
             )
     yield from _named_services(app, appdef.name, config)
@@ -187,7 +188,10 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
 
 
 def _named_services(app: Application, appdef: str, config: Config) -> Iterator[Fault]:
-    """Yield a fault for each named service that is unknown or gets no node of its own."""
+    """Yield a fault for each service that the demand names, but that gets no node by this.
+
+    Such a service is unknown, must not be named by a demand, or is named with an empty node.
+    """
     services = config.services[appdef]
     for name in app.named:
         service = services.get(name)
@@ -196,8 +200,8 @@ def _named_services(app: Application, appdef: str, config: Config) -> Iterator[F
             yield fault(f"services.{name}", f"{appdef} has no such service{known}")
         elif not service.is_placeable:
             message = (
-                f"{name} runs at its sources, or for applications of other types too, so no "
-                "demand names its node; leave it out"
+                f"{name} runs at its sources, or for applications of other types too, so a demand "
+                "cannot name its node; leave it out"
             )
             yield fault(f"services.{name}", message)
         elif not app.services.get(name):
@@ -213,7 +217,7 @@ def _instance(
     """
     id, _, named = app.id.rpartition("@")
     if app.separate and (not id or named != app.version):
-        message = f"{quoted(app.id)} of a separate instance does not end in '@{app.version}'"
+        message = f"{quoted(app.id)} is a separate instance, but does not end in '@{app.version}'"
         yield fault("id", f"{message}; remove the claim, and demand the version instead")
     elif not app.separate and appdef.versions == "separate" and id and named in versions:
         yield fault(
@@ -309,13 +313,14 @@ def with_chosen_types(
 ) -> AnyRequest:
     """Return ``request`` with the type and the broker that each connection gets.
 
-    A claimed connection keeps its current type. A new connection gets the first type that can carry
-    it (:func:`connection_types.choose_type`), or no type if none can.
+    A type that the request names stays. If the request names none, a claimed connection keeps the
+    type of its claim, and a new connection gets the first type that can carry it
+    (:func:`connection_types.choose_type`). If no type can carry it, it gets none.
 
     Args:
         request: the request.
         config: the configuration, which has the nodes and brokers.
-        current: returns the claimed connection with an id, or ``None``.
+        current: takes an id and returns the claimed connection that has it, or ``None``.
     """
 
     def chosen(one: Demanded) -> Demanded:

@@ -17,7 +17,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 class InputTopic(NamedTuple):
     """An input topic of an application, and the node that publishes it.
 
-    ``further``: when this topic was booked, another topic was the usual topic of the node
+    ``further`` is true if another topic was the node's usual topic when this topic was booked
     (:mod:`demandops.plan.output_topics`).
     """
 
@@ -30,14 +30,15 @@ class InputTopic(NamedTuple):
     def part(self) -> str:
         """The text that stands for this input in topic names.
 
-        It is made from the source. For a further topic, it contains the topic too.
+        The text contains the source. For a further topic, it also contains the topic.
         """
         return self.part_in("")
 
     def part_in(self, version: str) -> str:
-        """Return the text that stands for this input in topic names of a separate instance.
+        """Return the text that stands for this input in the topic names of a separate instance.
 
-        The text contains the ``version`` of the instance. An empty ``version`` gives :attr:`part`.
+        The text contains ``version``, the instance's version. If ``version`` is empty, the text is
+        :attr:`part`.
         """
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
@@ -54,7 +55,7 @@ class InputTopic(NamedTuple):
 class Delivery(NamedTuple):
     """An output (``<service>.<output>``) that is brought to a node.
 
-    Without ``topic`` the output keeps its name.
+    Without ``topic``, the output has the same topic name there.
     """
 
     output: str
@@ -64,9 +65,10 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """Requirements on a node: its type, labels as pairs, capabilities and properties.
+    """Requirements on a node: its role, labels, capabilities and properties.
 
-    ``properties`` are texts like ``memoryGiB>=8`` (:mod:`demandops.config.node_property`).
+    ``labels`` are pairs of key and value. ``properties`` are texts like ``memoryGiB>=8``
+    (:mod:`demandops.config.node_property`).
     """
 
     role: str = ""
@@ -80,7 +82,7 @@ class Requirement:
         return len(self.labels) + len(self.capabilities) + len(self.properties)
 
     def united(self, other: Requirement) -> Requirement:
-        """Return the requirement that a node meets if it meets this one and ``other``."""
+        """Return the requirement that a node meets if it meets both this one and ``other``."""
         return Requirement(
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
@@ -91,15 +93,17 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
-    """One application: an appdef at a node with inputs by role.
+    """One application: its appdef, its node, and its inputs by role.
 
-    ``appdef`` is ``#<number>`` if the goal's number is unknown. In a claim the inputs of each role
-    are sorted by topic (:meth:`booked`). ``place`` has the requirements on the node; it is ``None``
-    if the demand names the node. ``separate`` says that this version runs at the same time as other
-    versions, and that the id ends in the version (:mod:`demandops.demand.separate_instance`).
-    ``services`` maps each service that has a node of its own to this node. ``named`` lists the
-    services whose node the demand names; the generator chose the nodes of the other services.
-    ``moved`` maps each service that an override moves to the node where it runs then.
+    ``appdef`` is ``#<number>`` if a goal gives the application's type as a number that no appdef
+    has. In a claim, the inputs of each role are sorted by topic (:meth:`booked`). ``place`` has the
+    requirements on the node; it is ``None`` if the demand names the node. ``separate`` says that
+    this version runs at the same time as other versions, and that the id ends in the version
+    (:mod:`demandops.demand.separate_instance`).
+
+    ``services`` maps service names to nodes, for services that have a node of their own. ``named``
+    lists the services for which the demand itself names the node; the generator chose the nodes of
+    the other services. ``moved`` maps service names to nodes, for services that an override moves.
     """
 
     id: str
@@ -119,7 +123,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     )
 
     def __eq__(self, other: object) -> bool:
-        """Compare exactly: in Python 1 equals True and 1.0, but a chart treats them differently."""
+        """Compare exactly, because Python treats 1, 1.0 and True as equal, but a chart does not."""
         if not isinstance(other, Application):
             return NotImplemented
         compared = (one.name for one in fields(self) if one.compare)
@@ -151,7 +155,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs of a role with this source and topic; all inputs must be sorted."""
+        """Return the inputs of a role with this source and topic.
+
+        The inputs of the role must be sorted, as they are in a claim.
+        """
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
@@ -160,10 +167,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further inputs of a role that have the text ``part`` in topic names.
+        """Return the further inputs of a role for which ``part`` stands in topic names.
 
-        For a separate instance, the usual inputs of the role count too. The parts of all inputs are
-        computed only once, because the plan of each service for a further topic needs them.
+        For a separate instance, the usual inputs of the role are returned too. The parts of all
+        inputs are computed only once, because the plan of each service for a further topic needs
+        them.
         """
         if not self._further:
             for known, topic in self.all_inputs():
@@ -183,7 +191,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return {*self.chosen_nodes, *self.moved.values(), *sources}
 
     def chosen_node(self, service: str) -> str:
-        """Return the node that is chosen for a service.
+        """Return the node that the demand or the generator chose for a service.
 
         The service runs elsewhere if an override moves it, or if it runs at its sources.
         """
@@ -321,7 +329,7 @@ def _exact(values: Mapping[str, object]) -> str:
 
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return topics merged by (topic, source); a later type replaces a missing one."""
+    """Return one topic for each (topic, source), sorted: the first that has a type, if any has."""
     merged: dict[tuple[str, str], InputTopic] = {}
     for topic in topics:
         known = merged.setdefault((topic.topic, topic.source), topic)

@@ -1,7 +1,7 @@
 """The choice of an access domain if a demand names a node that is in several domains.
 
-In each further domain the node has a name of its own, ``<node>@<domain>``, which a demand may give
-wherever it names a node. ``<node>@<first domain>`` is the node itself.
+In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
+it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
 
 A demand may name the node without a domain for an application, for a service of an application, or
 for an end of a connection. The domain is then the one in which the subject is booked already. If
@@ -32,9 +32,9 @@ Booked = Callable[[Subject], "Held | None"]
 def with_chosen_domains(
     request: AnyRequest, config: Config, booked: Booked
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with a chosen access domain for each node.
+    """Return the request with a chosen access domain for each node, and the faults.
 
-    Return also a fault for each node whose domain is not clear.
+    There is a fault for each node for which several access domains are possible.
     """
     if not config.hosts:
         return request, []
@@ -116,6 +116,6 @@ def _chosen(
             named = " or ".join(id_in_domain(node, domain) for domain in domains)
             message = (
                 f"'{node}' is in the access domains {' and '.join(domains)}, and their rules let "
-                f"the requesters use it in each; name it as {named}"
+                f"the requesters use the node in each; name it as {named}"
             )
             faults.append(one.fault(field, message, code="several-access-domains"))

@@ -29,8 +29,8 @@ class ClaimKey:
 class Claim:
     """One demand's hold on an application or a connection.
 
-    ``joined`` is true if a goal of the reference's action booked the claim; then only goals of that
-    action can shut the claim down. If only some of the ``requesters`` hold a topic, ``partial``
+    ``joined`` is true if a goal of the reference's action booked the claim. Only goals of that
+    action can shut such a claim down. If only some of the ``requesters`` hold a topic, ``partial``
     maps this topic to the requesters that hold it.
     """
 
@@ -72,7 +72,7 @@ class Claim:
 
     @property
     def keeping_override(self) -> str | None:
-        """The name of the override whose effect ``keep`` made the claim, or ``None``."""
+        """The name of the override that made the claim by its effect ``keep``, or ``None``."""
         name = self.demand.removeprefix(OVERRIDE_PREFIX)
         return None if name == self.demand else name
 
@@ -98,7 +98,7 @@ class Claim:
 
         Args:
             held: the application or the connection that the returned claim holds.
-            holders: each topic of ``held`` → its requesters, sorted.
+            holders: maps each topic of ``held`` to the sorted requesters that hold it.
         """
         requesters = tuple(sorted({who for names in holders.values() for who in names}))
         partial = {topic: names for topic, names in holders.items() if names != requesters}
@@ -136,7 +136,12 @@ class Claim:
         return None if held is None else self.with_holders(held, holders)
 
     def without_node(self, node: str) -> Claim | None:
-        """Return the claim without the inputs or ends at a node; ``None`` if nothing is left."""
+        """Return what is left of the claim without a node; ``None`` if nothing is left.
+
+        An application loses its inputs from the node and its deliveries to it. A connection loses
+        the node as its broker. Nothing is left of an application with a service on the node, and of
+        a connection with an end there.
+        """
         held = self.held.without_node(node)
         if held is None:
             return None
@@ -145,8 +150,8 @@ class Claim:
     def after_booking(self, current: Claim | None) -> Claim:
         """Return the claim as a booking writes it to the ledger.
 
-        If the demand's earlier claim, ``current``, differs only in the lease, the time of booking
-        stays.
+        If the demand's earlier claim, ``current``, differs in nothing but the lease, the returned
+        claim keeps the earlier time of booking.
         """
         if current is None:
             return self

@@ -77,9 +77,10 @@ class GoalPosition(FrozenModel):
 class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
-    ``parameters`` maps names to values, ``parameters_json`` to values as JSON text. ``version`` is
-    a version or a channel of the registry. ``connect`` is the connection type for inputs from other
-    nodes that no connection of the demand carries. ``services`` maps service names to nodes.
+    ``parameters`` maps names to values, and ``parameters_json`` maps names to values as JSON text.
+    ``version`` is a version or a channel of the registry. ``connect`` is the connection type for
+    inputs from other nodes, unless a connection of the demand carries them. ``services`` maps
+    service names to nodes.
     """
 
     id: str = ""
@@ -122,9 +123,10 @@ def _lease_form(value: object) -> object:
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""A duration or seconds.
+"""A duration or a number of seconds.
 
-A validator of its own checks the form, because pydantic reports a fault for each member of a union.
+The validator :func:`_lease_form` checks this, because for a wrong value of a union, pydantic
+reports one fault for each type in the union.
 """
 
 
@@ -146,9 +148,13 @@ class DemandGoal(FrozenModel):
 
 
 _DEEPEST = 50
-"""The deepest nesting of a parameter's value; a claim's file may have 100 levels."""
+"""How many levels a parameter's value may have; a claim's file, which has the value, may have 100.
+"""
 _LONGEST_KEY = 128
-"""The longest key in a parameter's value. YAML reads keys of up to 1024 characters with escapes."""
+"""How many characters a key in a parameter's value may have.
+
+YAML reads keys of at most 1024 characters, in which an escape counts as several.
+"""
 _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
@@ -194,10 +200,10 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return where a goal has a field of an application or connection, so that a fault can name it.
+    """Return the path in the goal of a field of an application or connection, for faults.
 
-    ``item`` is the path of the application or connection in the goal. The requesters are a field of
-    the goal itself.
+    ``item`` is the path of the application or connection in the goal, and ``path`` is the field's
+    path in the item. The requesters are a field of the goal itself.
     """
     if path.startswith("requesters"):
         return path
@@ -211,17 +217,17 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
     if goal.applications or goal.connections:
         yield fault(
             "applications" if goal.applications else "connections",
-            f"a {goal.operation} names only its demand; to release a part, put the demand without "
-            "it",
+            f"a {goal.operation} names only its demand; to release a part of the demand, put the "
+            "demand without that part",
         )
     if goal.priority:
-        yield fault("priority", f"a {goal.operation} does not wait; leave it out")
+        yield fault("priority", f"a {goal.operation} does not wait for room; leave it out")
     if goal.positions:
         yield fault("positions", f"a {goal.operation} chooses no node; leave the positions out")
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return the requirement in ``place``, or ``None`` if it is empty; append its faults."""
+    """Return the requirement in ``place``, or ``None`` if ``place`` is empty; add to ``faults``."""
     if place == GoalPlace():
         return None
     told = {found.field for found in faults}
@@ -248,7 +254,7 @@ def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Pos
     found: dict[str, Position] = {}
     for index, one in enumerate(listed):
         if one.node in found:
-            message = f"{quoted(one.node)} has a position already; give it once"
+            message = f"{quoted(one.node)} has another position above; give only one"
             faults.append(fault(f"positions[{index}].node", message))
         found[one.node] = Position(x=one.x, y=one.y)
     return found
@@ -318,11 +324,12 @@ def _value_problem(value: object, depth: int) -> str:
     if depth > _DEEPEST:
         return f"is nested deeper than {_DEEPEST} levels; make it flatter"
     if isinstance(value, float) and not math.isfinite(value):
-        return f"holds {value}, which is not a finite number; give one, or leave it out"
+        return f"holds {value}, which is not a finite number; give another value, or leave it out"
     if isinstance(value, str) and not is_unicode(value):
         return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
     if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
-        return f"has the key {quoted(long[0])} of {len(long[0])} characters; at most {_LONGEST_KEY}"
+        length = f"{len(long[0])} characters, but at most {_LONGEST_KEY} are allowed"
+        return f"has the key {quoted(long[0])} of {length}"
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
     return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")

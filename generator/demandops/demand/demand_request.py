@@ -19,9 +19,8 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""A function that maps the path of a field in an item to its path in the goal, which faults name.
-
-An example of the first path is ``inputs.ego_data[2].source``.
+"""A function that takes the path of a field in an application or connection, and returns its path
+in the goal, which faults name. A path in an application is ``inputs.ego_data[2].source``.
 """
 
 
@@ -43,10 +42,13 @@ class Demanded:
     note: str = ""
     """How a connection differs from the requested one; the receipt has this text as a warning."""
     placed: tuple[str, ...] = ()
-    """For each placed application or service: the chosen node, and why, in words."""
+    """A sentence for each placed application or service: which node was chosen, and why."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
-        """Return a fault in the field ``path`` of this item; it names the field of the goal."""
+        """Return a fault for the field at ``path`` in this item.
+
+        The fault names the field by its path in the goal.
+        """
         return fault(self.place(path), message, code=code)
 
 
@@ -86,7 +88,7 @@ AnyRequest = TypeVar("AnyRequest", bound=DemandRequest)
 
 @dataclass(frozen=True, slots=True)
 class Join(DemandRequest):
-    """The reference's goal: it adds claims to the earlier claims of its requesters."""
+    """A goal of the reference's action, which adds to what its requesters hold already."""
 
     operation = "join"
     adds_claims = True
@@ -95,7 +97,7 @@ class Join(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Shutdown(DemandRequest):
-    """The reference's goal with ``shutdown``: its requesters give up claims or parts of them."""
+    """A goal of the reference's action with ``shutdown``: its requesters give up what it lists."""
 
     operation = "shutdown"
     is_reference = True
@@ -103,7 +105,7 @@ class Shutdown(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Put(DemandRequest):
-    """Our own goal, after which its demand holds exactly the listed applications and connections.
+    """A goal of our own action, after which the demand holds exactly what the goal lists.
 
     ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that
     have none in the inventory. ``priority`` ranks the demand among those that wait for room.

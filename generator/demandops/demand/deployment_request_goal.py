@@ -88,7 +88,7 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return where a goal has a field of an application, so that a fault can name the place.
+    """Return the path in the goal of a field of an application, for faults.
 
     ``item`` is the application's path in the goal (``apps[0]``), and ``path`` is the field's path
     in :class:`Application`. ``lists`` maps roles to the goal's lists of topics.
@@ -109,7 +109,7 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return where a goal has a field of a connection, so that a fault can name the place.
+    """Return the path in the goal of a field of a connection, for faults.
 
     ``item`` is the connection's path in the goal (``connections[0]``), and ``path`` is the field's
     path in :class:`Connection`. The goal has two lists of topics: the names at the source, and the
@@ -130,7 +130,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
     Args:
         data: the goal as a mapping, as ``ros2 action send_goal`` takes it.
-        appdef_by_type: returns the appdef of a number in the message, or ``None``.
+        appdef_by_type: takes the number of an application type in the message, and returns the
+            appdef that has it, or ``None``.
 
     Returns:
         The request and the faults of its form. Fields of the wrong form are left out of the
@@ -147,7 +148,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     ]
     for index, connection in enumerate(goal.connections):
         where = f"connections[{index}]"
-        # an invalid type becomes None, so that the rules of no type apply
+        # an invalid type becomes None, so that nothing is checked that depends on the type
         kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
         demanded.append(_connection(where, connection, kind))
         if kind is None and f"{where}.type" not in faulty:
@@ -161,7 +162,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
                 "target topic i, so list as many of each"
             )
             faults.append(fault(f"{where}.target_topics", message))
-    # if "shutdown" is invalid, check a shutdown, because its rules are also rules for a join
+    # if "shutdown" is invalid, treat the goal as a shutdown, because a join must obey all its rules
     operation = Shutdown if goal.shutdown or "shutdown" in faulty else Join
     return operation(id=goal.id, demanded=tuple(demanded)), faults
 

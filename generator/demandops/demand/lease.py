@@ -50,9 +50,10 @@ class Lease:
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease with its full term from ``now``.
+        """Return the lease as it starts at ``now``, when a person approves the claim.
 
-        The result ends no earlier than ``before``, if that is given.
+        If ``before`` is given, the lease that the claim had until now, the result is that lease
+        after a renewal, so it ends no earlier than ``before``.
         """
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)
@@ -63,13 +64,14 @@ class Lease:
         return self.until + timedelta(seconds=self.slack)
 
     def has_ended(self, now: datetime) -> bool:
-        """Return whether the claim may be released: the recorded end and the slack have passed."""
+        """Return whether the claim may be released: the recorded end plus the slack has passed."""
         return self.expires_at < now
 
     def renewed(self, term: Term, now: datetime) -> Lease:
-        """Return the lease after a renewal; it is unchanged if the slack covers the renewal.
+        """Return the lease after a renewal.
 
-        The end never moves to an earlier time, because the clock may have been set back.
+        If the slack covers the renewal, the lease stays the same. The end never moves to an earlier
+        time, because the clock may have been set back.
         """
         wanted = term.lease_from(now)
         if (self.seconds, self.slack) == (

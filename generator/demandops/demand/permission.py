@@ -1,4 +1,4 @@
-"""Permission: the check that requesters may demand these applications, nodes and leases.
+"""Permission: the check that requesters may demand the applications, nodes and leases they ask for.
 
 The access domains of the nodes decide. Every refusal names the rule. A connection between two
 domains needs a rule in each domain that names the other domain. A domain, one of its rules or an
@@ -21,12 +21,12 @@ from demandops.demand.lease import Term
 from demandops.errors import Fault, fault
 
 Access = list[tuple[str, str]]
-"""Pairs of a rule's field (``nodes``, ``applications``) and a value that a demand needs there."""
+"""Pairs of a rule's field, such as ``nodes``, and a value that this field must allow."""
 
 PEERS = "peers"
-"""The field of a rule with the access domains at the other ends of connections."""
+"""The field of a rule that lists the access domains to which connections may lead."""
 _NO_RULES = (Rule(name="everything"),)
-"""The rules of a domain that has none: everybody may demand everything inside of the domain."""
+"""The rules that apply to a domain without rules: everybody may demand everything inside of it."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
@@ -47,7 +47,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield each access domain of an application or connection, and the access needed there."""
+    """Yield each access domain that an application or connection uses, and the access it needs."""
     more: Access = []
     if isinstance(held, Application):
         nodes, first = _service_nodes(held, config), [("applications", held.appdef)]
@@ -66,9 +66,9 @@ def needed_access(
 def _service_nodes(app: Application, config: Config) -> Iterable[str]:
     """Return the nodes on which services of an application run.
 
-    These are the application's node, sources of inputs, and the nodes of services that run once for
-    a cluster or are placed one by one. A node to which an override moves a service is left out: the
-    override's owner decides on it.
+    These are the application's node, the sources at which services run, and the nodes of services
+    that run once for a cluster or have a node of their own. A node to which an override moves a
+    service is left out, because the override's owner decides about that node.
     """
     services = config.services.get(app.appdef, {}).values()
     roles = {role for one in services if one.at_source for role in one.roots}
@@ -103,8 +103,8 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
         if not own:
             known = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
-                f"no rule of access domain '{domain.name}' is for '{requester}', only {known}; "
-                "ask for a change of policy/"
+                f"no rule of access domain '{domain.name}' is for '{requester}'; its rules are "
+                f"{known}; ask for a change of policy/"
             )
         else:
             reasons = "; ".join(
@@ -147,7 +147,10 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
 
 
 def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with a lease term for each subject, by the policy of its domain."""
+    """Return the request with a lease term for each subject.
+
+    The lease policy of the subject's access domain sets the term.
+    """
 
     def with_term(one: Demanded) -> Demanded:
         domain = config.domain_of.get(one.held.home)
@@ -173,7 +176,7 @@ def _wanted_lease(request: DemandRequest) -> int | None:
 def approval_reasons(
     request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
-    """Return the reasons why a request needs approval, each once: ``access domain 'edge'``.
+    """Return the reasons why a request needs approval, such as ``access domain 'edge'``, each once.
 
     Renewals, releases and the claims of overrides need no approval.
 

@@ -1,12 +1,13 @@
-"""Separate instances: applications of other versions run at the same time as the default version.
+"""Separate instances: applications that run another version beside the default version.
 
-With ``versions: separate`` a demand for a version other than the default gets an application of its
-own. This application has the version in its id (``edge/fusion@1.1.0``), so its services, topics and
-connections have names of their own. It is removed with its last claim. Services that several
-definitions share run once for all versions.
+With ``versions: separate`` in the appdef, a demand for a version other than the default gets an
+application of its own. This application has the version in its id (``edge/fusion@1.1.0``), so its
+services, topics and connections have names of their own. It is removed with its last claim. A
+service that several appdefs share still runs only once, for all versions.
 
-A claim records the version, not the channel that the demand named, also for the default version.
-Otherwise a channel that moves would change the version of an application that others share.
+With ``versions: separate``, a claim records the version, not the channel that the demand named,
+even if this is the default version. If it recorded the channel, a channel that moves would change
+the version of an application that others share.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from demandops.demand.demand_request import AnyRequest, DemandRequest
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with applications of other versions turned into separate instances."""
+    """Return the request, in which an application of another version than the default is separate.
+
+    This holds for appdefs with ``versions: separate``.
+    """
     demanded = (
         replace(one, held=_separated(one.held, config))
         if isinstance(one.held, Application) and one.held.version

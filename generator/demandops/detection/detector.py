@@ -1,7 +1,7 @@
-"""The detector without ROS: from observations to the goals that its rules want.
+"""The detector without ROS: it turns observations into the goals that its rules want.
 
-It holds the rules in effect and the engine's state. The caller reads files and clocks, and sends
-the goals.
+The detector holds the rules in effect and the engine's state. The caller reads files and clocks,
+and sends the goals.
 """
 
 from __future__ import annotations
@@ -51,10 +51,11 @@ class Detector:
         """Continue the events whose demands were booked before the start; return what each wants.
 
         Args:
-            booked: a goal for each event. An event ends if there is no longer a rule for it.
+            booked: each event, with the goal that started its demand. An event ends if there is no
+                longer a rule for it.
             now: the time.
             settle_s: how many seconds the events' entities may stay unseen until they count as
-                gone. If their source's timeout is longer, it counts instead.
+                gone. If their source's timeout is longer, the timeout counts instead.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
@@ -79,14 +80,18 @@ class Detector:
         return found
 
     def set_clock(self, seconds: float) -> None:
-        """Adjust all times after the clock was set forward by ``seconds``, or back if negative."""
+        """Shift all recorded times by ``seconds``, because the clock was set by as much.
+
+        ``seconds`` is negative if the clock was set back.
+        """
         self._state = self._state.shifted(seconds)
 
     def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
-        """Replace the rules; return the changed wants of the events that have not ended.
+        """Replace the rules; return what changes for the events that have not ended.
 
-        An event ends if its rule is gone or is no longer for its entities. If the rule's demand has
-        changed, the event wants the new demand instead. ``settle_s`` is as in :meth:`resume`.
+        An event ends if its rule is gone or is no longer for its entities. If the rule has changed,
+        the event wants the goal of the new rule instead, unless the rule's template needs a value
+        that is not known. ``settle_s`` is as in :meth:`resume`.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)
@@ -104,7 +109,7 @@ class Detector:
         return changed
 
     def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the values for the rule's template, as they were when the event started.
+        """Return the values for the rule's template, from the start of the event.
 
         The result is ``None`` if the template needs a value that is not known.
         """

@@ -1,6 +1,7 @@
-"""Reads messages: which entity a message is about, where it is, and what it reports.
+"""Reads which entity a message is about, where the entity is, and which values it reports.
 
-It takes any object with attributes, so messages of rclpy and of a recorded bag are read alike.
+A message may be any object with attributes, so messages of rclpy and of a recorded bag are read
+alike.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class MessageReader:
     """Reads the messages of one source."""
 
     def __init__(self, file: RuleFile, source: str) -> None:
-        """Make a reader of the messages of ``source``; it reads the fields that ``file`` needs."""
+        """Make a reader of those fields of the messages of ``source`` that ``file`` needs."""
         definition = file.sources[source]
         self._source = source
         self._entity = definition.entity and _getter(definition.entity)
@@ -56,7 +57,7 @@ class MessageReader:
         if self._position:
             x, y = (_number(get(message)) for get in self._position)
             if abs(x) > _FARTHEST_M or abs(y) > _FARTHEST_M:
-                raise Unreadable(f"its position is more than {_FARTHEST_M:g} m from the origin")
+                raise Unreadable(f"the position is more than {_FARTHEST_M:g} m from the origin")
             position = x, y
         values = {field: _number(get(message)) for field, get in self._fields.items()}
         return Observation(self._source, entity, at, position, values)
@@ -82,7 +83,7 @@ def _getter(path: str) -> Getter:
             for name, index in parts:
                 value = getattr(value, name) if name else value[index]
         except (AttributeError, IndexError, TypeError):
-            raise Unreadable(f"it has no field {path}") from None
+            raise Unreadable(f"the message has no field {path}") from None
         return value
 
     return get

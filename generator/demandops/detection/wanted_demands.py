@@ -2,8 +2,8 @@
 
 This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
 outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
-nothing is sent for it. If two events want demands with the same id, as after a rule got another
-name, the second one waits until the first one has ended its demand.
+nothing is sent for it. If two events want demands with the same id, the second event waits until
+the first one has ended its demand. This happens when a rule gets another name.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from demandops.detection.rules.rule_demand import Goal
 Purpose = Literal["start", "renew", "end"]
 
 _RENEW_AFTER = 1 / 3
-"""The part of a lease after which to renew it; two more attempts fit before its end."""
+"""The fraction of a lease after which to renew it; two more attempts fit before the lease ends."""
 _RETRY_S = 5.0
 _OTHER_S = 0.2
-"""How long to wait for another event that holds a demand with the same id."""
+"""How many seconds until the next try while another event holds a demand with the same id."""
 _NOT_SENT = frozenset({"no-server", "rejected"})
 """The codes of goals that the node did not accept."""
 _UNKNOWN = "timeout"
@@ -119,7 +119,7 @@ class WantedDemands:
         """Record that a demand was booked before the start.
 
         The caller then calls :meth:`want` for the same event. If the event still wants the demand,
-        the next goal renews it, because the time left of its lease is not known.
+        the next goal renews the demand, because nobody knows how much time its lease has left.
         """
         entry = self._entries.setdefault(key, _Entry())
         entry.held, entry.renew_at = goal, -inf
@@ -201,7 +201,7 @@ class WantedDemands:
         return len(self._entries)
 
     def unanswered(self) -> int:
-        """Return how many events have a demand that is not yet booked or released as wanted."""
+        """Return how many events have a demand that is still to be booked or released."""
         return sum(one.wanted != one.held or not one.is_sure for one in self._entries.values())
 
     def refusals(self) -> Iterator[tuple[Key, str]]:

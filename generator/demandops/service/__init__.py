@@ -1,8 +1,8 @@
 """The generator as a service: submit a demand and get a receipt once it is published.
 
-Any thread may submit. One thread journals the demands that arrive. One worker thread owns the state
-repo: it commits each demand and publishes the commits together. After a crash it resumes from the
-journal.
+Any thread may submit a demand. One thread journals the demands that arrive. One worker thread owns
+the state repo: it commits each demand and publishes the commits together. After a crash, the next
+start resumes the demands in the journal.
 """
 
 from demandops.service.generator import Generator

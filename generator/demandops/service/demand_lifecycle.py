@@ -77,8 +77,8 @@ class Demands:
             limit: how many demands may wait.
             requester_limit: how many demands of one requester may wait; None is no limit.
             runtime: provides the time and the threads.
-            bases: operation id → a commit before the demand's own, for the demands that earlier
-                processes carried out.
+            bases: for the demands that earlier processes carried out: maps the operation id of each
+                to a commit that is older than the demand's own commit.
         """
         self._journal = journal
         self._limit, self._requester_limit = limit, requester_limit
@@ -125,7 +125,7 @@ class Demands:
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether the worker must interrupt a fetch: a demand waits, or the generator stops."""
+        """Whether the worker must end a fetch, because a demand waits or the generator stops."""
         return self.has_waiting or self._closed
 
     # ---- waiting for demands ----
@@ -149,7 +149,7 @@ class Demands:
         """Wait until a demand arrives, :meth:`wake` or :meth:`close` is called, or time runs out.
 
         Returns:
-            False if no demand waits and no further demand is accepted, else True.
+            False if no demand waits and no further demand is accepted; otherwise True.
         """
         with self._changed:
             self._wait(timeout, self.must_not_wait)
@@ -158,8 +158,8 @@ class Demands:
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Wait for a new demand; return all demands that arrived since the last call.
 
-        Demands that :meth:`take` has seen are left out. The list is empty if ``timeout`` seconds,
-        a withdrawal or :meth:`wake` ended the wait.
+        Demands that had arrived when :meth:`take` was called are left out. The list is empty if the
+        wait ended after ``timeout`` seconds, by a withdrawal or by :meth:`wake`.
 
         Raises:
             Unsound: if a failed write left the journal in an unknown state.
@@ -191,7 +191,8 @@ class Demands:
     def put_back(self, batch: list[Ticket]) -> None:
         """Move all demands of a batch back to the front of the queue.
 
-        Other requesters, of whom demands arrived meanwhile, then have their turn earlier.
+        The next batch then takes turns between these demands and the demands that other requesters
+        sent meanwhile.
         """
         with self._changed:
             self._waiting.put_back([each for each in batch if each not in self._taken_back])
@@ -233,7 +234,7 @@ class Demands:
                 if error is not None:
                     refused.append((ticket, error))
                     continue
-                if ticket.operation in self._bases:  # sent again: the first may be published
+                if ticket.operation in self._bases:  # sent again; it may be published
                     ticket.mark_maybe_published(self._bases[ticket.operation])
                 self._bases[ticket.operation] = ticket.base
                 self._of_requester[requester_of(ticket.goal)] += 1
@@ -245,7 +246,7 @@ class Demands:
                 self._journal.append(ticket.journal_entry() for ticket in taken)
             except (StateRepoError, Unsound) as failure:
                 log.error("%s", failure)
-                self.wake()  # the worker ends the process, if it must
+                self.wake()  # so that the worker ends the process if the journal is unsound
                 for ticket in taken:
                     del self._tickets[ticket.operation]
                     self._of_requester[requester_of(ticket.goal)] -= 1
@@ -270,13 +271,15 @@ class Demands:
             return ShuttingDown("the generator is shutting down; send the demand again later")
         if others + len(self._waiting) >= self._limit:
             why = f" for the state repo: {self.blocked}" if self.blocked else ""
-            return QueueFull(f"{self._limit} demands are waiting already{why}; send it again later")
+            return QueueFull(
+                f"{self._limit} demands are waiting already{why}; send the demand again later"
+            )
         who = requester_of(ticket.goal)
         limit = self._requester_limit
         if limit is not None and self._of_requester[who] >= limit:
             return QueueFull(
-                f"{limit} demands of {quoted(who)} have no answer yet; send it again later, or "
-                "raise the node's parameter requester_queue_limit"
+                f"{limit} demands of {quoted(who)} have no answer yet; send the demand again "
+                "later, or raise the node's parameter requester_queue_limit"
             )
         return None
 
@@ -302,7 +305,7 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Return demands that no longer need approval to the state ``waiting``.
+        """Queue demands that were proposed but no longer need approval, as waiting demands.
 
         Each demand is marked as maybe published, because a person may have merged it meanwhile.
         """
@@ -355,7 +358,7 @@ class Demands:
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer the demands that were withdrawn while waiting, and remove them from the batch.
 
-        A demand that was withdrawn while it awaited approval is answered later: after its branch is
+        A demand that was withdrawn while it awaited approval is answered later, after its branch is
         deleted.
         """
         with self._changed:
@@ -371,9 +374,9 @@ class Demands:
     ) -> None:
         """Answer each demand with its result; remove it from the journal unless ``keep`` is set.
 
-        A demand is answered once: a later result is dropped. The listener of a refused demand is
-        notified before the journal forgets the demand. Otherwise a crash could lose the refusal,
-        because a refused demand has no commit.
+        A demand is answered only once, so a later result is dropped. The listener of a refused
+        demand is notified before the journal forgets the demand. In the reverse order, a crash
+        could lose the refusal, because a refused demand has no commit.
 
         Raises:
             Unsound: if a failed write left the journal in an unknown state; no demand is answered.

@@ -102,14 +102,15 @@ class Evaluator:
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         """Return the results of the demands in ``batch`` that ``tip`` records, oldest first.
 
-        An earlier attempt pushed these demands but did not answer them: the connection or the
-        process ended after the remote accepted the push, or an fsync failed. This method writes
-        and fsyncs the commits since the oldest base of these demands again.
+        An earlier attempt pushed these demands but did not answer them, because the connection or
+        the process ended after the remote accepted the push, or because an fsync failed. In a
+        repository on this disk, this method writes the commits since the oldest base of these
+        demands once more, and fsyncs them.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
         found = [(base, operations_since(self._repository.objects, tip, base)) for base in bases]
-        # all bases are ancestors of the tip, so the oldest base has the outcomes of all others
+        # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
         since, recorded = max(found, key=lambda each: len(each[1]), default=("", {}))
         published = [operation for operation in reversed(recorded) if operation in sought]
         if published:
@@ -123,7 +124,7 @@ class Evaluator:
 
 def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
-        message = "was refused, but the reason was lost; send it again"
+        message = "the demand was refused, but the reason was lost; send it again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
     outcome: Outcome = "booked"

@@ -4,7 +4,7 @@ A demand takes the turn of its first requester. Demands that share an applicatio
 a demand id keep their order. Goals of the reference's action that share a requester also keep their
 order, because the second of two equal shutdowns has an effect only if a join came between them. If
 the next demand must follow another demand, the queue returns the other demand first. A rollback or
-a decommission may touch any subject: no demand overtakes it, and it overtakes no demand.
+a decommission may touch any subject, so no demand overtakes it, and it overtakes no demand.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class _Queued:
     """A demand in the queue.
 
     ``number`` is higher for each later arrival. ``subjects`` is None if the demand may touch any
-    subject. ``has_left``: the demand is no longer in the queue.
+    subject. ``has_left`` is true once the demand is no longer in the queue.
     """
 
     number: int
@@ -98,7 +98,7 @@ class FairQueue:
             lane = self._lanes.pop(requester)
             first = _next_in(lane)
             if first is not None:
-                self._lanes[requester] = lane  # add it at the end, so that the others come first
+                self._lanes[requester] = lane  # at the end, so that the other requesters come first
                 break
         while True:
             before = self._before(first)

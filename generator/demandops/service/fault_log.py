@@ -14,7 +14,7 @@ log = logging.getLogger("demandops")
 
 
 class FaultLog:
-    """Logs faults of the state repo's files, and that this generator lacks a signing key."""
+    """Logs faults of the state repo's files, and warns if this generator lacks a signing key."""
 
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
@@ -38,7 +38,7 @@ class FaultLog:
         if allowed_signers.are_listed(self._repository.objects, snapshot.commit):
             self._warned_of_signers = True
             log.warning(
-                "%s lists who may sign, but this generator has no key; `verify` will refuse its "
+                "%s lists who may sign, but this generator has no key, so `verify` will refuse its "
                 "commits, and generators will treat them as commits by a person; start the "
                 "generator with --signing-key",
                 allowed_signers.ALLOWED_SIGNERS,

@@ -31,15 +31,15 @@ log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
 _GRACE_S = 5.0
-"""How many more seconds a stop waits for the threads when the timeout of the stop is over.
+"""How many more seconds a stop waits for the threads after its timeout.
 
-A running call of git or ssh-keygen ends sooner.
+A running call of git or ssh-keygen ends within this time.
 """
 _MOST_RECENT = 1_000
-"""How many commits are read at the start for the demands that earlier processes carried out.
+"""How many commits are read at the start, to find the demands that earlier processes carried out.
 
-A demand that a client sends again with the same operation id counts once if its commit is one of
-these.
+If a client sends a demand again with the same operation id, and its commit is among those read, the
+demand counts once.
 """
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
@@ -131,7 +131,7 @@ class Generator:
     def snapshot_at(self, revision: str) -> Snapshot:
         """Return the state in effect at a commit or a time, without a fetch.
 
-        Any thread may call it; it may take seconds.
+        Any thread may call this method, which may take seconds.
 
         Raises:
             InvalidInput, StateRepoError: if there is no such commit, or it is not valid.
@@ -162,7 +162,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Thread name → error, for each thread that has failed and not recovered yet.
+        """The error of each thread or task that has failed and not recovered yet, by its name.
 
         Any thread may read this.
         """
@@ -243,8 +243,8 @@ class Generator:
                 journal for the next start, and their futures raise ``ShuttingDown``.
 
         Returns:
-            A future that returns whether everything was published. It is ready once the threads
-            have ended, or :data:`_GRACE_S` after the timeout.
+            A future that returns whether everything was published. The future is done once the
+            threads have ended, at the latest :data:`_GRACE_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:

@@ -1,6 +1,6 @@
 """The inbound webhook: a Git server reports a push, and the generator fetches at once.
 
-Notifications are untrusted: only the signature is checked, and the content is not read. Anyone who
+Notifications are untrusted: their signature is checked, and their content is not read. Anyone who
 reaches the address may connect. So the server limits the number of open connections, and cuts off
 each connection after some seconds, however slow its sender is.
 """
@@ -39,7 +39,7 @@ _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
 
 
 class PushWebhook:
-    """The server of the webhook, in a thread of its own; it answers ``/`` for health checks."""
+    """The webhook's server, in a thread of its own; a request for ``/`` is a health check."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
         """Start the server.
@@ -74,9 +74,9 @@ class PushWebhook:
             log_config=None,
             log_level="error",  # anybody who connects could fill the log with warnings
             access_log=False,  # paths and headers may hold secrets
-            proxy_headers=False,  # anyone may write them
+            proxy_headers=False,  # anyone may send such headers
             server_header=False,
-            headers=[("Connection", "close")],  # the time limit is for one request
+            headers=[("Connection", "close")],  # a connection has time for one request only
             timeout_graceful_shutdown=_STOP_TIMEOUT_S,
         )
         self._server = uvicorn.Server(config)
@@ -116,19 +116,19 @@ class PushWebhook:
     def _warn(self, sender: str) -> None:
         """Log that a notification is not signed, at most once a minute.
 
-        Anyone may send requests, so each of them must not fill the log.
+        Anyone may send requests, and a line for each request could fill the log.
         """
         if REAL.monotonic() - self._warned > _WARN_EVERY_S:
             self._warned = REAL.monotonic()
             log.warning(
-                "a notification from %s was not signed with the webhook's secret; is it the same "
-                "here and at the Git server?",
+                "a notification from %s was not signed with the webhook's secret; is the secret "
+                "the same here and at the Git server?",
                 sender,
             )
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that the server cuts off after some seconds, or at once if it has too many."""
+    """A connection that the server cuts off after some seconds, or at once if too many are open."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)

@@ -21,7 +21,7 @@ log = logging.getLogger("demandops")
 Stage = Literal[
     "away", "admitted", "booked", "waiting", "committed", "proposed", "pushed", "refused"
 ]
-"""A stage of a demand; the demand's listener is called with each.
+"""A stage of a demand; the demand's listener is called with each stage.
 
 ``away``: the state repo cannot be reached or written now.
 
@@ -67,14 +67,15 @@ class Receipt:
 class Ticket:
     """A demand under way; ``future`` returns its receipt or raises its error.
 
-    ``journaled`` returns True as soon as the journal has the demand; from then on, a crash does not
-    lose the demand. ``journaled`` returns False if the demand is refused before that; ``future``
-    then raises the reason.
+    The future ``journaled`` returns True as soon as the journal has the demand, because from then
+    on a crash does not lose the demand. If the demand is refused before, ``journaled`` returns
+    False, and ``future`` raises the reason.
 
-    ``base`` is the tip that was known when the demand arrived. ``maybe_published``: the remote may
-    have accepted a push of the demand although no answer arrived. ``has_released``: the demand
-    released another demand that awaited approval, so there may be no claims to release.
-    ``joined`` are tickets of the same operation id that arrived later; they get the same answer.
+    ``base`` is the tip that was known when the demand arrived. ``maybe_published`` is true if the
+    remote may have accepted a push of the demand although no answer arrived. ``has_released`` is
+    true if the demand released another demand that awaited approval, so that there may be no claims
+    to release. ``joined`` are tickets of the same operation id that arrived later. They get the
+    same answer.
     """
 
     operation: str

@@ -1,7 +1,7 @@
 """The worker: follows the state repo, and publishes the demands as commits.
 
-It runs in one thread, the only one that writes to the state repo. Demands go first: a fetch stops
-when a demand arrives, because the demand's push finds new commits too.
+The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
+fetch stops when a demand arrives. The push of the demand finds new commits just as the fetch would.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Worker:
 
     def run(self) -> None:
         """Publish demands, until no further demand is accepted and no demand waits."""
-        # people may have decided proposals before the start: answer their demands before a stop
+        # people may have decided about proposals before the start, so answer these demands first
         if self._demands.proposed:
             self._work()
         while self._demands.wait(self._seconds_until_due()):
@@ -115,7 +115,7 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                if self.snapshot.problems:  # a change may be valid now, after a release
+                if self.snapshot.problems:  # after a release, an invalid change may be valid
                     self._try_to_carry_out_changes()
             elif not self._rest:
                 self._follow()
@@ -181,7 +181,8 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        The batch is empty afterwards; what took too long to evaluate is in the queue again.
+        The batch is empty afterwards. The demands that there was no time to evaluate are in the
+        queue again.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -206,7 +207,7 @@ class Worker:
                 wait = backoff.unreachable()
             if wait is None:
                 continue
-            # wait before the fetch, not after it: the push must follow the fetch closely
+            # wait before the fetch, not after it, because the push must follow the fetch closely
             self._wait_to_retry(batch, wait)
             self._require_not_ending()
             self._demands.take(batch, self._batch_limit)
@@ -229,7 +230,7 @@ class Worker:
         Returns:
             The seconds to wait before the next attempt, or None to continue at once.
         """
-        # fetch first: a demand that was committed can no longer be withdrawn
+        # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
             self._repository.refresh()
             self._must_fetch, self._tip_is_fresh = False, True
@@ -344,10 +345,10 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out the commits of others, and do own work that is due.
+        """Fetch if a fetch is due, carry out people's changes, and do the work of :class:`OwnWork`.
 
-        Own work ends overrides, drains nodes, scales down or books waiting demands. The worker
-        reads a repository on this disk each time, because that is cheap.
+        That work ends overrides, drains nodes, scales down, and books waiting demands. Of a
+        repository on this disk, the worker reads the tip in every call, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
@@ -364,7 +365,7 @@ class Worker:
             self._own_work.postpone()
 
     def _check_proposals(self) -> None:
-        """Check the demands that await approval on the newest main, if a check is due."""
+        """If a check is due, check against the newest main the demands that await approval."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:
@@ -372,7 +373,7 @@ class Worker:
             if heads.main != str(self.snapshot.commit):
                 self._repository.refresh()
                 self._try_to_carry_out_changes()
-            # a deleted branch may be merged, which only a main as new as ``heads`` shows
+            # a deleted branch may have been merged, which only a main as new as ``heads`` shows
             if self._repository.includes(str(self.snapshot.commit), heads.main):
                 self._approvals.check(self.snapshot, heads)
         except (Unavailable, PushDenied) as error:
@@ -401,7 +402,7 @@ class Worker:
     def _new_commit_batch(self) -> CommitBatch:
         """Return a commit batch on the newest known tip.
 
-        Its first commits render people's changes and do own work that is due (:meth:`_follow`).
+        Its first commits render people's changes, and do the work of :class:`OwnWork` that is due.
         """
         tip = self._repository.tip()
         before = self.snapshot

@@ -74,8 +74,8 @@ class DemandSender:
         """Return the current counts and failures.
 
         Returns:
-            How many events have a demand, how many of these demands are not yet booked or released
-            as wanted, and the events whose last goal failed, each with the reason.
+            How many events have a demand, how many of these demands are still to be booked or
+            released, and the events whose last goal failed, each with the reason.
         """
         with self._changed:
             return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
@@ -91,7 +91,7 @@ class DemandSender:
             if subjects:
                 what += f" for {', '.join(subjects)}"
             if told:
-                self._log("warning", f"rule {rule}: {what} failed, and is tried again: {told}")
+                self._log("warning", f"rule {rule}: {what} failed and will be tried again: {told}")
             elif not outcome.code and sending.purpose != "renew":
                 self._log("info", f"rule {rule}: {what}: {outcome.message}")
 

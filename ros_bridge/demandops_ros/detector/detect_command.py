@@ -36,8 +36,9 @@ def detect(
     """Watch topics and demand by rules.
 
     RULES is a file of rules (docs/detector.md); the ROS parameter rules can name it instead. The
-    detector reads it again when it changes. Everything after --ros-args goes to ROS. Stop it with
-    Ctrl-C or SIGTERM: its demands stay booked, and the next start continues them.
+    detector reads the file again when the file changes. Everything after --ros-args goes to ROS.
+    Stop the detector with Ctrl-C or SIGTERM. Its demands then stay booked, and the next start
+    continues with them.
 
     \b
     Examples:
@@ -55,7 +56,7 @@ def detect(
         return
     for option, given in (("--plot", plot is not None), ("--output", output != "text")):
         if given:
-            raise click.UsageError(f"{option} is for --replay; add that, or leave it out")
+            raise click.UsageError(f"{option} needs --replay; add --replay, or leave {option} out")
     _run(rules, ros_args)
 
 

@@ -1,7 +1,7 @@
-"""The node of the event detector: topics in, demands out.
+"""The node of the event detector, which watches topics and sends demands.
 
-The node's decisions depend on events only, not on which services are deployed. Only at its start,
-the node reads the latched bookkeeping. It finds there the demands of its earlier run, so that a
+The node's decisions depend only on events, not on which services are deployed. Only at its start,
+the node reads the latched bookkeeping. It contains the demands of the node's earlier run, so that a
 restart does not end them.
 """
 
@@ -92,7 +92,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self.create_timer(1.0, self._report)
 
     def close(self) -> None:
-        """Stop the node. Its demands stay booked for the next start, or until their leases end."""
+        """Stop the node. Its demands stay booked until their leases end, unless it starts again."""
         self._topics.close()
         self._sender.close()
 
@@ -138,11 +138,11 @@ class DetectorNode(Node):  # type: ignore[misc]
         if self._is_started:
             return
         if self._now() == _UNHEARD_CLOCK:
-            missing = "no message on /clock yet, so nothing is demanded: use_sim_time is set; "
-            missing += "start a node that publishes /clock, or set use_sim_time to false"
+            missing = "use_sim_time is set, but no message on /clock has come, so nothing is "
+            missing += "demanded; start a node that publishes /clock, or set use_sim_time to false"
         else:
-            missing = "no bookkeeping yet, so nothing is demanded: start demandops serve, or set "
-            missing += "the parameter bookkeeping_topic to the topic of its bookkeeping"
+            missing = "no bookkeeping has come, so nothing is demanded; start demandops serve, or "
+            missing += "set the parameter bookkeeping_topic to the topic of its bookkeeping"
         self.get_logger().warning(missing)
 
     # ---- periodic work ----
@@ -170,7 +170,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         jumped = min(passed, 0.0) if simulated else passed - (look - self._last_look)
         self._last_now, self._last_look = now, look
         if abs(jumped) > _SET_CLOCK_S:
-            self._log("warning", f"the clock was set by {jumped:.1f} s")
+            self._log("warning", f"the clock has jumped by {jumped:.1f} s")
             self._detector.set_clock(jumped)
 
     def _reload_if_changed(self) -> None:

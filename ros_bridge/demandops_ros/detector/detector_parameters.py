@@ -29,8 +29,8 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     ),
     "settling_time": (
         10.0,
-        "Seconds after the start after which an unseen entity of a booked demand counts as gone; "
-        "the timeout of its source, if that is longer.",
+        "How many seconds after the start an entity of a booked demand may stay unseen before it "
+        "counts as gone; if the timeout of its source is longer, the timeout counts.",
         (0.1, 3_600.0),
     ),
     "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),

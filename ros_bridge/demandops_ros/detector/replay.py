@@ -1,4 +1,4 @@
-"""Rules tried on a recorded bag: which demands they would make, and when."""
+"""Tries rules on a recorded bag, and shows which demands they would make, and when."""
 
 from __future__ import annotations
 

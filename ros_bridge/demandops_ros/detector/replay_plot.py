@@ -62,7 +62,7 @@ class _Scale:
 def _round(metres: float) -> float:
     """Return a round number of at most a quarter of ``metres``, but at least 0.1.
 
-    It is the length of the scale bar. The time axis uses it too, with seconds.
+    The scale bar has this length. The time axis uses the function too, with seconds.
     """
     lengths = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
     return max((one for one in lengths if one <= metres / 4), default=lengths[0])

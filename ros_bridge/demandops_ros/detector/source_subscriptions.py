@@ -77,8 +77,8 @@ class SourceSubscriptions:
                     continue
                 if source.type not in types:
                     self._tell_once(
-                        f"{topic} has the type {', '.join(types)}, but source {name} reads "
-                        f"{source.type}; it is not read"
+                        f"{topic} is not read, because its type is {', '.join(types)}, and source "
+                        f"{name} reads {source.type}"
                     )
                 elif self._node.count_publishers(topic):
                     self._subscriptions[name, topic] = self._node.create_subscription(

@@ -1,4 +1,4 @@
-"""Reads the parameters of a node from a ROS parameter file. Pure."""
+"""Reads the parameters of a node from the text of a ROS parameter file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ _SECTION = "ros__parameters"
 
 
 def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
-    """Return a node's parameters by dotted name; its section overrides the section for all nodes.
+    """Return a node's parameters by dotted name.
+
+    The node's own section in the file overrides the section for all nodes.
 
     Args:
         node: the node's name, with or without a slash in front.

@@ -23,8 +23,8 @@ _PARAMETERS = {
     "ros_params_file_name": "params.yml",
     "target_ros_node": "",
 }
-"""The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher.
-Its `period` is not among them, because a watch does not poll."""
+"""The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
+without its ``period``, because a watch does not poll."""
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -40,11 +40,11 @@ Its `period` is not among them, because a watch does not poll."""
 def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     """Keep a ROS node's parameters equal to those in a ConfigMap.
 
-    It watches the ConfigMap, which holds a ROS parameter file, and sets the parameters of the
-    running node when they change, or when the node starts again. Everything after --ros-args goes
+    The ConfigMap holds a ROS parameter file. The command sets the parameters of the running node
+    when the ConfigMap changes, and when the node starts again. Everything after --ros-args goes
     to ROS. The ROS parameters are those of the reference's k8s_configmap_watcher: configmap_name,
     namespace, ros_params_file_name (the key in the ConfigMap; default params.yml) and
-    target_ros_node. Stop it with Ctrl-C or SIGTERM.
+    target_ros_node. Stop the command with Ctrl-C or SIGTERM.
 
     \b
     Examples:

@@ -185,7 +185,7 @@ class Answers:
         assert time.monotonic() - start < 3 * SHORT_S
         message = str(caught.value)
         assert "Deployment perception/" in message and "not scheduled: " in message
-        assert f"it is booked in {world.tip()}" in message
+        assert f"the demand is booked in {world.tip()}" in message
         # the demand is still booked, and becomes healthy once the edge accepts pods
         edge_is_full()
         restart_generator(world, TIMEOUT_S)

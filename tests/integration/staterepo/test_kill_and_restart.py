@@ -160,7 +160,7 @@ def test_a_leave_that_is_sent_again_after_its_answer_was_lost_spares_a_later_joi
     ("point", "reason"),
     [
         ("publishing:2", "unknown-node: apps[0].header.node_id: 'nowhere' is not in inventory/"),
-        ("published:2", "refused: was refused, but the reason was lost; send it again"),
+        ("published:2", "refused: the demand was refused, but the reason was lost; send it again"),
     ],
 )
 def test_a_demand_that_is_refused_around_a_kill_is_refused_in_the_log(

@@ -1,4 +1,4 @@
-"""Any value that is sent as a goal is decided, or refused with faults; it raises nothing else."""
+"""Any value that is sent as a goal is decided, or refused with faults, without any other error."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def assert_told(faults: tuple[Fault, ...]) -> None:
         assert found.message
         assert found.code
         assert not UNSEEN & set(map(category, str(found))), repr(found)
-        assert not found.field.startswith("applications["), "a message calls this field apps"
+        assert not found.field.startswith("applications["), "the action calls this field apps"
 
 
 @examples(70)

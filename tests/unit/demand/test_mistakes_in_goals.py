@@ -23,7 +23,7 @@ ELSEWHERE = {
     "applications[1].place": "applications[1].node",  # then both are missing
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
-"""For a mistake in some fields: another field at which its fault may be reported."""
+"""Maps some fields to another field, at which a mistake in the first field may be reported."""
 
 
 @pytest.mark.parametrize(

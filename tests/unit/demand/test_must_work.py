@@ -14,7 +14,7 @@ from tests.kit.memory import MemoryRepo
 
 
 class TestOpenBroker:
-    """The broker is the only one, else the requested one, else the target's, else the source's."""
+    """The broker is the only one that exists, or the first of: requested, target's, source's."""
 
     @staticmethod
     def hosts(books: MemoryRepo) -> set[str]:

@@ -233,8 +233,8 @@ def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
     count = 20_000
     clouds = [(f"/a/b{i}", "vehicle00") for i in range(count)]
     assert MemoryRepo().faults(goal([application(clouds=clouds)])) == [
-        f"id: lists {count + 2} applications, connections, topics and requesters; at most 20000 "
-        "are allowed; a platform engineer may raise limits.demandItems in demandops.yaml"
+        f"id: lists {count + 2} applications, connections, topics and requesters, but at most "
+        "20000 are allowed; a platform engineer may raise limits.demandItems in demandops.yaml"
     ]
 
 
@@ -263,7 +263,7 @@ def test_parameters_are_bounded() -> None:
     (found, *_) = MemoryRepo().faults(
         demand | {"applications": [app | {"parameters": {"use_sim_time": "x" * 100_000}}]}
     )
-    assert found.startswith("applications[0].parameters: have 100020 bytes; at most 100000 are")
+    assert found.startswith("applications[0].parameters: have 100020 bytes, but at most 100000 are")
 
 
 def test_of_many_faults_the_first_are_told_and_the_others_counted() -> None:

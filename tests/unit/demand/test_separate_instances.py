@@ -37,7 +37,7 @@ def empty() -> MemoryRepo:
 
 
 def own(version: str) -> str:
-    """Return the version of the instance for a demanded version; empty for the default version."""
+    """Return the version of the separate instance for a demanded version; empty for the default."""
     version = CHANNELS.get(version, version or DEFAULT)
     return "" if version == DEFAULT else version
 

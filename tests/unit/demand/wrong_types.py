@@ -16,9 +16,11 @@ WRONG: dict[str, object] = {
     "nothing": None,
     "text": "id: x",
     "an unknown field, misspelt": perception(shutdwon=True),
-    "an unknown field, like none": perception(qos=1),
+    "an unknown field, unlike any known one": perception(qos=1),
     # a shutdown may have an empty list of topics, so that list is no fault
-    "a shutdown that is no truth": goal([application(clouds=[])], [connection(topics=[])])
+    "a shutdown that is neither true nor false": goal(
+        [application(clouds=[])], [connection(topics=[])]
+    )
     | {"shutdown": "yes"},
     "faults of form and of content": goal(
         [application(node="egde", who=["vehicle00", ".."]) | {"typ": 1}],
@@ -33,6 +35,6 @@ WRONG: dict[str, object] = {
     "lists of one length, with a wrong item": goal(
         [], [connection(topics=[NUMBER, "/a"], targets=["/b", "/c"])]
     ),
-    "a number for a list, which is not empty too": {"id": "x", "apps": 5},
+    "a number for a list, which is no empty list": {"id": "x", "apps": 5},
     "keys that are no text": {**perception(), 1: "x", None: "x", 1.5: "x", (1, 2): "x"},
 }

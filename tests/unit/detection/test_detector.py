@@ -114,4 +114,4 @@ def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:
     assert want.goal is not None and want.goal.id == "puts/bus1"
     assert detector.step([], 4.9) == []
     ((event, want),) = detector.step([], 5)
-    assert (event.why, want.goal) == ("bus1 was not seen since the start", None)
+    assert (event.why, want.goal) == ("bus1 has not been seen since the start", None)

@@ -27,7 +27,7 @@ def test_an_event_says_what_has_happened() -> None:
     assert event.why == "a is 50.0 m from the area"
     assert event.values == {"rule": "near", "entity": "a", "x": 30, "y": 40, "distance": 50}
     (event,) = run.step(9)
-    assert (event.why, event.at) == ("a is silent for 3 s", 4)
+    assert (event.why, event.at) == ("a has been silent for 3 s", 4)
 
 
 def test_a_polygon_with_a_notch_is_left_there() -> None:
@@ -44,7 +44,7 @@ def test_a_dwell_time_goes_on_between_start_and_stop_and_ends_beyond() -> None:
     assert run.told(1, at(1, "a", 80), at(1, "b", 80)) == []
     assert run.told(2.5, at(2, "a", 89), at(2.5, "b", 95)) == []
     assert run.told(4, at(4, "b", 80)) == [("stays", "a", "start", 3)]
-    assert run.told(5) == [("stays", "a", "stop", 5)], "a is silent since 2 s; b must wait again"
+    assert run.told(5) == [("stays", "a", "stop", 5)], "a was last heard at 2; b must dwell again"
     assert run.told(6) == [("stays", "b", "start", 6)]
 
 
@@ -77,7 +77,7 @@ def test_a_schedule_follows_the_clock_of_its_zone_and_may_end_on_the_next_day() 
 
 
 def test_changes_that_a_long_silence_brings_are_told_in_their_order() -> None:
-    """One step passes over them, as in a replay of a bag with a gap."""
+    """All the changes are in one step, as in a replay of a bag with a gap."""
     sources = {**SOURCES, "slow": {"topic": "/slow/{entity}", "type": POSE, "timeout": "10m"}}
     rules = (
         rule("hour", schedule={"start": "00:01", "stop": "00:02"}),

@@ -23,7 +23,7 @@ def reader(type_name: str = "a_msgs/msg/A", **fields: Any) -> MessageReader:
 
 
 def message(x: object = 1, y: object = 2, **more: Any) -> Message:
-    """Return a message that has its position in the place of each known type."""
+    """Return a message that has the position in the fields of each known message type."""
     point = Message(position=Message(x=x, y=y))
     pose = Message(position=Message(x=x, y=y), pose=point)
     state = Message(continuous_state=[x, y])
@@ -51,7 +51,7 @@ def test_a_field_may_name_the_entity_of_a_topic_that_many_share() -> None:
         (float("nan"), "nan is not a finite number"),
         (float("-inf"), "-inf is not a finite number"),
         ("here", "'here' is not a number"),
-        (1e10, "its position is more than 1e+09 m from the origin"),
+        (1e10, "the position is more than 1e+09 m from the origin"),
     ],
 )
 def test_a_position_of_no_use_is_left_out(x: object, why: str) -> None:
@@ -61,7 +61,7 @@ def test_a_position_of_no_use_is_left_out(x: object, why: str) -> None:
 
 
 def test_a_message_that_lacks_a_field_is_left_out() -> None:
-    with pytest.raises(Unreadable, match=r"it has no field engine.heat\[1\]"):
+    with pytest.raises(Unreadable, match=r"the message has no field engine.heat\[1\]"):
         reader().observation(Message(engine=Message(heat=[1])), "car", 7)
 
 

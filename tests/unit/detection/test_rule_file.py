@@ -33,8 +33,9 @@ def faults(text: str) -> list[str]:
     [
         (
             rule("a", near={**NEAR, "stop": 84}),
-            "rules.yaml:21: rules[0].near: stop 84 must be above start 84: between them nothing "
-            "changes, so that an entity on the edge does not start and stop again and again",
+            "rules.yaml:21: rules[0].near: stop 84 must be above start 84: between the two, the "
+            "condition stays as it is, so that an entity near the limit does not start and stop it "
+            "again and again",
         ),
         (
             rule("a", near={**NEAR, "source": "car"}),
@@ -42,8 +43,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near={**NEAR, "source": "batteries"}),
-            "rules.yaml:22: rules[0].near.source: 'batteries' has no position; name its fields in "
-            "sources.batteries.x and y",
+            "rules.yaml:22: rules[0].near.source: source 'batteries' has no position; name the "
+            "fields of its position in sources.batteries.x and y",
         ),
         (
             rule("a", near=NEAR, count=None, threshold={"source": "cars", "field": "x..y"}),
@@ -66,8 +67,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(request="{distance}")),
-            "rules.yaml:21: rules[0].demand.request: '{distance}' alone becomes a number, which is "
-            "not possible here; add a word to it",
+            "rules.yaml:21: rules[0].demand.request: '{distance}' alone becomes a number, but this "
+            "field needs text; add a word to it",
         ),
         (
             rule("a", near={"source": "cars", "polygon": [{"x": 0, "y": 0}, {"x": 1, "y": 1}]}),
@@ -84,13 +85,13 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{rule}")),
-            "rules.yaml:18: rules[0].demand.demand: must name {entity}: or two events would share "
-            "one demand",
+            "rules.yaml:18: rules[0].demand.demand: must name {entity}, because otherwise two "
+            "events would share one demand",
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{entity}/{x}")),
             "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but an id must stay "
-            "the same; leave it out",
+            "the same; leave that name out",
         ),
         (
             rule("a", near=NEAR, demand=demand(operation="release")),
@@ -107,7 +108,7 @@ def faults(text: str) -> list[str]:
                 deploymentRequest={"id": "r", "connections": [{"requester_ids": ["s"]}]},
             ),
             "rules.yaml:27: rules[0].deploymentRequest.connections[0].requester_ids: must name "
-            "{entity}: a shutdown finds its claims by their requesters",
+            "{entity}, because a shutdown finds claims by their requesters",
         ),
     ],
 )
@@ -124,7 +125,7 @@ def test_mistakes_of_sources_are_told_together() -> None:
     }
     assert faults(text_of(rule("r", near={**NEAR, "source": "a"}), sources=sources)) == [
         "rules.yaml:4: sources.a: needs the name of the entity once: write {entity} as a part of "
-        "topic, or name in entity the field that has it",
+        "topic, or set entity to the field of the message that has the name",
         "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
         "letters, digits and '_' between single '/', no part starting with a digit",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
@@ -139,8 +140,8 @@ def test_two_rules_for_the_same_entities_have_demands_of_their_own() -> None:
     same, other = demand(demand="b/{entity}"), demand()
     told = faults(text_of(rule("a", near=NEAR, demand=same), rule("b", near=far, demand=other)))
     assert told == [
-        "rules.yaml:30: rules[1].demand.demand: is the id of a demand of rule 'a' too: the event "
-        "that ends first would end the demand of both; add {rule} to one of them"
+        "rules.yaml:30: rules[1].demand.demand: is the id of a demand of rule 'a' too, so the "
+        "event that ends first would end the demand of both; add {rule} to one of the ids"
     ]
     cars = rule("a", near=NEAR, demand=same, entities=["car*"])
     rule_file.read(text_of(cars, rule("b", near=far, entities=["bus*"])), "rules.yaml")

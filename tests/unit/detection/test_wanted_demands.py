@@ -1,4 +1,4 @@
-"""The detector sends one goal at a time, repeats it after a fault, and sends none that is over."""
+"""For an event, the detector sends one goal at a time, and repeats a failed goal while wanted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Sent:
         return sending
 
     def done(self, now: float, lease_s: float = 0.0, code: str = "", message: str = "") -> str:
-        """Send and answer the next goal; return its purpose, or what is reported of a fault."""
+        """Send and answer the next goal; return its purpose, or with a ``code`` the text to log."""
         sending = self.next(now)
         told = self.wanted.answered(sending, Outcome(code, message, lease_s), now)
         assert code or not told
@@ -130,7 +130,7 @@ def test_a_demand_booked_before_the_start_is_renewed_at_once_and_not_put_again()
 
 
 def test_an_event_waits_until_another_one_has_ended_the_demand_with_the_same_id() -> None:
-    """So the release of a rule that got another name cannot end the demand of the new name."""
+    """So if a rule gets another name, the release for the old name cannot end the new demand."""
     sent = Sent()
     sent.want(PUT)
     assert sent.done(0) == "start"

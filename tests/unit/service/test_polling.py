@@ -1,4 +1,4 @@
-"""The times at which the state repo is polled; the test moves the clock, and nothing is random."""
+"""The times at which the state repo is polled; most tests use a clock that they move themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An index of areas by place, so that an entity is compared with the areas near it only."""
+"""An index of areas by position, so that an entity is compared only with the areas near it."""
 
 from __future__ import annotations
 

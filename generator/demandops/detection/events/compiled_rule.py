@@ -1,4 +1,4 @@
-"""Rules, prepared for quick checks of each observation; one class for each kind of condition."""
+"""Rules in a form that checks observations quickly, with one class for each kind of condition."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Facts(NamedTuple):
 
 
 class CompiledRule:
-    """The base class of all compiled rules."""
+    """The base class of rules in the form that checks observations."""
 
     def __init__(self, rule: Rule) -> None:
         self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
@@ -96,7 +96,7 @@ class ThresholdRule(CompiledRule):
 
 
 class AreaRule(CompiledRule):
-    """A rule on an area: the distance of one entity to it, or the number of entities near it."""
+    """A rule on one entity's distance to an area, or on the number of entities in or near it."""
 
     def __init__(self, rule: Rule, condition: Near | Count) -> None:
         super().__init__(rule)
@@ -106,7 +106,7 @@ class AreaRule(CompiledRule):
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return an entity's position and distance, or the number of entities."""
+        """Return an entity's position and its distance to the area, or the number of entities."""
         named = self._named(subjects)
         if self.count is not None:
             return Facts({**named, "count": count}, f"{count} entities are in or near the area")
@@ -146,7 +146,7 @@ class PairRule(CompiledRule):
         return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the position of the first entity, and the distance."""
+        """Return the position of the first entity, and its distance to the second one."""
         one, other = (seen[who] for who in self.entities_of(subjects))
         (x, y), away = one.position or (0.0, 0.0), distance(one, other)
         text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
@@ -165,9 +165,10 @@ class PairRule(CompiledRule):
         before: Observation | None,
         after: Observation | None,
     ) -> None:
-        """Move an entity in ``cells`` from its square ``before`` to its square ``after``.
+        """Move an entity in ``cells`` from the square where it was to the square where it is now.
 
-        ``None``, and an observation without a position, stand for no square.
+        ``before`` and ``after`` are its last and its new observation. If one of them is ``None`` or
+        has no position, there is no square to leave or to enter.
         """
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
@@ -180,9 +181,9 @@ class PairRule(CompiledRule):
             cells[entered] = cells.get(entered, frozenset()) | {entity}
 
     def around(self, cells: Mapping[Cell, frozenset[str]], one: Observation) -> Iterator[Who]:
-        """Yield the possible partners of an entity.
+        """Yield the possible partners of an entity, with their sources.
 
-        These are all that are near enough, and some that are too far away.
+        These are all entities that are near enough, and some that are too far away.
         """
         cell = self._cell(one)
         if cell is None:
@@ -203,7 +204,7 @@ def distance(one: Observation, other: Observation) -> float:
 
 
 def compiled(rule: Rule) -> CompiledRule:
-    """Return a rule, compiled to the class for its kind of condition."""
+    """Return a rule in the form that checks observations, by the rule's kind of condition."""
     condition = rule.condition
     if isinstance(condition, Near | Count):
         return AreaRule(rule, condition)

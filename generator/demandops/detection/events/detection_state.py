@@ -54,9 +54,9 @@ class Event(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """A condition that is met since ``since``.
+    """A condition that has been met since the time ``since``.
 
-    ``lasts`` is false during the dwell time, and then true.
+    ``lasts`` is false during the dwell time, and true after it.
     """
 
     since: float
@@ -69,8 +69,8 @@ class State:
 
     ``seen`` has the last observation of each entity that is not gone.
 
-    ``phases`` has the conditions that are met now. ``engaged`` has the keys of these conditions by
-    entity.
+    ``phases`` has the conditions that are met now, by key. ``engaged`` has, for each entity, the
+    keys of the conditions in which the entity takes part.
 
     ``awaited`` has the entities of earlier events that have not been seen since the start, each
     with the time at which it counts as gone. Before ``settled``, no condition on a count stops.
@@ -78,8 +78,8 @@ class State:
     ``counted`` has, for each entity, the rules that count it. ``counts`` has, for each rule, how
     many entities it counts. ``cells`` has the entities by square, for rules on pairs.
 
-    Without observations, nothing changes before ``due``, and no schedule changes before
-    ``hours_due``.
+    Unless an observation arrives, nothing changes before ``due``, and no schedule begins or ends
+    before ``hours_due``.
     """
 
     now: float

@@ -1,7 +1,7 @@
-"""One step of the engine, which collects the events of observations and of passing time.
+"""One step of the engine, which collects the events that observations and passing time cause.
 
-A step changes a copy of the state, not the state itself. The copy costs little: it is shallow,
-because the values in the mappings are immutable, and one step takes many observations.
+A step changes a copy of the state, not the state itself. The copy costs little, because one step
+takes many observations, and because the copy is shallow: the values in the mappings are immutable.
 """
 
 from __future__ import annotations
@@ -71,12 +71,13 @@ class EngineStep:
     def pass_time(self, until: float) -> None:
         """Advance the time to ``until``, and apply all changes that are due by then.
 
-        These are the ends of dwell times, entities that are silent for too long, and schedules.
+        Such a change is due when a dwell time ends, when an entity has been silent for too long, or
+        when a schedule begins or ends.
         """
         while until >= self._due:
             self._due = inf
             for at, act in sorted(self._all_due(), key=lambda one: one[0]):
-                if at > min(until, self._due):  # a change before may have an earlier consequence
+                if at > min(until, self._due):  # an action may have made another change due before
                     break
                 self._now = max(self._now, at)
                 act()
@@ -117,11 +118,11 @@ class EngineStep:
 
     def _lose_silent(self, who: Who, last: Observation) -> None:
         if self._seen.get(who) is last:
-            self._lose(who, f"{who[1]} is silent for {self._engine.timeouts[who[0]]:g} s")
+            self._lose(who, f"{who[1]} has been silent for {self._engine.timeouts[who[0]]:g} s")
 
     def _give_up(self, who: Who) -> None:
         if self._awaited.pop(who, None) is not None:
-            self._lose(who, f"{who[1]} was not seen since the start")
+            self._lose(who, f"{who[1]} has not been seen since the start")
 
     def _lose(self, who: Who, why: str) -> None:
         """Forget an entity, and end all events that it takes part in."""
@@ -204,7 +205,10 @@ class EngineStep:
     # ---- events ----
 
     def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
-        """Start a condition if ``starts``, stop it if ``stops``, or else keep its state."""
+        """Stop a condition if ``stops`` is true, or start it if ``starts`` is true.
+
+        If neither is true, the condition stays as it is.
+        """
         phase = self._phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")

@@ -1,6 +1,6 @@
-"""The engine: from observations to events, by the rules of one file.
+"""The engine, which turns observations into events by the rules of one file.
 
-``step`` changes nothing that it was given and reads no clock. The same observations give the same
+``step`` changes none of its arguments and reads no clock. The same observations give the same
 events, however they are split into steps.
 """
 
@@ -58,7 +58,7 @@ class EventEngine:
             now: the time.
             held: the events whose demands are already booked. Events without a rule are left out.
             settle_s: how many seconds the entities of these events may stay unseen until they count
-                as gone. If their source's timeout is longer, it counts instead.
+                as gone. If their source's timeout is longer, the timeout counts instead.
         """
         keys = tuple(held)
         settled = now + max((settle_s, *map(self._timeout_of_count, keys)))
@@ -68,7 +68,10 @@ class EventEngine:
         return step.result()
 
     def _timeout_of_count(self, key: Key) -> float:
-        """Return the timeout of the source that the event's rule counts; 0 for other rules."""
+        """Return the timeout of the source whose entities the event's rule counts.
+
+        The result is 0 if the rule does not count entities.
+        """
         rule = self.rules.get(key[0])
         is_count = isinstance(rule, AreaRule) and rule.count is not None
         return self.timeouts[rule.sources[0]] if rule and is_count else 0.0

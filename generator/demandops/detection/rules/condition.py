@@ -1,7 +1,7 @@
 """The conditions of rules: distances, counts, limits and hours.
 
-Each one starts at one value and stops at another, so that a value near the limit does not start and
-stop it again and again.
+Each condition on a number starts at one value and stops at another, so that a value that varies
+around the limit does not start and stop the condition again and again.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ class _InArea(CamelModel):
 def _refuse_distances(start: float, stop: float) -> None:
     if stop <= start:
         raise ValueError(
-            f"stop {stop:g} must be above start {start:g}: between them nothing changes, so that "
-            "an entity on the edge does not start and stop again and again"
+            f"stop {stop:g} must be above start {start:g}: between the two, the condition stays as "
+            "it is, so that an entity near the limit does not start and stop it again and again"
         )
 
 
 class Near(_InArea):
-    """Starts when an entity is within ``start`` metres of an area; ends beyond ``stop``."""
+    """Starts when an entity is within ``start`` metres of an area; stops beyond ``stop`` metres."""
 
     start: Metres
     stop: Metres
@@ -76,7 +76,7 @@ class Near(_InArea):
 
 
 class Together(CamelModel):
-    """Starts when two entities are within ``start`` metres; ends when they are beyond ``stop``.
+    """Starts when two entities are at most ``start`` metres apart; stops beyond ``stop`` metres.
 
     Both entities are of ``source``, unless ``other`` names the source of the second one.
     """
@@ -93,9 +93,9 @@ class Together(CamelModel):
 
 
 class Count(_InArea):
-    """Starts with ``start`` or more entities within ``radius``; ends with ``stop`` or fewer.
+    """Starts with ``start`` or more entities within ``radius``; stops with ``stop`` or fewer.
 
-    ``radius`` is the distance to the area in metres.
+    ``radius`` is the largest distance to the area, in metres, at which an entity is counted.
     """
 
     radius: Metres = 0.0
@@ -107,12 +107,12 @@ class Count(_InArea):
         if self.stop >= self.start:
             raise ValueError(f"stop {self.stop} must be below start {self.start}")
         if self.point is not None and not self.radius:
-            raise ValueError("radius is missing, and nothing is exactly at a point; add it")
+            raise ValueError("radius is missing; add it, because no entity is exactly at a point")
         return self
 
 
 class Threshold(CamelModel):
-    """Starts when a number is above or below a limit; ends when it is back at ``stop``."""
+    """Starts when a number is above or below a limit; stops when the number is back at ``stop``."""
 
     source: DnsLabel
     field: FieldPath
@@ -144,12 +144,12 @@ def _clock(text: str) -> time:
 def _zone(text: str) -> ZoneInfo:
     try:
         return ZoneInfo(text)
-    except (OSError, ValueError, KeyError):  # unknown, or no name of a zone
+    except (OSError, ValueError, KeyError):  # an unknown zone, or a text that cannot name a zone
         raise ValueError(f"'{text}' is not a time zone; write it like Europe/Berlin") from None
 
 
 class Hours(CamelModel):
-    """Lasts from one time of day to another, on certain days of the week."""
+    """Holds from one time of day to another, on certain days of the week."""
 
     days: Annotated[
         tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],

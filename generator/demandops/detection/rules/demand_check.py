@@ -36,7 +36,7 @@ def faults_of_demand(
         field: the path of the demand in the file of rules.
         subjects: the template's names for the entities that an event of the rule is about.
         momentary: the names of values that are known only when an event starts. A ``Demand`` may
-            use them, but not in its ids.
+            use them, except in its id and its requesters. A ``DeploymentRequest`` may not.
     """
     stable = {"rule", *subjects}
     known = stable | (momentary if template.action == "demand" else set())
@@ -58,11 +58,12 @@ def faults_of_demand(
 
 
 def _number_for_text(text: str) -> str:
-    """Return the fault of a text that is a number alone in braces; empty for other texts."""
+    """Return a message if ``text`` is only the name of a number in braces, such as ``{x}``.
+
+    The result is empty for other texts.
+    """
     if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
-        return (
-            f"{quoted(text)} alone becomes a number, which is not possible here; add a word to it"
-        )
+        return f"{quoted(text)} alone becomes a number, but this field needs text; add a word to it"
     return ""
 
 
@@ -74,21 +75,23 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
     data = template.data
     if template.action == "demand":
         yield from _missing(data, field, "demand", "requesters")
-        listed = [("demand", [data.get("demand", "")], "or two events would share one demand")]
+        why = "otherwise two events would share one demand"
+        listed = [("demand", [data.get("demand", "")], why)]
         stable = [("demand", data.get("demand", "")), ("requesters", data.get("requesters", ()))]
         for name, value in stable:
             for path, text in rule_template.texts(value, f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
                     message = f"'{{{changing[0]}}}' changes, but an id must stay the same; "
-                    yield fault(path, f"{message}leave it out")
+                    yield fault(path, f"{message}leave that name out")
     else:
         yield from _missing(data, field, "id")
-        why = "a shutdown finds its claims by their requesters"
+        why = "a shutdown finds claims by their requesters"
         listed = [(path, who, why) for path, who in _requesters_by_field(data)]
     for path, values, why in listed:
         missing = needed - {f"{{{name}}}" for value in values for name in names(value)}
         if missing and any(values):
-            yield fault(f"{field}.{path}", f"must name {' and '.join(sorted(missing))}: {why}")
+            named = " and ".join(sorted(missing))
+            yield fault(f"{field}.{path}", f"must name {named}, because {why}")
 
 
 def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: ANN401 - plain data

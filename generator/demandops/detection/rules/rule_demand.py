@@ -1,7 +1,7 @@
-"""What a rule demands: a template of a goal of one of the two actions.
+"""What a rule demands: a template for goals of one of the two actions.
 
-The template makes the goals that start, renew and end a demand. It also finds the demands that a
-rule has made, among those in the bookkeeping.
+The template makes the goals that start, renew and end a demand. It also recognizes which demands in
+the bookkeeping the rule has made.
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ class Goal:
 class BookedDemand:
     """A demand that the bookkeeping lists.
 
-    ``demand`` is its id. A demand of a ``DeploymentRequest`` has a ``request`` instead.
+    ``demand`` is the demand's id. For a demand by ``DeploymentRequest``, it is empty, and
+    ``request`` is the id of the request.
     """
 
     demand: str
@@ -88,9 +89,10 @@ class RuleDemand:
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
-        """Return the goal that starts the demand, as far as ``values`` suffice.
+        """Return the goal that starts the demand, if ``values`` has all names of the template.
 
-        If ``values`` lacks a name, the goal has only the demand's id and its requesters.
+        If it lacks a name, the goal has only the demand's id and its requesters, which suffice to
+        end the demand.
         """
         if self.names() <= set(values):
             return self.goal(values)
@@ -107,7 +109,7 @@ class RuleDemand:
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
-        """Return the entities with which this template makes the demand ``held``.
+        """Return the entities for which this template makes the demand ``held``.
 
         Args:
             held: a demand in the bookkeeping.

@@ -34,15 +34,15 @@ POSITIONS: Mapping[str, tuple[str, str]] = {
     "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
     "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
 }
-"""For each message type, the fields with x and y that are read unless the source names others."""
+"""For some message types, the fields that have x and y; a source can name other fields instead."""
 
 
 class Source(CamelModel):
-    """The topics of one kind of entity.
+    """The topics on which one kind of entity reports.
 
-    The name of the entity is the part of the topic that ``{entity}`` stands for, or the text in the
-    message's field that ``entity`` names. ``x`` and ``y`` name the fields with the entity's
-    position. An entity counts as gone when it has been silent for ``timeout``.
+    The name of the entity is either the part of the topic for which ``{entity}`` stands, or the
+    text in the message's field that ``entity`` names. ``x`` and ``y`` name the fields with the
+    entity's position. An entity counts as gone when it has been silent for ``timeout``.
     """
 
     topic: Annotated[Text, without(topic_pattern_problem)]
@@ -56,8 +56,8 @@ class Source(CamelModel):
     def _names_entities(self) -> Source:
         if ("{entity}" in self.topic) == bool(self.entity):
             raise ValueError(
-                "needs the name of the entity once: write {entity} as a part of topic, or name in "
-                "entity the field that has it"
+                "needs the name of the entity once: write {entity} as a part of topic, or set "
+                "entity to the field of the message that has the name"
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
@@ -79,7 +79,8 @@ class Rule(CamelModel):
 
     The rule is for entities that match ``entities``. The condition must hold for ``dwell``
     before anything is demanded. A refused demand is sent again after ``retry``. A
-    ``deploymentRequest`` is repeated every ``renew``, for domains where it has a lease.
+    ``deploymentRequest`` is sent again every ``renew``, which renews its lease in access domains
+    that give it one.
     """
 
     name: DnsLabel
@@ -190,7 +191,10 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                 known = suggestion(name, rules.sources)
                 yield fault(f"{where}.{kind}.{part}", f"'{name}' is not in sources{known}")
             elif name is not None and kind != "threshold" and not rules.sources[name].position:
-                message = f"'{name}' has no position; name its fields in sources.{name}.x and y"
+                message = (
+                    f"source '{name}' has no position; name the fields of its position in "
+                    f"sources.{name}.x and y"
+                )
                 yield fault(f"{where}.{kind}.{part}", message)
         field = "demand" if rule.demand is not None else "deploymentRequest"
         yield from faults_of_demand(
@@ -201,8 +205,8 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
             for other_id, other in ids:
                 if id == other_id and _may_meet(rule, other):
                     message = (
-                        f"is the id of a demand of rule '{other.name}' too: the event that ends "
-                        "first would end the demand of both; add {rule} to one of them"
+                        f"is the id of a demand of rule '{other.name}' too, so the event that ends "
+                        "first would end the demand of both; add {rule} to one of the ids"
                     )
                     yield fault(f"{where}.demand.demand", message)
                     break

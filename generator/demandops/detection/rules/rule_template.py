@@ -54,7 +54,7 @@ def _written(found: re.Match[str], values: Values) -> str:
 
 
 def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN401
-    """Yield the path and the text of each text and each key in a template.
+    """Yield (path, text) for each text and each key in a template.
 
     ``field`` is the path of the template itself.
     """
@@ -89,9 +89,9 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return the entities for which a template becomes ``text``: name in braces → entity.
+    """Return a map from the names in braces to the entities with which the template gives ``text``.
 
-    The mapping is empty if there are no such entities.
+    The map is empty if no entities give this text.
     """
     seen: set[str] = set()
     pattern, end = "", 0

@@ -34,7 +34,8 @@ class Schedule:
     def next_check(self, now: float) -> float:
         """Return a time after ``now`` until which the result of :meth:`is_on` does not change.
 
-        It is at most an hour ahead, because a change to or from summer time moves the hours.
+        The returned time is at most an hour after ``now``, because a change to or from summer time
+        moves the hours.
         """
         local = datetime.fromtimestamp(now, self.zone)
         ahead = [now + 3600.0]

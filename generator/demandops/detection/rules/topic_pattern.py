@@ -1,4 +1,4 @@
-"""Patterns of topics with the name of an entity in them: ``/vehicles/{entity}/pose``."""
+"""Patterns of topics, such as ``/vehicles/{entity}/pose``: ``{entity}`` stands for any entity."""
 
 from __future__ import annotations
 

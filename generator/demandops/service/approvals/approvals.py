@@ -1,9 +1,10 @@
 """The proposals that await approval, and the answers to their demands.
 
-This code runs in the worker thread. A proposal is booked once main has its claims, after a merge
-commit, a squash or a rebase. Until then the worker rebuilds the branch on each new main, so that
-the branch has the files that the generator would render there. :meth:`Proposal.verdict` decides
-what happens to the demands of a proposal; this module carries that verdict out.
+This code runs in the worker thread. A proposal is booked once main has its claims, whether by a
+merge commit, a squash or a rebase. Until then the worker rebuilds the branch on each new main, so
+that the branch has the files that the generator would render on that main.
+:meth:`Proposal.verdict` decides what happens to the demands of a proposal, and this module carries
+that verdict out.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ from demandops.staterepo.write.proposal_branch import (
 log = logging.getLogger("demandops")
 
 _LONGEST_CHECK_S = 0.5
-"""How many seconds a check may go on while a demand waits; it may push many branches."""
+"""How many seconds a check, which may push many branches, goes on while a demand waits."""
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -94,7 +95,7 @@ class Approvals:
         proposal = next((p for p in self._proposals.values() if p.branch == record.branch), None)
         if proposal is None:
             key = key_of(request) if request else ("operation", ticket.operation)
-            if key in self._proposals:  # another branch of an earlier run has the same key
+            if key in self._proposals:  # the earlier run left another branch with the same key
                 key = ("operation", ticket.operation)
             proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
         if ticket.state == "proposed":  # a withdrawn ticket has an older record
@@ -142,7 +143,7 @@ class Approvals:
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Add a demand that needs approval to its existing proposal, or else to a new one.
+        """Add a demand that needs approval to the proposal that has its key, or to a new proposal.
 
         A put replaces the earlier demands of its proposal. The demand gets an error as its answer
         if other requesters own the proposal, if a requester has too many proposals, or if the
@@ -178,13 +179,13 @@ class Approvals:
         self._changed.append(proposal.branch)
 
     def _requester_over_limit(self, request: DemandRequest) -> str:
-        """Return a requester of ``request`` with too many proposals already, or an empty text."""
+        """Return a requester of ``request`` that has too many proposals; empty if there is none."""
         counts = Counter(name for each in self._proposals.values() for name in each.requesters())
         full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
         return next(full, "")
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the demand's pending proposal if ``request`` is a put without approval."""
+        """Withdraw the demand's open proposal if ``request`` is a put that needs no approval."""
         proposal = self._proposals.get(key_of(request))
         if proposal is not None and isinstance(request, Put):
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
@@ -252,12 +253,12 @@ class Approvals:
         self._timer.ended(str(snapshot.commit))
 
     def _must_pause(self, began: float) -> bool:
-        """Return whether to interrupt a check that began at a time, because a demand waits."""
+        """Return whether a check that began at ``began`` must pause, because a demand waits."""
         is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
         return is_long and self._demands.has_waiting
 
     def _check_next(self, proposals: list[Proposal]) -> None:
-        """Make a check due that begins with ``proposals``."""
+        """Make another check due, which begins with ``proposals``."""
         first = set(proposals)
         self._proposals = {k: p for k, p in self._proposals.items() if p in first} | self._proposals
         self._changed.append(proposals[0].branch)
@@ -419,7 +420,7 @@ class Approvals:
 
         The next start resumes them.
         """
-        error = ShuttingDown("awaits approval; it is resumed at the next start")
+        error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
         self._proposals = {}
@@ -427,7 +428,7 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return a demand's request if it is a release that can be carried out, else None.
+    """Return a demand's request if it is a release that can be carried out, or None if it is not.
 
     A demand that is withdrawn, or whose goal is refused, cannot be carried out.
     """

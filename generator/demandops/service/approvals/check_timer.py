@@ -1,4 +1,4 @@
-"""When to check the proposals: soon after main moved, else at an interval."""
+"""When to check the proposals: soon after main has moved, and otherwise at an interval."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ CHECK_LOCAL_S = 1.0
 CHECK_REMOTE_S = 5.0
 """The seconds between two checks of a remote's branches; only a check detects a deleted branch."""
 _PAUSE_FACTOR = 9
-"""When main moves, the next check waits this many times as long as the last check took.
+"""After main has moved, the next check waits this many times as long as the last check took.
 
-It waits no longer than the interval.
+It waits no longer than the interval between two checks.
 """
 
 
 class CheckTimer:
-    """Decides when the next check is due; after a failed check, when the interval has passed."""
+    """Decides when the next check is due; after a failed check, only after the interval."""
 
     def __init__(self, runtime: Runtime, *, local: bool) -> None:
         self._runtime = runtime
@@ -27,8 +27,8 @@ class CheckTimer:
     def is_due(self, tip: str, *, has_news: bool) -> bool:
         """Return whether to check now, with main at ``tip``.
 
-        ``has_news``: a proposal has changed. A check is then due at once, unless the last check
-        failed.
+        If ``has_news`` is true, because a proposal has changed, a check is due at once, unless the
+        last check failed.
         """
         if has_news and self._checked_at is not None:
             return True

@@ -1,7 +1,7 @@
 """Opens, watches and closes pull requests at a forge, in a thread of its own.
 
-A slow or unreachable forge delays no demand and no proposal: a branch can be merged without a pull
-request.
+A slow or unreachable forge delays no demand and no proposal, because a branch can be merged without
+a pull request.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class ForgeWorker:
                         log.warning("%s: %s", task.branch, error)
                     self._last_error = str(error)
                     if error.asks_to_wait or error.status is None:
-                        # no requester must wait until the forge answers again
+                        # notify the requesters now, not only once the forge answers again
                         for each in (task, *self._tasks):
                             self._remember(each, self._pull_requests.get(each.branch))
                     if error.asks_to_wait:

@@ -51,7 +51,8 @@ class Proposal:
 
     ``reasons`` say why approval is needed. ``searched_to`` is the commit of main up to which the
     history was searched for merged demands. ``checked_at`` is the commit of main at the last check;
-    it is empty if the proposal must be checked again. ``edited``: a person committed to the branch.
+    it is empty if the proposal must be checked again. ``edited`` is true if a person committed to
+    the branch.
     """
 
     key: Key
@@ -216,10 +217,10 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 
 
 def pull_request_body(message: str, reasons: Iterable[str]) -> str:
-    """Return the text of a pull request; it contains the commit's message.
+    """Return the text of a pull request, which contains the commit's message in a code block.
 
-    The message is in a code block, because requesters choose the ids in it. Outside of a code
-    block, an id could become a link or a mention.
+    Requesters choose the ids in the message. Outside of a code block, an id could become a link or
+    a mention.
     """
     fence = _fence(message, 3)
     return (

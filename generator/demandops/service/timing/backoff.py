@@ -27,9 +27,10 @@ on this disk takes less than 1 ms.
 """
 
 LONGEST_EVALUATION_S = 1.0
-"""How many seconds to evaluate demands before those that are evaluated are published.
+"""After how many seconds of evaluation the demands evaluated so far are published.
 
-The others go back to the queue, so that demands that arrived meanwhile take their turn.
+The other demands of the batch go back to the queue, so that demands that arrived meanwhile take
+their turn.
 """
 
 

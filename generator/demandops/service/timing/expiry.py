@@ -47,9 +47,9 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        A demand gets no new ticket in the minute after its last answered ticket. The tickets are
-        correct only at the time of the call: later, a requester may have renewed a lease, or a
-        person may have set the clock.
+        A demand gets no new ticket in the minute after its last ticket, if this was answered. The
+        tickets are correct only at the time of the call, because later a requester may have renewed
+        a lease, or a person may have set the clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
@@ -86,8 +86,9 @@ class LeaseExpiry:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        The minimum lets the worker wait although a lease has ended. The ledger keeps such a lease
-        if its release failed, or if it gets more time after a jump of the clock.
+        The minimum lets the worker wait although a lease has ended. The ledger keeps a lease that
+        has ended if the release of its claim failed, or if it gets more time after a jump of the
+        clock.
         """
         first = ledger.first_to_end()
         if first is not self._first:  # a search is slow if many leases end at one time
@@ -100,7 +101,7 @@ class LeaseExpiry:
         expected = self._last[0] + timedelta(seconds=steady - self._last[1])
         if wall - expected > _JUMP:
             jump = (wall - expected).total_seconds()
-            log.warning("the clock went forward by %.0f s; every lease gets its full term", jump)
+            log.warning("the clock jumped forward by %.0f s, so leases get their full term", jump)
             self._jumped_at = wall
         self._last = (wall, steady)
         return wall

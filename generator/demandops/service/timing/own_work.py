@@ -1,4 +1,4 @@
-"""The work that the generator commits by itself at its due time, not because of a new demand."""
+"""The work that the generator commits by itself when it is due, not because of a new demand."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class OwnWork:
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand, decided on ``before``, freed room."""
+        """Book waiting demands if the last demand, which was decided on ``before``, freed room."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:

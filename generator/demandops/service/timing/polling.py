@@ -73,9 +73,9 @@ class PollTimer:
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Plan the next fetch after the end of a fetch or of a push, which finds new commits too.
+        """Plan the next fetch at the end of a fetch, or of a push, which also finds new commits.
 
-        ``reached``: the remote could be reached; otherwise the interval grows.
+        ``reached`` says whether the remote could be reached. If it could not, the interval grows.
         """
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._runtime.monotonic()

@@ -26,7 +26,10 @@ class RateLimit:
     def faults(
         self, request: DemandRequest, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
-        """Count a demand and yield a fault for each quota it exceeds; releases are not limited."""
+        """Count a demand, and yield a fault for each quota that a requester exceeds with it.
+
+        Releases are not limited.
+        """
         if not request.adds_claims:
             return
         homes = (config.domain_of.get(one.held.home) for one in request.demanded)
@@ -49,7 +52,7 @@ class RateLimit:
         """
         self._forget_idle(received)
         seen = self._seen.pop(key, None) or deque()
-        self._seen[key] = seen  # move it to the end: idle requesters come first
+        self._seen[key] = seen  # at the end, so that the requester that is idle longest is first
         while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
         operations = [known for _, known in seen]

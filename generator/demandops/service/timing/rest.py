@@ -1,4 +1,4 @@
-"""How long not to fetch from the state repo after an error; demands are still published."""
+"""The pause after an error in which the worker does not fetch, but still publishes demands."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class WaitingTurns:
             try:
                 decision = decide(commits.head.state, dict(waiting.goal), now, commits.read)
             except InvalidInput as error:
-                log.debug("demand %s waits on: %s", quoted(waiting.demand), error)
+                log.debug("demand %s still waits: %s", quoted(waiting.demand), error)
                 continue
             if decision.outcome == "booked" and not decision.approval:
                 commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
@@ -45,7 +45,7 @@ class WaitingTurns:
         self._tried = commits.head.state
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand, decided on ``before``, freed room."""
+        """Book waiting demands if the last demand, which was decided on ``before``, freed room."""
         if commits.frees:
             commits.frees = False
             self.book_due(commits)
@@ -53,7 +53,7 @@ class WaitingTurns:
             self._tried = commits.head.state
 
     def is_due(self, state: State) -> bool:
-        """Return whether demands wait that were not yet tried on this state."""
+        """Return whether there are waiting demands that were not yet tried on this state."""
         tried = self._tried
         return bool(state.ledger.waiting) and not (
             tried is not None and tried.ledger is state.ledger and tried.config is state.config
