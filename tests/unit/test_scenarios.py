@@ -42,7 +42,7 @@ DEMAND = "send: {kind: Demand, demand: d, requesters: [a]}"
         ("must: hold nothing\nsteps: [{holds: {of-edge: []}}]", "lists no words"),
         ("must: misspell\nsteps: [{expire: [d]}]", "expire: is not a field here"),
         ("must: accept no faults\ninvalid: []", "needs either steps"),
-        ("must: be both\ninvalid: [{field: x}]\nsteps: [{runs: {}}]", "either steps or invalid, not both"),
+        ("must: be both\ninvalid: [{field: x}]\nsteps: [{runs: {}}]", "or invalid, not both"),
     ],
 )
 def test_a_scenario_that_could_not_fail_is_not_read(text: str, told: str) -> None:
