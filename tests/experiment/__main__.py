@@ -38,7 +38,7 @@ def main() -> int:
         "--gap",
         type=float,
         default=10.0,
-        help="about how many seconds pass between two events",
+        help="about how many seconds of driving lie between two events",
     )
     parser.add_argument("--short", action="store_true", help="one vehicle comes and leaves")
     parser.add_argument("--vanish", choices=routes.VEHICLES, default="", help="who falls silent")

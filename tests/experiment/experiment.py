@@ -333,10 +333,9 @@ _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 
 
 def _stand(happens: list[float], number: int) -> float:
-    """Return until when the vehicles may drive once the first `number` events have happened.
+    """Return the time at which the vehicles must stop after the first `number` causes of events.
 
-    `happens` has the times of the poses that cause events. The result is shortly before the next of
-    them, or infinity after the last one.
+    It is shortly before the next cause, or infinity if there is no further cause.
     """
     if number == len(happens):
         return math.inf

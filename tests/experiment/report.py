@@ -24,12 +24,12 @@ text-align: left; border-bottom: 1px solid #ddd; }
 
 
 _TIMELINE = (
-    "A bar shows when the vehicle was within the rules' distance. A mark below it is a message with "
-    "ego data that arrived on the edge. The red line is the number of pods if all were always on."
+    "A bar shows when the vehicle was within the rules' distance. A mark below a bar is a message "
+    "with ego data that arrived on the edge. The red line shows the pods if all were always on."
 )
 _DELAYS = (
-    "Seconds since the pose that crossed the distance was sent. A dot is an event, and the red line "
-    "is the median. For a join: the demand was accepted, its commit was published, the pods of the "
+    "Seconds since the pose that crossed the distance was sent. A dot is an event. The red line is "
+    "the median. For a join: the demand was accepted, its commit was published, the pods of the "
     "vehicle's connection had their nodes, the first fused message had its ego data. For a leave, "
     "the pods had ended. Pods start as processes of this machine, so no image is pulled."
 )
@@ -265,9 +265,9 @@ def _savings(outcome: Outcome) -> str:
         for s in savings(outcome)
     ]
     caption = (
-        "Means over the drive. Always on means that each service that ran at all runs all the time, "
-        "and that all messages of its topics are carried. The initial deployment always runs, so it "
-        "does not count."
+        "Means over the drive. Always on means that each service that ran at all runs all the time "
+        "and that all messages of its topics are carried. The initial deployment does not count, "
+        "because it always runs."
     )
     return _table(("", "on demand", "always on", "saved"), rows) + f"<p>{caption}</p>"
 
