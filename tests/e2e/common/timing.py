@@ -12,8 +12,8 @@ _STAGES = ("committed", "pushed", "fetched", "applied", "ready", "in all")
 class Times:
     """The monotonic times in seconds at which a demand reached each stage.
 
-    `committed` and `pushed` come from the node's feedback. The test finds the later times by polling
-    every 0.1 s.
+    `committed` and `pushed` come from the node's feedback. The test finds the later times by
+    polling every 0.1 s.
     """
 
     goal: float
