@@ -235,7 +235,7 @@ class Experiment:
         return self._world.domain.lines()
 
     def _wait_until_as_before(self, seconds: float) -> None:
-        """Wait until the clusters have exactly the objects that they had before the first demand."""
+        """Wait until the clusters have exactly the objects from before the first demand."""
         if not self._reaches(lambda: self._lines() == self._before, seconds):
             lines = self._lines()
             stays, lacks = sorted(lines - self._before), sorted(self._before - lines)
