@@ -33,7 +33,7 @@ def crossings(near: Near) -> tuple[Near, ...]:
 
 
 def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
-    """Return the inventory as path → text; `clusters` is the skeleton's `clusters.yaml`."""
+    """Return the inventory's texts by path; `clusters` is the skeleton's `clusters.yaml`."""
     places: dict[str, Any] = yaml.safe_load(clusters)
     places["clusters"].append({"name": FLEET})
     kinds = dict.fromkeys(vehicles, "vehicle") | {node: node.rstrip("0123456789") for node in NODES}

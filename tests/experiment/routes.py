@@ -26,7 +26,7 @@ LEAD_S = 2.0
 MIDDLES = ((0.0, 0.0), (1000.0, 0.0), (0.0, 1000.0))
 SPACING_S = 1.2
 _SILENCE_S = 0.6
-"""A recorded vehicle is silent while the nearest pose in its recording is more seconds away."""
+"""A recorded vehicle is silent while its nearest recorded pose is more than this time away."""
 
 _PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
 """The order of events in the paper: `0` means that vehicle 0 joins, `-0` that it leaves."""

@@ -33,7 +33,7 @@ from tests.faults.progress import Progress, Tried
 from tests.faults.rig import Rig
 
 WORKERS = (os.cpu_count() or 1) + 1
-"""More than there are cores: while a worker waits for a disk or a lock, a core is free."""
+"""One more than there are cores, because a worker that waits for a disk or a lock needs no core."""
 MEMORY = Path("/dev/shm")
 """A file system in memory, where a sync takes no time; strace still shows each sync."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"

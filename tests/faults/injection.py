@@ -1,4 +1,4 @@
-"""Errors and kills at the system calls of one demand; strace finds the calls and injects these."""
+"""Errors and kills at the system calls of one demand; strace finds the calls and injects both."""
 
 from __future__ import annotations
 

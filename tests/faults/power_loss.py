@@ -254,7 +254,7 @@ def failed_sync(rig: Rig, number: int) -> Result:
     disk = Disk(rig.folder)
     broken = (*_TRACE, "-e", f"inject=fsync:error=EIO:when={number}")
     first = rig.book(DEMAND, Strace(broken))
-    again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked before
+    again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked already
     files = set()
     for ran in (first, again):
         for call in parse(ran.trace, ran.roles, rig.folder):

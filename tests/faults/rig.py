@@ -46,7 +46,9 @@ END_S = 8.0
 """How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
 _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
-"""The clock of the first process. A process's clock stands still; the next process is a minute on.
+"""The clock of the first process; each further process has a clock that is a minute later.
+
+The clock of a process stands still.
 
 So a demand has the same commits each time. Its calls keep their numbers, and a state of the disk
 that was met before is recognized (:meth:`Rig.fingerprint`).

@@ -569,7 +569,7 @@ _OBJECTS: dict[Any, list[Any]] = {
 def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
     """Return a strategy for what an API may report instead of ``value``.
 
-    In these values, parts are missing or null, and texts and numbers are others.
+    In these values, parts are missing or null, and texts and numbers differ.
     """
     if isinstance(value, dict):
         parts = {key: _reported(inner, is_top=False) for key, inner in value.items()}

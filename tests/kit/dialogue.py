@@ -71,7 +71,10 @@ class Dialogue:
         return True
 
     def _read(self, wait_s: float) -> bool:
-        """Append new output to ``text``; return False if there is none in time or none any more."""
+        """Append new output to ``text``.
+
+        Return False if no output comes within ``wait_s``, or if the output has ended.
+        """
         if not select.select([self._master], [], [], max(wait_s, 0))[0]:
             return False
         try:

@@ -83,7 +83,7 @@ def rendered(case: str) -> Mapping[str, Files]:
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    """Return the files below ``expected/`` as step → path → text."""
+    """Return the texts of the files below ``expected/``, by step and then by path."""
     expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
     for path in sorted(expected.rglob("*")):

@@ -46,7 +46,7 @@ class Mutation(NamedTuple):
     new_place: Place
 
     def is_at(self, field: str) -> bool:
-        """Return whether a fault names the mistake's place, or a place inside or around that."""
+        """Return whether a fault names the mistake's place, or a place inside or around it."""
         return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
@@ -109,7 +109,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 
 
 def _one(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
-    """Return the mistake whose ``turn`` it is, or all if ``DEMANDOPS_EXAMPLES`` is above 1."""
+    """Return the one mistake for this ``turn``, or all if ``DEMANDOPS_EXAMPLES`` is above 1."""
     kinds = [*mistakes] if TIMES > 1 else [[*mistakes][turn % len(mistakes)]]
     return {kind: mistakes[kind] for kind in kinds}
 

@@ -54,7 +54,10 @@ class Run:
         self.pid = 0
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Return all events once the process ends; call ``on_ready`` when it can take demands."""
+        """Return all events once the process ends.
+
+        ``on_ready`` is called when the process can take demands.
+        """
         sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:

@@ -171,7 +171,10 @@ class Person:
         raise AssertionError("each of 100 attempts met a commit that was published first")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Commit ``files`` in the clone, push, and return the commit; fail if the push is late."""
+        """Commit ``files`` in the clone, push, and return the commit.
+
+        The push fails if somebody else pushes meanwhile.
+        """
         self.fetch()
         for path, text in files.items():
             target = self.folder / path

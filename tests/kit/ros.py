@@ -148,7 +148,7 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain, faster if it has ``warm`` commands."""
+    """Starts `demandops serve` in one ROS domain; ``warm`` commands start faster."""
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str

@@ -194,7 +194,7 @@ class Books:
             for other in claims.values():
                 if other["fixed"] != fixed:
                     raise _Refused("another node, type or end")
-                # "explicitly different": only if both name a broker
+                # brokers are "explicitly different" only if both connections name one
                 if broker and other["broker"] and other["broker"] != broker:
                     raise _Refused("another broker")
                 if any(other["routes"].get(one, two) != two for one, two in routes.items()):
@@ -464,7 +464,7 @@ def in_model_words(
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Return a map from (node, topic of an object list) to the point cloud of the detection.
+    """Return a map from (node, topic of an object list) to the point cloud that it is made from.
 
     ``manifests`` are the rendered releases.
     """

@@ -259,7 +259,7 @@ class World(MemoryRepo):
         return found
 
     def assert_sound(self) -> None:
-        """Check that the files are the ledger's and those of its releases, without others."""
+        """Check that the files are exactly those of the ledger and of the ledger's releases."""
         assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}

@@ -2,8 +2,8 @@
 
 Without ``SEED``, the first seed is random. For each history that fails, the program prints the
 command that plays the history again. It stops after ten failures. At the end it prints what was
-played, and how many histories take a minute of processor time. This number does not depend on what
-else the machine does.
+played, and how many histories it plays in one minute of processor time. This number does not depend
+on what else the machine does.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def test_it_prints_what_it_printed(command: str, patch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch) -> None:
-    """Each word that a command shows on a terminal is in its output to a pipe, which is whole."""
+    """Each word that a command shows on a terminal is also in its output to a pipe."""
     lines = file_of(command).read_text().splitlines()
     wider = [line for line in lines if line.startswith("more columns in a wider terminal: ")]
     piped = {*words(same_ids(demandops(*shlex.split(command)).out)), *words(" ".join(wider))}

@@ -55,7 +55,7 @@ def source_end(node: str) -> str:
 
 
 def target_end(node: str) -> str:
-    """Return the name of the client that ends a node's connection to the edge, on the edge."""
+    """Return the name of the client that runs on the edge for a node's connection to the edge."""
     return f"mqtt-{node}-edge-target-{_ENDS[node][1]}"
 
 

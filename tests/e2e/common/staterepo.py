@@ -195,7 +195,7 @@ class StateRepo(Generic[Domain]):
         applied = domain.wait_applied(sent.commit)
         ready = domain.wait_lines(wanted)
         pushed = sent.stages["pushed"]
-        committed = sent.stages.get("committed", pushed)  # if nothing changed, there is none
+        committed = sent.stages.get("committed", pushed)  # no commit if nothing changed
         return Times(sent.at, committed, pushed, fetched, applied, ready)
 
     def _pull(self) -> None:

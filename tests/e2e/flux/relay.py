@@ -40,7 +40,7 @@ class Relay:
         """Refuse new connections and close the open ones."""
         if self._listener is not None:
             with contextlib.suppress(OSError):
-                self._listener.shutdown(socket.SHUT_RDWR)  # ends the thread's accept
+                self._listener.shutdown(socket.SHUT_RDWR)  # the thread's accept() then returns
             self._listener.close()
             self._listener = None
         with self._lock:

@@ -143,7 +143,7 @@ def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
 
 
 def running(domain: Domain) -> set[tuple[str, str]]:
-    """Return node and name of each ready pod, without hash; '?' for a pod that is not ready."""
+    """Return each ready pod's name without the hash, and its node; '?' if a pod is not ready."""
     lines = (line for line in domain.lines() if line.startswith("pod of "))
     matches = map(_POD.fullmatch, lines)
     return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}

@@ -70,7 +70,7 @@ def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
 
 @contextmanager
 def wakes(domain: Domain) -> Iterator[list[bool]]:
-    """Yield a list; for each request to fetch, it gets whether Flux was idle just before."""
+    """Yield a list that gets one entry per request to fetch: whether Flux was idle just before."""
     found: list[bool] = []
     over = threading.Event()
 

@@ -44,7 +44,7 @@ class World(StateRepo[Domain]):
             for kind, name in (("Kustomization", domain.name), ("GitRepository", SOURCE)):
                 kube.delete(kind, name, namespace)
                 kube.wait_gone(kind, name, namespace)
-            for kind in ("HelmRelease", "HelmChart"):  # or the next one loses its own
+            for kind in ("HelmRelease", "HelmChart"):  # or the next world loses its own
                 kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
         self.remove_wide()
         self.domains.clear()
