@@ -34,17 +34,17 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", f"limit(seconds): fail the test when it takes longer (default {_LIMIT_S:.0f})"
     )
-    config.addinivalue_line("markers", "synced: force writes to disk, as the program does")
+    config.addinivalue_line("markers", "synced: flush files to the disk, as the program does")
     sync.force(False)
     _keep_files_in_memory()
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background job
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _keep_files_in_memory() -> None:
-    """Put the tests' temporary folders in memory if it has enough room.
+    """Put the tests' temporary folders in memory if the memory has enough room.
 
-    A whole run makes a third of a million files.
+    This saves time, because a whole run makes a third of a million files.
     """
     named = {"TMPDIR", "PYTEST_DEBUG_TEMPROOT"} & os.environ.keys()
     if not named and _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free >= _ROOM_IN_MEMORY:
@@ -52,14 +52,14 @@ def _keep_files_in_memory() -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude the collected tests from garbage collection; this saves a seventh of the run time."""
+    """Exempt all present objects from garbage collection; this saves a seventh of the run time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return more workers than processors, as many tests wait for git and other processes."""
+    """Return three workers for two processors, because tests often wait for other processes."""
     return (os.cpu_count() or 1) * 3 // 2
 
 
@@ -78,7 +78,7 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep the journals and clones of a test in a folder of its own."""
+    """Keep the journals and clones of each test in a folder of that test; return the folder."""
     home = tmp_path / "home"
     monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(home))
     return home
@@ -86,7 +86,7 @@ def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(autouse=True)
 def synced(request: pytest.FixtureRequest) -> bool:
-    """Force writes to disk only in tests marked `synced`; return whether this test is marked."""
+    """Let only tests marked `synced` flush files to the disk; return whether this one is marked."""
     on = request.node.get_closest_marker("synced") is not None
     sync.force(on)
     return on
@@ -154,7 +154,7 @@ def state(bare: Path) -> GitRepo:
 
 @pytest.fixture(params=["embedded", "file-url"])
 def address(request: pytest.FixtureRequest, bare: Path) -> str:
-    """The address of the state repo `bare`: once its path, once its URL as a remote."""
+    """The address of the state repo `bare`; a test runs once with its path, once with its URL."""
     return str(bare) if request.param == "embedded" else bare.as_uri()
 
 
@@ -186,7 +186,7 @@ def checkout(_checkout_template: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def generator(bare: Path) -> Iterator[Generator]:
-    """A generator that uses the state repo in place."""
+    """A generator that works in the state repo `bare` itself, without a clone."""
     with running(bare) as started:
         yield started
 
@@ -219,7 +219,7 @@ def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
 
 @pytest.fixture
 def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
-    """Return the starter of generator processes; the end of the test kills those that still run."""
+    """Yield what starts generators as processes; kill those that run when the test ends."""
     _all_drivers.synced = synced
     yield _all_drivers
     _all_drivers.kill_runs()

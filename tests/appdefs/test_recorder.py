@@ -271,7 +271,7 @@ class TestParameters:
                 demand = self.demand(f"who{minute}", **parameters)
                 repo.send(demand, NOW + timedelta(minutes=minute))
         assert self.values(books)[name] == merged
-        if name != "title":  # of several titles the last one counts
+        if name != "title":  # of several titles, the last one counts
             assert self.values(turned)[name] == merged
 
     def test_values_without_a_rule_for_merging_must_agree(self, books: MemoryRepo) -> None:

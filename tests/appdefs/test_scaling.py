@@ -66,7 +66,7 @@ def demand(
 
 
 def release(repo: MemoryRepo) -> dict[str, Any]:
-    """Return the recorder's HelmRelease, or its Application with Argo CD."""
+    """Return the recorder's HelmRelease or, with Argo CD, the recorder's Application."""
     (path,) = (path for path in repo.rendered() if "/rec-" in path)
     found: dict[str, Any] = plain_yaml.load(repo.files[path])
     return found
@@ -187,7 +187,7 @@ class TestRequesters:
 
     @staticmethod
     def changed(repo: MemoryRepo, requesters: int) -> tuple[list[str], set[str]]:
-        """Demand again with this number of requesters.
+        """Demand the recorder again, with this number of requesters.
 
         Return the generated files that change, and the names of the services that are planned
         again.

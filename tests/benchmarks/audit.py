@@ -2,7 +2,7 @@
 
 Vehicles join and leave at all edges in turn; the generator makes a commit of each join and leave.
 The benchmark prints the seconds of each question. ``--keep FOLDER`` makes the state repo in this
-folder and keeps it, or uses the one that is there.
+folder and keeps it. If the folder has a state repo already, the benchmark uses that one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
     """Make a state repo with a fleet and ``commits`` further demands; return its path."""
     laid = fleet.lay_down(folder / "state-repo.git", releases)
     generator = Generator(str(laid.path), data=folder / "data")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # off while the repo is made
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync while the repo is made
     try:
         for first in range(0, commits, BATCH):
             tickets = []

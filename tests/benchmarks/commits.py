@@ -37,7 +37,7 @@ WARM_UP = 4
 
 
 def _changed(repo: pygit2.Repository, commit: pygit2.Commit) -> dict[str, str | None]:
-    """Return path → text of the files that a commit changed; None for a removed file."""
+    """Return the text of each file that a commit changed, by path; None for a removed file."""
     files: dict[str, str | None] = {}
     before, after = commit.parents[0].tree, commit.tree
     for path, _ in trees.differences(before, after):
@@ -46,7 +46,7 @@ def _changed(repo: pygit2.Repository, commit: pygit2.Commit) -> dict[str, str | 
 
 
 class Floor:
-    """Writes the same objects with bare pygit2, each into a file of its own: the floor."""
+    """Measures the floor: bare pygit2 writes the same objects, each into a file of its own."""
 
     def __init__(self, path: Path) -> None:
         self._repo, self._other = pygit2.Repository(str(path)), pygit2.Repository(str(path))
@@ -144,7 +144,7 @@ def _index(folder: Path, bare: Path, changes: list[dict[str, str | None]]) -> li
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="releases")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of releases")
     parser.add_argument("--edges-per-cluster", type=int, default=10)
     parser.add_argument("--output", type=Path, default=Path("build/bench.json"))
     args = parser.parse_args()

@@ -207,7 +207,7 @@ def main() -> int:
     with TemporaryDirectory(prefix="bench-", dir=args.output.parent) as folder:
         rows = measure(Path(folder), args.releases, args.rounds)
     out = Console(highlight=False)
-    out.print(fleet.table("A join with everything configured, beside none of it (medians)", rows))
+    out.print(fleet.table("A join, with nothing and with everything configured (medians)", rows))
     args.output.write_text(json.dumps(rows, indent=2) + "\n")
     out.print(f"written to {args.output}")
     return 0

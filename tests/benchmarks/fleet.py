@@ -1,4 +1,4 @@
-"""State repos with a fleet of any size, made at once, for the benchmarks.
+"""State repos with a fleet of any size for the benchmarks; one commit contains the whole fleet.
 
 A region is a cluster of ten edges with ten vehicles each. Each vehicle has a connection (two
 releases) and a detection on its edge, and each edge has a fusion. The code of the generator itself
@@ -153,7 +153,7 @@ def _lay_down(
     files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, ledger, state.engine))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # off only while the repo is made
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync for now
     tree = write_tree(repo, None, files)
     who = commit_message.generator_signature(now)
     text = "A fleet\n\nOperation: init\nRender-Version: 2\n"

@@ -1,4 +1,4 @@
-"""Measure how a demand's cost grows with its application's vehicles and with its own topics.
+"""Measure how the cost of a demand grows with the vehicles of its application and with its topics.
 
 A vehicle joins and leaves an application that 10 to 1,000 other vehicles hold. A goal lists 10,
 1,000 or 8,000 topics. The benchmark measures wall-clock time and CPU time from ``submit`` to the
@@ -41,10 +41,11 @@ def _costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
 
 
 def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Row]:
-    """Return figures for each size: the join and the leave of one more vehicle.
+    """Return a row for each size: what the join and the leave of one more vehicle cost.
 
-    ``sizes`` gives, for each size, the number of vehicles that hold the application. ``ego``
-    returns the ego topics of a goal, given the size and the goal's number.
+    A size is a number of vehicles or a number of topics. ``sizes`` maps each size to the number of
+    vehicles that hold the application. ``ego`` returns the ego topics of a goal for a size and the
+    goal's number.
     """
     generators: dict[int, Generator] = {}
     rows: dict[int, Row] = {}
@@ -73,12 +74,12 @@ def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Ro
 
 
 def vehicles_rows(folder: Path, vehicles: Sequence[int]) -> list[Row]:
-    """Return figures for one more vehicle on an application, for each number of its vehicles."""
+    """Return a row for each number of vehicles on an application: what one more vehicle costs."""
     return _rows(folder, {size: size for size in vehicles}, ROUNDS, lambda size, number: [])
 
 
 def topics_rows(folder: Path, topics: Sequence[int]) -> list[Row]:
-    """Return figures for a goal and its shutdown, for each number of the goal's topics."""
+    """Return a row for each number of topics in a goal: what the goal and its shutdown cost."""
 
     def ego(size: int, number: int) -> list[str]:
         return [f"/t{number}/n{index}" for index in range(size)]

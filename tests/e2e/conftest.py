@@ -18,7 +18,7 @@ pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.ste
 
 @pytest.fixture(autouse=True)
 def limited() -> None:
-    """Set no limit on a test, because each wait in these tests has its own."""
+    """Set no limit on a test, because each wait in these tests has a limit of its own."""
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +48,7 @@ def requester(ros_domain: int) -> Iterator[DemandClient]:
 
 @pytest.fixture
 def edge_is_full(rig: Rig) -> Iterator[Callable[[], None]]:
-    """Let no pod be scheduled on the edge; return the function that lifts this."""
+    """Keep pods from being scheduled on the edge; yield a function that allows it again."""
     (edge,) = rig.kube.find("Node", selector="node_id=edge")
 
     def unschedulable(value: bool | None) -> None:

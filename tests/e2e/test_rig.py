@@ -1,4 +1,4 @@
-"""The rig starts, reconciles, prunes and stops, as the other end-to-end tests need."""
+"""The rig starts, reconciles, prunes and stops, as the other end-to-end tests need it to."""
 
 from __future__ import annotations
 

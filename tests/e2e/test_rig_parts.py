@@ -58,7 +58,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def quiet(_: str) -> None:
-    """Take the place of a report, and print nothing."""
+    """Print nothing, in place of a report."""
 
 
 def test_a_program_is_built_once_with_its_crds(runs: Path) -> None:
@@ -191,7 +191,7 @@ def test_a_process_that_ignores_sigterm_is_killed_with_its_children(
 def test_a_process_outlives_the_thread_that_started_it(
     processes: Processes, tmp_path: Path
 ) -> None:
-    note = tmp_path / "note"  # once it exists, the process is bound to its parent
+    note = tmp_path / "note"  # once this file exists, the process is bound to its parent
     component = shell(
         "long", f"touch {note}; sleep 60", lambda: None if note.exists() else "not yet"
     )

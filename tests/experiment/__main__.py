@@ -1,4 +1,4 @@
-"""`make experiment`: play, check, and write the report."""
+"""`make experiment`: play the experiment, check the run, and write the report."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ def main() -> int:
         "--gap",
         type=float,
         default=10.0,
-        help="seconds from event to event, at least",
+        help="about how many seconds of driving lie between two events",
     )
     parser.add_argument("--short", action="store_true", help="one vehicle comes and leaves")
-    parser.add_argument("--vanish", choices=routes.VEHICLES, default="", help="falls silent")
+    parser.add_argument("--vanish", choices=routes.VEHICLES, default="", help="who falls silent")
     parser.add_argument(
         "--large",
         type=int,
@@ -49,7 +49,7 @@ def main() -> int:
         const=200,
         default=0,
         metavar="VEHICLES",
-        help="so many vehicles (200) by their poses alone, three intersections, two clusters",
+        help="the larger experiment: 200 vehicles or as many as given, which only send poses",
     )
     parser.add_argument("--bag", default="", help="take the vehicles' poses from a recorded bag")
     given = parser.parse_args()
@@ -76,7 +76,7 @@ def main() -> int:
     say("the clusters are down")
     bag = folder / "poses"
     write_bag(bag, ((pose.at, pose.vehicle, pose.x, pose.y) for pose in outcome.poses))
-    say(f"what the vehicles sent is recorded in {bag.relative_to(ROOT)}")
+    say(f"the poses that the vehicles sent are recorded in {bag.relative_to(ROOT)}")
     file = folder / "report.html"
     file.write_text(report.page(outcome, found))
     plots = report.plots(outcome)

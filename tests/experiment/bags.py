@@ -31,7 +31,7 @@ def bag_tracks(bag: Path, near: Near) -> tuple[Track, ...]:
     if others:
         raise SystemExit(
             f"{bag}: has poses of {', '.join(sorted(others))}; the experiment has nodes for "
-            f"{', '.join(VEHICLES)} only: rename the topics"
+            f"{', '.join(VEHICLES)} only, so rename the topics"
         )
     for track in found:
         if math.hypot(*track.position(0.0)) <= near.stop:

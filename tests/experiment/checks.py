@@ -75,7 +75,7 @@ def _as_in_the_paper(outcome: Outcome) -> Iterator[Check]:
 def _inputs(outcome: Outcome) -> Iterator[str]:
     """Yield each fault in the topics that the fusion read, and in the number of its starts.
 
-    The fusion must read the right sets of topics in the order of the demands. Between two of them,
+    The fusion must read the right sets of topics in the order of the demands. Between two demands,
     it may read other sets for a short time.
     """
     seen = [topics for at, topics in outcome.inputs if at >= outcome.set_off]
@@ -86,7 +86,7 @@ def _inputs(outcome: Outcome) -> Iterator[str]:
         if wanted in seen:
             seen = seen[seen.index(wanted) + 1 :]
         else:
-            yield f"after '{formed}' it never read {sorted(wanted)}"
+            yield f"after '{formed}', the fusion never read {sorted(wanted)}"
     fusions = [pod for pod in outcome.pods if pod.service == FUSION]
     starts = [len(container.starts) for pod in fusions for container in pod.containers]
     stays = _stays([formed.joins for formed in outcome.formed])

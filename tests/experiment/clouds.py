@@ -16,7 +16,7 @@ _SPREAD_M = 0.4
 
 
 def points_of(objects: Iterable[tuple[float, float]], chance: random.Random) -> list[Point]:
-    """Return random points around the centre (x, y) of each object, which has a car's size."""
+    """Return random points around the centre (x, y) of each object; objects are as big as cars."""
     return [
         (chance.gauss(x, _SPREAD_M), chance.gauss(y, _SPREAD_M), chance.uniform(0.2, 1.6))
         for x, y in objects

@@ -33,7 +33,7 @@ def crossings(near: Near) -> tuple[Near, ...]:
 
 
 def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
-    """Return the inventory as path → text; `clusters` is the skeleton's `clusters.yaml`."""
+    """Return the inventory's texts by path; `clusters` is the skeleton's `clusters.yaml`."""
     places: dict[str, Any] = yaml.safe_load(clusters)
     places["clusters"].append({"name": FLEET})
     kinds = dict.fromkeys(vehicles, "vehicle") | {node: node.rstrip("0123456789") for node in NODES}
@@ -107,8 +107,8 @@ def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
     return [
         Check("the detector formed the demands that a plain script over the poses gives",
               differ(_by_vehicle(outcome.events), _by_vehicle(outcome.formed))),
-        Check("the requesters of every service and connection are right after the demands that "
-              "were looked at", "; ".join(_requesters(outcome.formed, passing))),
+        Check("at the commits whose bookkeeping was read, the requesters of every service and "
+              "connection are right", "; ".join(_requesters(outcome.formed, passing))),
         Check("every pod ran on the node that it was for", "; ".join(check_nodes(outcome))),
         Check("at the end both clusters are as before",
               differ(sorted(outcome.before), sorted(outcome.left))),

@@ -35,7 +35,7 @@ from .standins.image import image
 ROOT = Path(__file__).resolve().parents[2]
 _PATIENCE_S = 120.0
 _STAND_S = 0.5
-"""If the vehicles must wait, they stop so many seconds before the cause of the next event."""
+"""Vehicles that must wait stop this many seconds before the pose that causes the next event."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
 
 
@@ -235,11 +235,11 @@ class Experiment:
         return self._world.domain.lines()
 
     def _wait_until_as_before(self, seconds: float) -> None:
-        """Wait until the clusters have exactly the objects of the time before the first demand."""
+        """Wait until the clusters have exactly the objects from before the first demand."""
         if not self._reaches(lambda: self._lines() == self._before, seconds):
             lines = self._lines()
             stays, lacks = sorted(lines - self._before), sorted(self._before - lines)
-            raise AssertionError(f"after {seconds:.0f} s too much: {stays}, missing: {lacks}")
+            raise AssertionError(f"after {seconds:.0f} s, left over: {stays}; missing: {lacks}")
 
     def _bookkeeping(self, commit: str) -> dict[str, list[str]]:
         """Return the requesters of each service and connection after a commit.
@@ -304,7 +304,7 @@ class Experiment:
         return (self._folder / f"{name}.log").read_text()
 
     def _wait(self, what: str, holds: Callable[[], bool], seconds: float = _PATIENCE_S) -> None:
-        assert self._reaches(holds, seconds), f"{what} did not come in {seconds:.0f} s"
+        assert self._reaches(holds, seconds), f"{what} did not come within {seconds:.0f} s"
 
     def _reaches(self, holds: Callable[[], bool], seconds: float) -> bool:
         deadline = time.monotonic() + seconds
@@ -333,9 +333,9 @@ _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 
 
 def _stand(happens: list[float], number: int) -> float:
-    """Return the time at which the vehicles must stop after `number` causes of events.
+    """Return the time at which the vehicles must stop after the first `number` causes of events.
 
-    This is shortly before the next cause, or infinity after the last one.
+    It is shortly before the next cause, or infinity if there is no further cause.
     """
     if number == len(happens):
         return math.inf

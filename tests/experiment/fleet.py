@@ -37,7 +37,7 @@ STATION_CLOUD_TARGET = f"/stations/{S}/pointcloud"
 def files(
     nodes: str, images: str, domains: dict[str, int], ports: dict[str, int]
 ) -> dict[str, str]:
-    """Return the files that differ from the skeleton's, as path → text.
+    """Return the texts, by path, of the files that differ from the skeleton's.
 
     Args:
         nodes, images: `inventory/nodes.yaml` and `registry/images.yaml` of the skeleton.

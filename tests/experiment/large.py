@@ -32,7 +32,7 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""The number of commits, about, at which the run records the whole bookkeeping.
+"""At about this many commits, the run records the whole bookkeeping.
 
 These commits are spread evenly over the run, and the last commit is one of them.
 """
@@ -162,7 +162,7 @@ class LargeExperiment(Experiment):
         )
 
     def _exists(self, path: str) -> bool:
-        self._world.tip()  # pulls the clone
+        self._world.tip()  # updates the clone
         return (self._world.person.folder / path).exists()
 
     def _lines(self) -> frozenset[str]:

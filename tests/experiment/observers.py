@@ -117,7 +117,7 @@ class CloudObserver(Observer):
         self.stages[bytes(message.goal_id.uuid)].setdefault(stage, (time.time(), rest.strip()))
 
     def commits(self) -> dict[str, dict[str, float]]:
-        """Return commit → stage → time for each demand that was committed."""
+        """Return the time of each stage of each committed demand, by commit and stage."""
         return {
             stages["committed"][1]: {stage: at for stage, (at, _) in stages.items()}
             for stages in list(self.stages.values())

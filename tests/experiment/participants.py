@@ -141,7 +141,7 @@ class Participants:
             self._send_clouds(where, elapsed, now)
 
     def _pass_time(self) -> float:
-        """Add the driving time since the last call; return the sum in seconds, or -1 at first."""
+        """Return for how many seconds the vehicles have driven; -1 before they set off."""
         passed, self._last = time.monotonic() - self._last, time.monotonic()
         if self.set_off is not None:
             driven = min(passed, max(0.0, self.until - self._elapsed))

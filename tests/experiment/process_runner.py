@@ -1,11 +1,11 @@
 """Runs the containers of a namespace's pods as processes of this machine, as a kubelet would.
 
 The runner watches the API server: it starts a pod that got a node, and ends a pod that is deleted.
-Each container runs its own command with its own arguments and environment. The runner starts a
-container that ended again after a pause, which becomes longer each time. ConfigMaps become files,
-which change with the ConfigMap. The processes share this machine's file system, so a path below a
-mount becomes a path below the volume's folder. A container that mounts the token of the pod's
-account gets a kubeconfig for this account, in KUBECONFIG.
+Each container runs its own command with its own arguments and environment. If a container ends, the
+runner restarts it after a pause, which becomes longer each time. ConfigMaps become files, which
+change with the ConfigMap. The processes share this machine's file system, so a path below a mount
+becomes a path below the volume's folder. A container that mounts the token of the pod's account
+gets a kubeconfig for this account, in KUBECONFIG.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ class ProcessRunner:
     def _watch(self, kind: str, method: str) -> None:
         """Queue all objects of a kind, then each change, until the runner is closed.
 
-        A watch ends now and then. What is deleted before the next one begins is in no event, so all
-        objects are read again.
+        A watch ends now and then. No event reports an object that is deleted before the next watch
+        begins, so all objects are listed again.
         """
         read: Any = getattr(CoreV1Api(self._kube.api), method)
         plain = self._kube.api.sanitize_for_serialization

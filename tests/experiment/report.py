@@ -14,7 +14,7 @@ from .routes import FAR_M
 _COLORS = ("#0b6e99", "#c2571a", "#4b8b3b", "#8a4fa3")
 _WIDTH, _LEFT = 900, 150
 _MOST_ROWS = 8
-"""Up to this number, the plots draw each vehicle by itself; more are drawn as a crowd."""
+"""The plots draw up to this many vehicles one by one; they draw more vehicles as a crowd."""
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; }
 table { border-collapse: collapse; margin: 1em 0; } th, td { padding: .2em .9em .2em 0;
@@ -24,14 +24,14 @@ text-align: left; border-bottom: 1px solid #ddd; }
 
 
 _TIMELINE = (
-    "Bars: within the rules' distance. Marks below: ego data that arrived on the edge. The red "
-    "line: the same pods always on."
+    "A bar shows when the vehicle was within the rules' distance. A mark below a bar is a message "
+    "with ego data that arrived on the edge. The red line shows the pods if all were always on."
 )
 _DELAYS = (
-    "Seconds after the pose that crossed the distance was sent; a dot for each event, red the "
-    "median. Joins: the demand was accepted, its commit published, the pods of the vehicle's "
-    "connection had their nodes, the first fused message had its ego data. Leaves: the pods "
-    "ended. Pods start as processes of this machine: no image is pulled."
+    "Seconds since the pose that crossed the distance was sent. A dot is an event. The red line is "
+    "the median. For a join: the demand was accepted, its commit was published, the pods of the "
+    "vehicle's connection had their nodes, the first fused message had its ego data. For a leave, "
+    "the pods had ended. Pods start as processes of this machine, so no image is pulled."
 )
 
 
@@ -77,7 +77,7 @@ def _summary(outcome: Outcome) -> str:
     if not outcome.settings.large:
         text += (
             f"The poses reached it over MQTT. The vehicles stood for {outcome.held:.0f} s in all, "
-            "each time until what the last event demands was there."
+            "each time until the last event had all its consequences."
         )
     return f"<p>{text}</p>"
 
@@ -265,8 +265,9 @@ def _savings(outcome: Outcome) -> str:
         for s in savings(outcome)
     ]
     caption = (
-        "Means over the drive. Always on: every service that ran at all, all the time, and its "
-        "topics carried as they were published. Without the initial deployment, which always runs."
+        "Means over the drive. Always on means that each service that ran at all runs all the time "
+        "and that all messages of its topics are carried. The initial deployment does not count, "
+        "because it always runs."
     )
     return _table(("", "on demand", "always on", "saved"), rows) + f"<p>{caption}</p>"
 

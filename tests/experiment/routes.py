@@ -26,7 +26,7 @@ LEAD_S = 2.0
 MIDDLES = ((0.0, 0.0), (1000.0, 0.0), (0.0, 1000.0))
 SPACING_S = 1.2
 _SILENCE_S = 0.6
-"""A vehicle is silent at a time if its recording has no pose within so many seconds of it."""
+"""A recorded vehicle is silent while its nearest recorded pose is more than this time away."""
 
 _PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
 """The order of events in the paper: `0` means that vehicle 0 joins, `-0` that it leaves."""
@@ -109,8 +109,8 @@ class Route:
 class Track:
     """A recorded way: points of time, x and y, with straight lines between them.
 
-    Until the time of the first point, the vehicle waits there. It is silent in the gaps of the
-    recording.
+    Until the time of the first point, the vehicle waits at that point. It is silent in the gaps of
+    the recording.
     """
 
     vehicle: str

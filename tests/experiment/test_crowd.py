@@ -80,8 +80,8 @@ def test_demands_of_different_vehicles_may_overtake_and_others_are_found() -> No
     assert faults(formed()[1:])[0].startswith("the detector formed")
     wrong = [replace(formed()[0], bookkeeping={}), *formed()[1:]]
     assert faults(wrong) == [
-        "the requesters of every service and connection are right after the demands that were "
-        "looked at"
+        "at the commits whose bookkeeping was read, the requesters of every service and connection "
+        "are right"
     ]
 
 

@@ -33,7 +33,7 @@ from tests.faults.progress import Progress, Tried
 from tests.faults.rig import Rig
 
 WORKERS = (os.cpu_count() or 1) + 1
-"""More than there are cores: while a worker waits for a disk or a lock, a core is free."""
+"""One more than there are cores, because a worker that waits for a disk or a lock needs no core."""
 MEMORY = Path("/dev/shm")
 """A file system in memory, where a sync takes no time; strace still shows each sync."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
@@ -54,8 +54,8 @@ class _Task:
 def main() -> int:
     """Run the tasks and write the report; return 1 if a promise was broken, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--long", action="store_true", help="every call, and every fault at it")
-    parser.add_argument("--only", default="", help="only tasks whose text contains this")
+    parser.add_argument("--long", action="store_true", help="try every fault at every call")
+    parser.add_argument("--only", default="", help="run only tasks whose text contains this")
     parser.add_argument(
         "--resume", action="store_true", help="go on with a run that was interrupted"
     )
@@ -83,7 +83,7 @@ def main() -> int:
 
 
 def _prepare(folder: Path) -> None:
-    """Import all modules, and compile templates and schemas: no forked process does it again."""
+    """Import all modules, and compile templates and schemas, so that no forked process must."""
     for module in walk_packages(demandops.__path__, "demandops."):
         import_module(module.name)
     rig = Rig(folder / "first", remote=False)
@@ -93,14 +93,14 @@ def _prepare(folder: Path) -> None:
             code = command_line.run([*command, *state])
         assert code == 0, code
     gc.collect()
-    gc.freeze()  # else the collector of each forked process would copy all memory
+    gc.freeze()  # otherwise the garbage collector of each forked process would copy all memory
 
 
 def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
     """Yield all tasks, the longest first."""
     mounts = disk.may_mount()
     if not mounts:
-        print("a full disk is not tried: only root can mount a small one")
+        print("a full disk is not tried, because only root can mount a small disk")
     for remote in (False, True):
         if long or not remote:
             yield _Task("power", remote)
@@ -167,7 +167,7 @@ def _report(results: list[Result], seconds: float) -> None:
         verdicts = [*result.problems, *known] or ["sound"]
         by_class.setdefault(name, Counter()).update(verdicts)
     OUT.parent.mkdir(exist_ok=True)
-    in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # runs add up
+    in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # the file counts all runs
     for name, verdicts in by_class.items():
         in_all[name] = Counter(in_all.get(name, {})) + verdicts
     OUT.write_text(json.dumps(in_all, indent=1, sort_keys=True))
@@ -178,7 +178,7 @@ def _report(results: list[Result], seconds: float) -> None:
     known = sum(bool(result.known) for result in results)
     print(
         f"{len(results)} faults and states, {wrong} with a violation, "
-        f"{known} with what is known and open, {seconds:.0f} s"
+        f"{known} with a known and open problem, {seconds:.0f} s"
     )
 
 

@@ -1,4 +1,4 @@
-"""Faults of a full disk, for the state repo and for the journal's folder, and of damaged files."""
+"""Two kinds of faults: a full disk for the state repo or the journal's folder; a damaged file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors and kills at the system calls of one demand, found and injected by strace."""
+"""Errors and kills at the system calls of one demand; strace finds the calls and injects both."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often a call that was missed is counted and tried again, because the counts vary."""
+"""How often to count again and to repeat a fault that missed its call, because counts vary."""
 _TRIES_ON_JOURNAL = 40
-"""How often it is tried in one thread and the other, if it is a call on the journal.
+"""How often to repeat a fault that missed a call on the journal, in one thread and the other.
 
-Either thread may journal a demand. These calls are counted by themselves (:func:`_counted`).
+Either thread may journal a demand. Only calls on the journal are counted then (:func:`_counted`).
 """
 _OTHER_THREAD = {
     "demandops-journal": "demandops-writer",
@@ -73,17 +73,18 @@ _OF_SERVER = (
 )
 """Messages of a git process, here or at the server, that do not give the reason of its failure.
 
-A server that cannot read its references offers none, so the remote "has no branch", or one of
-zeros. A server that cannot read its folder says that this is no repository.
+A server that cannot read its references offers none, so the remote "has no branch", or it offers a
+branch whose id has only zeros. A server that cannot read its folder says that the folder is no
+repository.
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """Messages about files that libgit2 could not read; they give no reason."""
 
 
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""A call at the server whose error Git takes for the end of a list, so it may lose an object.
+"""A call at the server whose error Git takes for the end of a list, so that it may lose an object.
 
-The generator cannot see this. docs/reliability.md tells operators, under "Known and open".
+The generator cannot see this loss. docs/reliability.md describes it under "Known and open".
 """
 
 
@@ -122,7 +123,7 @@ class Site:
     def faults(self) -> list[str]:
         """Return the faults that can be injected at this call.
 
-        A kill comes before the call, so it shows the state after the call before it.
+        A kill comes before the call, so it shows the state after the previous call.
         """
         errors = ["EIO"]
         if self.kind in _BY_NAME:
@@ -182,10 +183,11 @@ def sites(rig: Rig) -> list[Site]:
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return the same call with its number in this process.
+    """Return the call of a site, with the number that the call has in this process.
 
-    The number may differ, because this process may read more or fewer files. If the same thread did
-    not make the call this time, return the call of another thread on the same class of file.
+    Numbers differ between processes, because a process may read more or fewer files. If the site's
+    thread did not make the call this time, return the call of another thread on the same class of
+    file.
     """
     known = _KNOWN[rig.folder]
     same = [each for each in known if (each.of_class, each.place) == (site.of_class, site.place)]
@@ -279,8 +281,8 @@ def run(rig: Rig, job: Job) -> Result:
 def _counted_anew(rig: Rig, wanted: Site, here: Site, *, only_here: bool) -> Site:
     """Return a call with its number in a new process that meets no fault.
 
-    If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If it
-    does not make the call this time, trace all.
+    If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If
+    that thread or process does not make the call this time, trace all of them.
     """
     if only_here:
         before = sum(
@@ -302,7 +304,7 @@ def _at(site: Site) -> str:
 
 
 def _traces(site: Site) -> list[str]:
-    """Return strace's options that trace the calls of a site's kind, and those that parse needs."""
+    """Return options of strace to trace the calls of the site's kind and those that parse needs."""
     return ["-s64", "-e", f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork"]
 
 
@@ -330,7 +332,8 @@ def _run(rig: Rig, job: Job, site: Site) -> Result:
     told = [os.strerror(getattr(errno, job.fault, 0)), "no room", *_HIDDEN]
     if not site.is_threads:
         told += _OF_SERVER
-    own = site.is_threads and (not job.remote or "outbox" in site.file)  # the remote keeps a push
+    # a failed sync of a clone does no harm, because the remote keeps what was pushed
+    own = site.is_threads and (not job.remote or "outbox" in site.file)
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role
     problems = list(after_fault(ran, tuple(told), unsound=unsound))
     if site.role == "git receive-pack":  # its locks stay until an operator removes them

@@ -47,14 +47,14 @@ def after_restart(
 ) -> Iterator[str]:
     """Book another demand in a fresh process, and yield each problem of the state repo.
 
-    What was sound is not tried again from the same state of the disk, unless a process that lingers
-    may still change it.
+    A state of the disk that was sound before is not tried again, unless a process that lingers may
+    still change the disk.
 
     Args:
         rig: the state repo.
         ran: the process with the injected fault.
         journaled: whether the journal has the demand, so that it must be booked.
-        clones: whether git must find no fault in the clones either.
+        clones: whether `git fsck` must find no fault in the clones, too.
     """
     state = None
     if not ran.lingers:

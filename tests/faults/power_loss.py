@@ -25,7 +25,7 @@ _GONE = -2
 
 @dataclass(frozen=True)
 class _Name:
-    """A change of a folder's entry: it gets a file or a folder, or is removed."""
+    """A change of a name in a folder: the name gets a file or a folder, or is removed."""
 
     path: str
     node: int
@@ -247,14 +247,14 @@ def _lose(
 def failed_sync(rig: Rig, number: int) -> Result:
     """Fail a sync of the branch or pack, start again, then lose power; nothing may be missing.
 
-    Data whose sync failed is gone after the power loss, even though the next start can read it. The
-    next start must write it again.
+    A power loss removes the data whose sync failed, although the next start could still read that
+    data. So the next start must write the data again.
     """
     rig.restore()
     disk = Disk(rig.folder)
     broken = (*_TRACE, "-e", f"inject=fsync:error=EIO:when={number}")
     first = rig.book(DEMAND, Strace(broken))
-    again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked: publishes nothing
+    again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked already
     files = set()
     for ran in (first, again):
         for call in parse(ran.trace, ran.roles, rig.folder):

@@ -1,4 +1,4 @@
-"""What a run has tried: told while it goes on, and kept for a run that takes its place."""
+"""What a run has tried: printed while the run goes on, and stored for a run that resumes it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ _TELL_EVERY_S = 30.0
 class Tried:
     """The sound tasks of an interrupted run, in a file: one line for each, by the task's text.
 
-    The first line names the program that was tried. What another program did is not taken over.
+    The first line has a digest of the program that was tried. If the program has changed since, the
+    file's tasks do not count.
     """
 
     def __init__(self, file: Path, *, resume: bool) -> None:
@@ -30,7 +31,7 @@ class Tried:
         program = json.dumps(_program())
         lines = file.read_text().splitlines() if resume and file.exists() else []
         if lines and lines[0] != program:
-            print("the program has changed since the run that was interrupted: beginning anew")
+            print("the program has changed since the interrupted run, so all tasks are tried again")
             lines = []
         for line in lines[1:]:
             with suppress(ValueError):  # cut off by the interruption
@@ -45,19 +46,19 @@ class Tried:
         file.write_text("".join(f"{line}\n" for line in lines or [program]))
 
     def add(self, task: str, results: Iterable[Result]) -> None:
-        """Keep the results of a task, unless a promise was broken: then it must be tried again."""
+        """Keep the results of a task, unless a promise was broken and it must be tried again."""
         kept = [asdict(result) for result in results]
         if not any(each["problems"] for each in kept):
             with self._file.open("a") as file:
                 file.write(json.dumps([task, kept]) + "\n")
 
     def finish(self) -> None:
-        """Forget all: the run reached its end."""
+        """Delete the file, because the run has reached its end."""
         self._file.unlink()
 
 
 class Progress:
-    """Tells now and then how many tasks are done, how long it took, and what was found so far."""
+    """Prints now and then how many tasks are done, in what time, and with how many violations."""
 
     def __init__(self, total: int) -> None:
         self._total, self._done, self._wrong = total, 0, 0

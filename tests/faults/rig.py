@@ -34,22 +34,24 @@ from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""The shortest time limit, in seconds, of a process that books a demand; it then gets SIGTERM.
+"""The shortest time, in seconds, after which a process that books a demand gets SIGTERM.
 
 A demand takes half a second, but it may have to wait for its disk.
 """
 PATIENCE = 20
-"""On a busy machine, the time limit is so many times what the first demand took."""
+"""On a busy machine, the time limit is this many times the time that the first demand took."""
 PLENTY_S = 300.0
 """The time limit, in seconds, for commands that meet no fault; a busy machine once took over 60."""
 END_S = 8.0
 """How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
 _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
-"""The time of the first process. It stands still in a process and moves on with each.
+"""The clock of the first process; each further process has a clock that is a minute later.
 
-So a demand has the same commits each time: its calls keep their numbers, and a state of the disk
-that was met before is known again (:meth:`Rig.fingerprint`).
+The clock of a process stands still.
+
+So a demand has the same commits each time. Its calls keep their numbers, and a state of the disk
+that was met before is recognized (:meth:`Rig.fingerprint`).
 """
 _END_WITH_PARENT, _ADOPT_ORPHANS = 1, 36  # PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER
 _CHANCE = re.compile(
@@ -70,7 +72,7 @@ if [ "$program" = git ]; then
 fi
 if [ -n "$FAULTS_AT" ]; then
   number=1
-  set -C  # fails at a file that exists; the shell does this itself, mkdir would be a process
+  set -C  # so that > fails if the file exists; mkdir would do, but it would be a process
   until true 2>/dev/null >"$FAULTS_TRACES/$command $number"; do number=$((number + 1)); done
   case "$FAULTS_AT" in git | "git $command $number")
     trace="$FAULTS_TRACES/$command $number"
@@ -118,7 +120,7 @@ class GitTrace:
 class Ran:
     """What a process did: its exit code, its output, its traces, and how it hung if it did.
 
-    ``lingers``: a process that it started, such as ``git push``, still ran when it had ended.
+    ``lingers`` is true if a process that it started, such as ``git push``, outlived it.
     """
 
     code: int
@@ -158,14 +160,14 @@ class Rig:
         self.scratch.mkdir(parents=True)
         self._wrap_git()
         self.folder.mkdir()
-        ctypes.CDLL(None).prctl(_ADOPT_ORPHANS, 1)  # so that this process can tell who lingers
+        ctypes.CDLL(None).prctl(_ADOPT_ORPHANS, 1)  # so that :func:`_lingers` sees the orphans
         self.must(self.demandops("init", str(self.state), "--bare"))
         self.limit = 0.0
         self.is_slower(0)
         self.save()
 
     def _wrap_git(self) -> None:
-        """Replace git's programs by a script that can trace them, also when git starts them."""
+        """Replace git's programs, also for git itself, by a script that can trace them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
         wrapper.write_text(_GIT)
         wrapper.chmod(0o755)
@@ -176,7 +178,7 @@ class Rig:
     def is_slower(self, number: int) -> bool:
         """Book a demand that meets no fault, and return whether the limit had to be raised.
 
-        A process that was taken to hang may only have had too little of a busy machine.
+        A process that seemed to hang may only have been slow on a busy machine.
         """
         began = time.monotonic()
         self.must(self.book(number, limit=PLENTY_S))
@@ -214,7 +216,7 @@ class Rig:
         self._runs = self._runs_of_template
 
     def fingerprint(self) -> str:
-        """Return a digest of all that the next process can find: names, modes, bytes, its clock."""
+        """Return a digest of all that the next process can find: the files and its clock."""
         told = sha256(str(self._runs).encode())
         for path in sorted(self.folder.rglob("*")):
             told.update(f"\0{_CHANCE.sub('*', str(path))}\0{path.lstat().st_mode}\0".encode())
@@ -397,7 +399,7 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
         def begin(name: str) -> None:
             with one_begins:
                 if select.select([waits], [], [], 0)[0]:
-                    os.read(waits, 1)  # of the thread before; strace would count its own read
+                    os.read(waits, 1)  # for the previous thread, whose own read strace would count
                 os.write(tell, f"{name} {threading.get_native_id()}\n".encode())
                 select.select([waits], [], [])
             with suppress(OSError):

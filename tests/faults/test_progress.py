@@ -1,4 +1,4 @@
-"""A run of the fault injection that takes the place of an interrupted one tries only the rest."""
+"""A run of the fault injection that resumes an interrupted run tries only what is left."""
 
 from __future__ import annotations
 

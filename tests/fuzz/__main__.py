@@ -27,7 +27,7 @@ from tests.fuzz import Target
 
 try:
     import atheris
-except ImportError:  # without a wheel of Atheris for this system, Hypothesis changes the seeds
+except ImportError:  # no wheel of Atheris for this system, so Hypothesis changes the seeds instead
     atheris = None
 
 FOLDER = Path("build/fuzz").absolute()
@@ -71,7 +71,7 @@ class Run:
             os._exit(status)  # without the exit handlers that the parent has registered
 
     def _look(self) -> None:
-        tempfile.tempdir = str(self.folder)  # the next run removes it
+        tempfile.tempdir = str(self.folder)  # the next run removes this folder
         signal.signal(signal.SIGVTALRM, _stop)
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, used + MOST_MEMORY))
@@ -87,7 +87,7 @@ class Run:
         """Check one input; keep a finding unless a shorter input with the same error is kept."""
         self.calls.value += 1
         error = self._error(value)
-        if isinstance(error, TooSlow):  # the first call of a function may have to prepare much
+        if isinstance(error, TooSlow):  # perhaps only because a first call has to prepare much
             error = self._error(value)
         if error is None:
             return
@@ -196,7 +196,7 @@ def run(one: Run) -> list[str]:
 
 
 def main(names: list[str]) -> int:
-    """Run the named targets, one for each processor at once; return 1 after a finding, else 0."""
+    """Run the named targets, as many at once as processors; return 1 after a finding, else 0."""
     ours = ["demandops", "demandops_ros"]
     instrumented = atheris.instrument_imports(include=ours) if atheris else nullcontext()
     with instrumented, redirect_stderr(StringIO()):  # atheris prints each module's name

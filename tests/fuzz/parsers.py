@@ -150,7 +150,7 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
 
 
 def file_of_the_reference(data: bytes) -> None:
-    """A file of the reference that can be read can also be mapped, and gives goals."""
+    """Check that each file of the reference that can be read gets a map, and gives goals."""
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)
     joins, _ = imported_goals.remaining_joins(files)
@@ -290,7 +290,7 @@ def contexts_file(data: bytes) -> None:
 
 
 def detector_rules(data: bytes) -> None:
-    """Rules that can be read can also be compiled; they accept observations and form goals."""
+    """Check that rules that can be read also compile, accept observations and form goals."""
     try:
         file = rule_file.read(_text(data), "rules.yaml")
     except InvalidInput as error:
@@ -434,7 +434,7 @@ def commit(data: bytes) -> None:
         oid = repo.write(pygit2.enums.ObjectType.COMMIT, head + data)
         found = repo[oid]
     except pygit2.GitError:
-        return  # no commit at all
+        return  # the bytes are no commit
     entry = commit_log.entry_of(found)
     assert entry.by_generator in (True, False)
     commit_log.author_of(found)
@@ -528,7 +528,7 @@ _PUSH = b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nX-Gitlab-Token:
 def webhook_address(data: bytes) -> None:
     text = _text(data)
     if any(char.isalpha() for char in text):
-        return  # a name would be looked up
+        return  # a host name would be looked up
     PushWebhook(text, b"", lambda: None).close()
 
 
@@ -569,7 +569,7 @@ _OBJECTS: dict[Any, list[Any]] = {
 def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
     """Return a strategy for what an API may report instead of ``value``.
 
-    Parts are missing or null, and texts and numbers differ.
+    In these values, parts are missing or null, and texts and numbers differ.
     """
     if isinstance(value, dict):
         parts = {key: _reported(inner, is_top=False) for key, inner in value.items()}

@@ -1,4 +1,4 @@
-"""A value that the program writes as text comes back the same from the program that reads it."""
+"""A value that the program writes as text is still the same when another program reads it."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def name_of_object(ids: tuple[str, str]) -> None:
 
 
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
-    """The override file has what a person gave to the command, unless the command refuses it."""
+    """Check that the override file has what a person gave, unless the command refuses it."""
     reason, owner, nodes, patch = words
     options = EditOptions("", None, " ".join(reason.split()) or "x", False, False, False, "text")
     given = {"owner": owner or "x", "values": patch}

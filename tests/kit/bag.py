@@ -27,7 +27,7 @@ def write_bag(
         path: the folder of the bag; it must not exist.
         poses: in the order of time.
         plugin: the storage format of the bag.
-        texts: string messages that are recorded before the poses: times, topics and texts.
+        texts: string messages to write before the poses; each is a time, a topic and a text.
     """
     new = _TYPES.types
     topics: dict[str, Any] = {}

@@ -32,7 +32,7 @@ new PerformanceObserver((list) => {
 def chromium() -> Iterator[Browser]:
     """Run Chromium with a new profile for the length of a block; yield the browser."""
     program = shutil.which("chromium")
-    assert program, "setup/system page installs chromium"
+    assert program, "chromium is not installed; run setup/system page"
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=list(_ALONE))
         try:

@@ -17,7 +17,7 @@ _SILENCE_S = 5.0
 
 
 class Dialogue:
-    """``demandops`` on a pseudoterminal, which has its input, output and errors."""
+    """``demandops`` with a pseudoterminal as its standard input, output and error."""
 
     def __init__(self, *args: str | Path, folder: Path | None = None, **environment: str) -> None:
         self.text, self._typed, self._typed_at = "", b"", 0
@@ -50,19 +50,20 @@ class Dialogue:
     def end(self) -> int:
         """Read until the command ends; return its exit code.
 
-        After some seconds of silence, this types the last text again, as people do: Python can miss
-        a signal that arrives just before it begins to read. If the command has answered already, a
-        second Ctrl-C would kill it while it ends.
+        After some seconds of silence, this types the last text again, as people do, because Python
+        can miss a signal that arrives just before it begins to read. If the command has printed
+        something since the text was typed, this does not type it again, because a second Ctrl-C
+        would kill the command while it ends.
         """
         end = time.monotonic() + PATIENCE_S
         while self._read(_SILENCE_S) or self._runs_silently():
-            assert time.monotonic() < end, f"it has not ended:\n{self.text}"
+            assert time.monotonic() < end, f"the command has not ended:\n{self.text}"
         _, status = os.waitpid(self._pid, 0)
         self._pid = 0
         return os.waitstatus_to_exitcode(status)
 
     def _runs_silently(self) -> bool:
-        """Return whether the command still runs; if it is silent, type the last text again."""
+        """Return whether the command still runs; if it ignores the last text, type that again."""
         if select.select([self._master], [], [], 0)[0]:
             return self._read(0)
         if not self.text[self._typed_at :].strip("^C\r\n"):
@@ -70,7 +71,10 @@ class Dialogue:
         return True
 
     def _read(self, wait_s: float) -> bool:
-        """Append new output to ``text``; return False if it has ended, or if none came in time."""
+        """Append new output to ``text``.
+
+        Return False if no output comes within ``wait_s``, or if the output has ended.
+        """
         if not select.select([self._master], [], [], max(wait_s, 0))[0]:
             return False
         try:

@@ -1,4 +1,4 @@
-"""A program that runs generators for tests to kill; each run prints its events as lines of JSON.
+"""A program that runs generators, which tests kill; a run prints its events as lines of JSON.
 
 The program imports the modules once and forks for every run. It reads each run from standard input,
 as one line of JSON. A run has lanes of demands. Each lane is a client that waits for an answer
@@ -46,7 +46,7 @@ def die() -> None:
 
 
 class _At:
-    """A callable that does its last act and kills this process when it is called the n-th time."""
+    """A callable whose n-th call does a last act and then kills this process."""
 
     def __init__(self, times: int, last_act: Callable[[], object]) -> None:
         self._left, self._last_act = times, last_act
@@ -83,8 +83,7 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""For each point: whether the kill comes after (true) or before (false) its calls, and the calls.
-"""
+"""For each point: whether to kill after (true) or before (false) a call, and of which functions."""
 
 
 def arm(where: str, address: str) -> None:

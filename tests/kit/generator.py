@@ -72,7 +72,7 @@ class Stages:
 def wait_until(true: Callable[[], object], what: str, timeout: float = PATIENCE_S) -> None:
     end = time.monotonic() + timeout
     while not true():
-        assert time.monotonic() < end, f"after {timeout:.0f} s still not so: {what}"
+        assert time.monotonic() < end, f"not true within {timeout:.0f} s: {what}"
         time.sleep(0.01)
 
 

@@ -1,4 +1,4 @@
-"""The Git server of ``tests.e2e.rig`` in the test's own process, with faults that a test sets."""
+"""The Git server of ``tests.e2e.rig`` inside a test's process, with faults that the test sets."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ class Faults:
     away_after_cut: bool = False
     """Whether a push without an answer also sets ``away``."""
     hang: threading.Event | None = None
-    """If set, each request waits for this event before anything else."""
+    """If this is not None, the server waits for the event before it handles a request."""
     cuts: Callable[[], bool] = lambda: False
-    """Called before a request is carried out and before its answer; true cuts the connection."""
+    """Called before a request is carried out and before it is answered; true cuts the connection.
+    """
 
 
 @dataclass
@@ -65,7 +66,7 @@ class _Handler(githttp.Handler):
     ordered: tuple[Server, str]
 
     def log_message(self, format: str, *args: object) -> None:
-        """Print no request."""
+        """Do not log requests."""
 
     def serve(self) -> None:
         self.close_connection = True

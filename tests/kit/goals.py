@@ -95,7 +95,7 @@ def goal(
 
 
 def perception(**changed: Any) -> Goal:
-    """Return a goal that is accepted: perception on the edge, with its point cloud's connection."""
+    """Return a valid goal: perception on the edge, and a connection for its point cloud."""
     return goal([application()], [connection()]) | changed
 
 

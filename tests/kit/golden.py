@@ -1,14 +1,14 @@
 """The golden cases: requests played in memory on a state repo, and the files that they must render.
 
 The requests are ``tests/golden/<case>/requests/*.yaml``, in order. ``expected/<step>/`` has the
-files that a step writes, as real files that a reviewer and `kubectl` can read. The file ``DELETED``
-in it lists the paths that the step deletes. The first step, ``0-start``, is what `init` renders.
-The files in a case's ``state-repo/`` replace or extend the skeleton's files.
+files that a step writes, as real files that a reviewer and `kubectl` can read. In each such folder,
+the file ``DELETED`` lists the paths that the step deletes. The first step, ``0-start``, is what
+`init` renders. The files in a case's ``state-repo/`` replace or extend the skeleton's files.
 
 The case ``experiment`` stores its whole start. Every other case stores how its start differs from
 the start of ``experiment``. A later step stores how it differs from the step before. A case in
-``FOLLOWING`` plays the requests of ``experiment``; its steps store how their changes differ from
-the changes there.
+``FOLLOWING`` plays the requests of ``experiment``. Each of its later steps stores only where its
+changes differ from the changes of the same step of ``experiment``.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def rendered(case: str) -> Mapping[str, Files]:
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    """Return the files below ``expected/`` as step → path → text."""
+    """Return the texts of the files below ``expected/``, by step and then by path."""
     expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
     for path in sorted(expected.rglob("*")):
@@ -106,7 +106,7 @@ def whole(case: str) -> Mapping[str, Files]:
 
 
 def to_store(case: str) -> dict[str, dict[str, str]]:
-    """Return the files that ``expected/`` must have, by step; leave out a step without a change."""
+    """Return the files that ``expected/`` must have, by step; steps without a change are absent."""
     steps: dict[str, dict[str, str]] = {}
     before: Files = {}
     for step, files in rendered(case).items():
@@ -119,7 +119,7 @@ def to_store(case: str) -> dict[str, dict[str, str]]:
 def _base(
     case: str, step: str, before: Files, steps_of: Callable[[str], Mapping[str, Files]]
 ) -> dict[str, str]:
-    """Return the files that a step's stored change starts from."""
+    """Return the files to which a step's stored change is applied."""
     if case == EXPERIMENT or (step != START and case not in FOLLOWING):
         return dict(before)
     steps: dict[str, Files] = {"": {}, **steps_of(EXPERIMENT)}
@@ -136,6 +136,6 @@ def _change(before: Files, after: Files) -> dict[str, str]:
 
 def _applied(before: Files, change: Files) -> dict[str, str]:
     gone = change.get(DELETED, "").splitlines()
-    assert set(gone) <= set(before), f"{DELETED} names files that are not there"
+    assert set(gone) <= set(before), f"{DELETED} lists files that do not exist before the step"
     files = {**before, **change}
     return {path: text for path, text in files.items() if path not in (DELETED, *gone)}

@@ -57,12 +57,12 @@ class Page(HTMLParser):
         return [element for element in self.elements if element.tag == tag]
 
     def texts(self, tag: str) -> list[str]:
-        """Return the text of each element with this tag, with single spaces for white space."""
+        """Return the text of each element with this tag; white space becomes one space."""
         return [" ".join(element.text.split()) for element in self.all(tag)]
 
     @property
     def text(self) -> str:
-        """The text of the ``main`` element, with single spaces for white space."""
+        """The text of the ``main`` element; white space becomes one space."""
         (main,) = self.texts("main")
         return main
 

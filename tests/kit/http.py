@@ -76,7 +76,7 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
     class Recorder(BaseHTTPRequestHandler):
         def log_message(self, format: str, *args: object) -> None:
-            """Print no request."""
+            """Do not log requests."""
 
         def _serve(self) -> None:
             length = int(self.headers.get("Content-Length") or 0)

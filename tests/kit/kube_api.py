@@ -1,4 +1,4 @@
-"""An API server whose objects a test puts into it; clients list, watch and annotate them."""
+"""An API server with objects from a test; clients list, watch and annotate the objects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BEAT_S = 0.5
 
 
 class KubeApi:
-    """The objects of one cluster, by plural name of the kind, namespace and name."""
+    """The objects of one cluster; a kind's plural name, a namespace and a name identify each."""
 
     def __init__(self) -> None:
         self.url = ""
@@ -41,7 +41,7 @@ class KubeApi:
             self._changed.notify_all()
 
     def patch(self, path: str, body: Item) -> None:
-        """Record a patch, and annotate the object as the patch says, if it exists."""
+        """Record a patch; if its object exists, give the object the patch's annotations."""
         *_, namespace, plural, name = path.split("/")
         with self._changed:
             item = self._items.get((plural, namespace, name))
@@ -54,7 +54,7 @@ class KubeApi:
             self.patches.append((path, body))
 
     def forget(self, plural: str, namespace: str, name: str) -> None:
-        """Delete an object while nobody watches, so that no watch reports it."""
+        """Delete an object without an event, as if no client watched when it was deleted."""
         with self._changed:
             del self._items[plural, namespace, name]
 
@@ -64,9 +64,9 @@ class KubeApi:
             return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
 
     def events(self, plural: str, namespace: str, since: int, seconds: float) -> Iterator[Item]:
-        """Yield the changes of a kind of objects in a namespace until the server is closed.
+        """Yield the changes of a namespace's objects of one kind after the version ``since``.
 
-        The changes begin after the version ``since``, and end after so many seconds.
+        The iterator ends after ``seconds``, or when the server is closed.
         """
         end = time.monotonic() + seconds
         while not self.closed and time.monotonic() < end:
@@ -86,7 +86,7 @@ class KubeApi:
         self.put("kustomizations", namespace, domain, status)
 
     def service(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
-        """Report a Helm release as ready, or with a ``fault`` as failed."""
+        """Report a Helm release as failed with ``fault``, or as ready if ``fault`` is empty."""
         ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
         ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"
         status = {"observedGeneration": 1, "conditions": [ready]}
@@ -106,7 +106,7 @@ def kube_api() -> Iterator[KubeApi]:
         protocol_version = "HTTP/1.1"
 
         def log_message(self, format: str, *args: object) -> None:
-            """Print no request."""
+            """Do not log requests."""
 
         def do_GET(self) -> None:
             address = urlsplit(self.path)

@@ -65,7 +65,7 @@ class MemoryRepo:
         return self.state.config
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal without a change of the repo; raise :class:`Refused` if it is refused."""
+        """Decide a goal and leave the repo unchanged; raise :class:`Refused` if it is refused."""
         return decide(self.state, goal, now or self.now, self.files.get)
 
     def send(self, goal: object, now: datetime | None = None) -> Decision:
@@ -81,7 +81,7 @@ class MemoryRepo:
         return decision
 
     def scale_down(self, now: datetime) -> list[str]:
-        """Remove the replicas that were kept until now, as the generator does.
+        """Remove replicas whose time to be kept ends at ``now``, as the generator does.
 
         Return the names of the changed releases.
         """
@@ -104,7 +104,7 @@ class MemoryRepo:
             return refusal
 
     def take_all(self, goals: Iterable[Goal]) -> list[str]:
-        """Send goals at intervals of a minute; return the outcome of each in one word."""
+        """Send goals at intervals of a minute; return the one-word outcome of each."""
         return [
             outcome(self.take(goal, self.now + timedelta(minutes=minute)))
             for minute, goal in enumerate(goals)
@@ -176,7 +176,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_booked(path: str) -> bool:
-    """Return whether a path is that of a claim, shutdowns, kept replicas or a waiting demand."""
+    """Return whether the file is a claim, shutdowns, kept replicas or a waiting demand."""
     roots = (
         recent_shutdowns.SHUTDOWNS_ROOT,
         kept_replicas.REPLICAS_ROOT,
@@ -186,7 +186,7 @@ def is_booked(path: str) -> bool:
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
-    """Return the ledger that the ledger's files among ``files`` describe."""
+    """Return the ledger that ``files`` describe; files of other folders are ignored."""
     booked = {path: text for path, text in files.items() if is_booked(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)

@@ -1,4 +1,4 @@
-"""Documents with one mistake of form each, and the verdict of a JSON schema on documents."""
+"""Documents that each have one mistake of form, and what a JSON schema says about documents."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ class Mutation(NamedTuple):
     new_place: Place
 
     def is_at(self, field: str) -> bool:
-        """Return whether a fault names the mistake's place, a part of it, or a value around it."""
+        """Return whether a fault names the mistake's place, or a place inside or around it."""
         return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the keys on the path to the mistake, and all texts in the value it replaced.
+        """Return the keys on the path to the mistake, and all texts in the replaced value.
 
         If another field refers to what the mistake broke, the fault in that field quotes one of
         these texts.
@@ -109,7 +109,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 
 
 def _one(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
-    """Return one mistake, another one each turn, or all if ``DEMANDOPS_EXAMPLES`` is above 1."""
+    """Return the one mistake for this ``turn``, or all if ``DEMANDOPS_EXAMPLES`` is above 1."""
     kinds = [*mistakes] if TIMES > 1 else [[*mistakes][turn % len(mistakes)]]
     return {kind: mistakes[kind] for kind in kinds}
 
@@ -133,7 +133,7 @@ def _at(document: Any, place: Place) -> Any:
 
 
 def _replaced(document: Any, place: Place, value: Any) -> Any:
-    """Return a document with another value at a place; both share the parts beside the place."""
+    """Return a copy of a document with another value at a place; all other parts are shared."""
     if not place:
         return value
     changed = copy.copy(document)
@@ -148,7 +148,7 @@ def path(place: Place) -> str:
 
 
 def _is_around(field: str, place: str) -> bool:
-    """Return whether a fault's field is the place, a part of it, or a value around it."""
+    """Return whether a fault's field is the place, or lies inside or around the place."""
     short, long = sorted((field, place), key=len)
     return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
 
@@ -156,12 +156,12 @@ def _is_around(field: str, place: str) -> bool:
 def problem(
     mutation: Mutation, faults: Sequence[Fault], form: Form, *, free: Container[str], file: str = ""
 ) -> str:
-    """Return the problem in the faults of a mutation, or an empty string.
+    """Return what is wrong with the faults found in a mutation, or an empty string.
 
     A fault must be at the mutation's place if the schema forbids the mutated document, or if a text
-    got a control character; only the ``free`` fields may have control characters. A fault at
-    another place must concern a reference, so it must quote a name from the mutation's place. A
-    fault at the mutation's place must not contain words of Python.
+    outside the ``free`` fields got a control character. A fault at another place must concern a
+    reference, so it must quote a name from the mutation's place. A fault at the mutation's place
+    must not contain words of Python.
     """
     place = path(mutation.place)
     here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
@@ -181,7 +181,7 @@ def problem(
 
 
 class Form:
-    """The verdicts of a JSON schema on documents, and the fields that it describes."""
+    """A JSON schema: which documents it rejects, and which fields it describes."""
 
     def __init__(self, schema: Schema) -> None:
         self._schema = schema
@@ -196,7 +196,7 @@ class Form:
         return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
 
     def limits(self) -> list[int]:
-        """Return the whole numbers one below a field's minimum or one above its maximum."""
+        """Return the numbers that just miss a field's range: minimum - 1 and maximum + 1."""
         limits = set()
         for part in self._parts():
             for field in part["properties"].values():

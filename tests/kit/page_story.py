@@ -46,7 +46,7 @@ replicas: 2
 
 
 def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
-    """Return a demand with a lease for a connection from a vehicle to the cloud."""
+    """Return a demand for a connection from a vehicle to the cloud, with a lease."""
     return {
         "apiVersion": "demandops/v1",
         "kind": "Demand",
@@ -66,7 +66,7 @@ def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
 
 
 def released(id: str, vehicle: str) -> Goal:
-    """Return the release of a demand that :func:`leased` returned."""
+    """Return the goal that releases the demand of :func:`leased`."""
     goal = leased(id, vehicle) | {"operation": "release"}
     return {key: value for key, value in goal.items() if key not in ("lease", "connections")}
 

@@ -7,8 +7,8 @@ A comment before a block says what a test does with it::
     <!-- not run: WHY -->
 
 A block with a title (```yaml title="PATH") is a file that the reader writes. In a `console` block,
-the lines after a command are its expected output. There `…` stands for any text in a line; alone on
-a line, it stands for any number of lines.
+the lines after a command are its expected output. In the output, `…` stands for any text in a line.
+A `…` alone on a line stands for any number of lines.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def blocks(markdown: str) -> Iterator[Block]:
 def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
     """Write the files of a page and run its commands.
 
-    Raise an AssertionError if a command prints something else than the page shows, or if a command
-    fails whose output the page does not show.
+    Raise an AssertionError if a command prints something else than the page shows. If the page
+    shows no output for a command, raise it if the command fails.
     """
     state = folder / ".state"
     state.write_text(f"cd {folder}\n")
@@ -111,7 +111,7 @@ def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
 def _ran(
     command: str, state: Path, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command in the folder and with the exported variables that the command before left."""
+    """Run a command; it starts with the folder and the exports that the previous one left."""
     script = (
         f"set -e\n. {state}\n"
         f'trap \'{{ printf "cd %q\\n" "$PWD"; export -p; }} >{state}\' EXIT\n{command}\n'

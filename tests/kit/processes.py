@@ -24,7 +24,7 @@ _SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
 
 
 def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any]:
-    """Return a demand in the form in which :meth:`Drivers.start` takes it."""
+    """Return a demand in the form that :meth:`Drivers.start` expects."""
     return {"name": name, "goal": made, "operation": operation or f"op-{name}"}
 
 
@@ -54,7 +54,10 @@ class Run:
         self.pid = 0
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Return the events until the process ends; call ``on_ready`` when it can take demands."""
+        """Return all events once the process ends.
+
+        ``on_ready`` is called when the process can take demands.
+        """
         sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
@@ -142,7 +145,7 @@ class Drivers:
 def listen_to_all(
     drivers: Drivers, runs: list[Run], on_ready: Callable[[], object] = lambda: None
 ) -> list[Told]:
-    """Read the events of all runs until they end; if the test is interrupted, kill them.
+    """Return the events of all runs once all have ended; kill the runs if the test is interrupted.
 
     Args:
         on_ready: called once, when all generators have started.
@@ -152,5 +155,5 @@ def listen_to_all(
         try:
             return list(pool.map(lambda run: run.listen(lambda: waited_for.wait(60)), runs))
         except BaseException:
-            drivers.kill_runs()  # else the pool would wait for them for ever
+            drivers.kill_runs()  # otherwise the pool would wait for the runs for ever
             raise

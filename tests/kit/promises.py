@@ -18,7 +18,7 @@ LEASES = (None, 10, 60, 90)
 
 
 class Maker:
-    """Makes random requests; few demands, requesters and subjects make them overlap often."""
+    """Makes random requests; they often overlap because they name few demands and subjects."""
 
     def __init__(self, random: Random) -> None:
         self._random = random
@@ -39,7 +39,7 @@ class Maker:
         return self._message(shutdown=kind > 17)
 
     def _of_known(self, kind: int) -> Goal:
-        """Return a renewal of a recent put, or the put again, with the same or another lease."""
+        """Return a renewal of a recent put, or the same put again, perhaps with another lease."""
         known = self._random.choice(self._puts[-2:])
         if kind < 3:
             return {key: known[key] for key in ("kind", "demand", "requesters")} | {
@@ -73,7 +73,7 @@ class Maker:
         return {
             "id": id,
             "type": "object-detection-fusion",
-            # mostly the same node: else all demands contradict each other
+            # mostly the same node, because otherwise most demands contradict each other
             "node": self._random.choice(["edge", "edge", "edge", "cloud"]),
             "connect": "none",
             "inputs": {"ego_data": topics or [{"topic": "/ego3", "source": "vehicle00"}]},

@@ -47,7 +47,7 @@ class Reference:
             self._apply(*_of_connection(connection, shutdown))
 
     def _apply(self, name: str, kind: str, spec: Item) -> None:
-        """Create a resource, or merge a patch into it; its kind's operator records any change."""
+        """Create or patch a resource; if that changes it, its operator records the request."""
         known = self.resources.get(name)
         merged = _merged(known["spec"], spec) if known else copy.deepcopy(spec)
         if known and merged == known["spec"]:
@@ -95,7 +95,7 @@ class Reference:
             del self.resources[name], book[name]
 
     def texts(self) -> dict[str, str]:
-        """Return the texts by file name: the operators' files, and the custom resources in one."""
+        """Return texts by file name: the operators' files, and one file of custom resources."""
         files = {}
         for kind, operator in OPERATORS.items():
             files[f"{operator}_bookkeeping.yml"] = yaml.dump(self.books[kind])

@@ -50,7 +50,7 @@ POLICY = "policy/access-domains.yaml"
 FORGER = (GENERATOR_NAME, GENERATOR_EMAIL, 1_770_000_000)
 """The author of a forged commit: a person with the generator's name.
 
-Only a signature shows that the generator did not make the commit.
+Only the missing signature shows that the generator did not make the commit.
 """
 
 
@@ -168,10 +168,13 @@ class Person:
         for _ in range(100):
             with suppress(pygit2.GitError):  # a generator published first: try again
                 return GitRepo(self.bare).commit(files, f"{message}\n", who)
-        raise AssertionError("main never stood still")
+        raise AssertionError("each of 100 attempts met a commit that was published first")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Commit ``files`` in the clone and push; return the commit. Fail if another push came."""
+        """Commit ``files`` in the clone, push, and return the commit.
+
+        The push fails if somebody else pushes meanwhile.
+        """
         self.fetch()
         for path, text in files.items():
             target = self.folder / path
@@ -293,7 +296,7 @@ def read(repo: Path, path: str) -> str:
 
 
 def without_vehicle01(repo: Path) -> dict[str, str | None]:
-    """Return path and text of the nodes' inventory without vehicle01, which demand 1 needs."""
+    """Return path and text of the nodes' inventory without vehicle01, which `numbered(1)` needs."""
     path = "inventory/nodes.yaml"
     before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
     return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
@@ -321,7 +324,7 @@ def claims(repo: Path, needle: str = "") -> list[str]:
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the differing files of the commits that `demandops verify` rejects, by summary.
+    """Return the commits that `demandops verify` rejects: their summaries and differing files.
 
     Only commits after ``since`` are verified, by default all after the first one.
     """
@@ -340,8 +343,8 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     """Check the objects, the history and the commits of a state repo.
 
     Nothing may be missing or damaged, the history must be linear, no operation may be committed
-    twice, and the commits must pass `demandops verify`. This verifies only the newest
-    ``verify_last`` commits, because each takes a tenth of a second; 0 means all.
+    twice, and the commits must pass `demandops verify`. Only the newest ``verify_last`` commits are
+    verified, because each takes a tenth of a second; 0 means all.
     """
     fsck = subprocess.run(
         ["git", "-C", str(repo), "fsck", "--strict", "--no-dangling", "--no-progress"],

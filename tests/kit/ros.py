@@ -40,11 +40,11 @@ STATUS = {
     GoalStatus.STATUS_SUCCEEDED: "succeeded",
     GoalStatus.STATUS_ABORTED: "aborted",
     GoalStatus.STATUS_CANCELED: "cancelled",
-    GoalStatus.STATUS_UNKNOWN: "",  # the node that knew the goal was killed
+    GoalStatus.STATUS_UNKNOWN: "",  # a killed node had the goal, and the new one does not know it
 }
 
 _LAST = 100
-"""The highest ROS domain to use; Linux gives the ports of higher ones to any socket."""
+"""The highest ROS domain to use; Linux may give a port of a higher domain to any socket."""
 
 
 @contextmanager
@@ -115,13 +115,13 @@ class Served:
     def last_words(self) -> str:
         """Return how the process ended, and its log.
 
-        A process that still runs is aborted; then the result also says what each thread was doing.
+        A process that still runs is aborted. The result then also says what each thread was doing.
         """
         code, pid = self.process.poll(), self.process.pid
         lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
         if code is None:
             for task in sorted(Path(f"/proc/{pid}/task").iterdir()):
-                with suppress(OSError):  # the thread may end meanwhile
+                with suppress(OSError):  # a thread that has ended
                     name, waits = ((task / file).read_text().strip() for file in ("comm", "wchan"))
                     ran, waited = self._scheduled(int(task.name))
                     times = f"ran {ran:.1f} s, waited {waited:.1f} s for a processor"
@@ -135,7 +135,7 @@ class Served:
         try:
             path = Path(f"/proc/{self.process.pid}/task/{thread}/schedstat")
             ran, waited, _ = map(int, path.read_text().split())
-        except (OSError, ValueError):  # it ended
+        except (OSError, ValueError):  # the thread has ended
             return 0.0, 0.0
         return ran / 1e9, waited / 1e9
 
@@ -148,7 +148,7 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain; with ``warm`` commands it starts faster."""
+    """Starts `demandops serve` in one ROS domain; ``warm`` commands start faster."""
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str

@@ -1,4 +1,4 @@
-"""A runtime that runs all threads in one; a seed determines their order and times."""
+"""A runtime that runs all its threads in one real thread; a seed determines the order and times."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Turns(Clock):
             thread.throw()
 
     def _next(self) -> greenlet:
-        """Return the next thread: a random one that can go on, else one whose wait ends first."""
+        """Return a random thread that can go on; if none can, one whose timeout is next."""
         free = [one for one, (is_over, _) in self._waiting.items() if is_over()]
         if not free:
             end = min(end for _, end in self._waiting.values())

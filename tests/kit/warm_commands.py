@@ -1,9 +1,10 @@
-"""Start commands without the time for imports: fork them from a process that has imported all.
+"""Start commands fast: fork them from a process that has imported all modules.
 
 The imports of a node take a second, and many tests start a node. Each command still has its own
 process, threads, signals, log and exit code. Python must have only one thread when it forks. The
-tests' own process has several, so a further process forks. It does not import ROS, because the
-tracing of ROS starts threads, and a fork of a process with threads can crash; the fork imports ROS.
+tests' own process has several, so another process forks. That process does not import ROS, because
+the tracing of ROS starts threads, and a fork of a process with threads can crash. Each fork imports
+ROS itself.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class WarmCommand:
 
 
 class WarmCommands:
-    """Starts commands as forks of a process that has done their imports."""
+    """Starts commands as forks of a process that has imported their modules."""
 
     def __init__(self, folder: Path) -> None:
         """Start the process that forks; put its pipes into ``folder``."""

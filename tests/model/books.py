@@ -16,7 +16,9 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Item = dict[str, Any]
 Demand = tuple[str, tuple[str, ...]]
-"""The request id and the sorted, distinct requesters of a join; they tell a subject's claims apart.
+"""The request id and the sorted, distinct requesters of a join.
+
+The claims on one subject differ in these.
 """
 
 Subject = tuple[str, str]
@@ -79,7 +81,7 @@ def requesters(item: Item) -> list[str]:
 
 
 def demand_of(goal: Goal, item: Item) -> Demand:
-    """Return the demand of an item, which tells its claim from other claims on the same subject."""
+    """Return the demand of an item; the claims on one subject belong to different demands."""
     return goal.get("id", ""), tuple(sorted(set(requesters(item))))
 
 
@@ -95,8 +97,8 @@ class Books:
     def take(self, goal: Goal, after: int = 1) -> Result:
         """Book or release a request as a whole, or refuse it as a whole.
 
-        The request comes ``after`` seconds after the one before. This is at least one second,
-        because a shutdown takes from the oldest claim first.
+        The request comes ``after`` seconds after the previous one. ``after`` is at least 1, so that
+        claims differ in age, because a shutdown takes from the oldest claim first.
         """
         self.now += after
         problem = next(self._inadmissible(goal), None)
@@ -183,7 +185,7 @@ class Books:
         found = [*brokers][:1] if len(brokers) == 1 else [n for n in (asked, *ends) if n in brokers]
         return found[0] if asked and found else ""
 
-    # Joining: additive for each claim; what contradicts a standing claim is refused
+    # Joining: a join adds to a claim, and is refused if it contradicts a claim on the subject
 
     def _join(self, goal: Goal) -> None:
         for item in _items(goal):
@@ -192,7 +194,7 @@ class Books:
             for other in claims.values():
                 if other["fixed"] != fixed:
                     raise _Refused("another node, type or end")
-                # "explicitly different": only if both name a broker
+                # brokers are "explicitly different" only if both connections name one
                 if broker and other["broker"] and other["broker"] != broker:
                     raise _Refused("another broker")
                 if any(other["routes"].get(one, two) != two for one, two in routes.items()):
@@ -208,10 +210,10 @@ class Books:
             }
             for topic in _topics(item):
                 claim["holds"].setdefault(topic, set()).update(demand[1])
-            # left open by the design: here, a join that changes its claim renews its booking time
+            # the design leaves this open; here, a join that changes a claim sets its booking time
             claims[demand] = claim if claim == was else claim | {"booked": self.now}
 
-    # Leaving: one hold of each requester that is named, on each topic that is listed
+    # Leaving: a shutdown takes one hold of each named requester on each listed topic
 
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
         """Take the holds that a shutdown lists.
@@ -273,8 +275,8 @@ class Books:
     def services(self) -> dict[tuple[str, str, str], dict[str, Any]]:
         """Return who requests each service; the key is the service, its node, and what it is for.
 
-        A detection is for one cloud (``source topic``), a fusion for one application. The object
-        lists of a fusion have the names of the clouds from which they are made.
+        A detection is for one point cloud (``<source> <topic>``), a fusion for one application. An
+        object list of a fusion has the name of the point cloud from which it is made.
         """
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
         for id_, claim in self._on("application"):
@@ -343,7 +345,7 @@ def _subject(item: Item) -> Subject:
 def _fixed(item: Item) -> dict[str, Any]:
     """Return the fields that all claims on a subject share: the node or the ends, and the type.
 
-    A shutdown may leave out nodes; these are empty.
+    A node that a shutdown leaves out is an empty text.
     """
     if "header" in item:
         return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}
@@ -462,7 +464,7 @@ def in_model_words(
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Return, by node and object list topic, the cloud from which a detection there makes the list.
+    """Return a map from (node, topic of an object list) to the point cloud that it is made from.
 
     ``manifests`` are the rendered releases.
     """

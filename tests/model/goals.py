@@ -52,7 +52,7 @@ CLOUDS = (
     ("/shared/points", "vehicle01"),
     ("/shared/points", "vehicle02"),
 )
-"""The usual clouds, a second cloud of vehicle00, and a topic name that two vehicles publish."""
+"""Point clouds: the usual ones, a second one of vehicle00, and one name that two vehicles use."""
 
 CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
     "vehicle00/edge": (
@@ -158,7 +158,7 @@ class Maker:
         """Return a shutdown of an earlier join: of all of it, of a part, or with mistakes."""
         place = self._random.randrange(len(self.joined))
         made = shutdown_of(self.joined[place])
-        if not self._odds(3):  # else it may be sent again
+        if not self._odds(3):  # otherwise the same join may be shut down again
             del self.joined[place]
         for kind in ("apps", "connections"):
             if len(made["apps"]) + len(made["connections"]) > 1 and self._odds(3):

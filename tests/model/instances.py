@@ -1,4 +1,4 @@
-"""A model of instances by version, of nodes in two access domains, and of kept replicas.
+"""A model of separate instances, of a node in two access domains, and of kept replicas.
 
 It is written from what docs/versions.md, docs/policy.md and docs/appdef.md promise, and imports
 nothing of the program. In this model, each demand for an instance has one application, which runs
@@ -16,7 +16,7 @@ from tests.model.leases import Goal
 from tests.model.places import Outcome, Places
 
 TALLY = "tally"
-"""The type of applications that have instances; each topic needs a replica, up to ``MOST``."""
+"""The type of the applications with separate instances; a topic needs a replica, up to ``MOST``."""
 DEFAULT, NEXT = "1.0.0", "1.1.0"
 HALL, FIRST, FURTHER = "hall", "hall@perception", "hall@city"
 """A node in two access domains, its name in the first one, and its name in the further one."""
@@ -37,7 +37,7 @@ Instance = tuple[str, str]
 class Instances(Places):
     """The model of places, with instances.
 
-    ``testing`` is the version in the channel of this name. ``kept`` has the instances with more
+    ``testing`` is the version of the channel ``testing``. ``kept`` has the instances with more
     replicas than they need, with the time until which each number of replicas is kept.
     """
 
@@ -92,7 +92,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep the replicas that were needed ``before`` and are needed no longer, for a time."""
+        """Keep for ``KEPT_FOR`` the replicas that were needed ``before`` and no longer are."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -120,7 +120,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return, for each number above ``least``, until when at least so many replicas are kept."""
+    """Return, for each number above ``least``, until when at least this many replicas are kept."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)

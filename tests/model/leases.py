@@ -1,7 +1,7 @@
-"""A model of leases and of demands in DemandOps' own format, written only from what is promised.
+"""A model of leases and of demands in DemandOps' own format, written only from the docs.
 
-It uses plain dicts over goals as they come in YAML, and imports nothing of the program. Where a
-sentence leaves something open, a comment says what this model does. Times are whole seconds.
+It uses plain dicts over goals as they come in YAML, and imports nothing of the program. Where the
+docs leave something open, a comment says what this model does. Times are whole seconds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Subject = tuple[str, str]
 """A subject: its kind (``applications`` or ``connections``) and its id."""
 
 BY_MESSAGE = "by message: "
-"""The start of the name that a demand from a goal of the reference has."""
+"""The start of the names of demands that come from goals of the reference."""
 
 
 REPEATS_WITHIN_S = 15 * 60
@@ -46,7 +46,7 @@ class Held:
     booked: int = 0
 
     def same(self, other: Held | None) -> bool:
-        """Return whether the two differ only in their times."""
+        """Return whether ``other`` is the same hold, except for its times."""
         if other is None:
             return False
         mine = (self.what, self.requesters, self.seconds, self.holders)
@@ -143,7 +143,7 @@ class Promises:
                 return True
         return False
 
-    # goals of the reference: one connection each; id and requesters name the demand
+    # goals of the reference: each has one connection; the goal's id and requesters name the demand
 
     def _message(self, goal: Goal, now: int) -> Outcome:
         item = goal["connections"][0]
@@ -184,7 +184,7 @@ class Promises:
             if name.startswith(BY_MESSAGE) and subject in held
         ]
         names = [name for *_, name in sorted(around)]
-        # requesters do not share holds, so one can be taken while others are searched
+        # no two requesters share a hold, so it does not matter whose holds are taken first
         taken = [self._take(names, one, subject, topics) for one in who]
         if not any(taken):
             return "refused"
@@ -263,9 +263,9 @@ class Promises:
 
 
 def _subjects(goal: Goal) -> dict[Subject, dict[str, Any]]:
-    """Return what a put demands of each subject.
+    """Return each subject that a put lists, with the content that it demands.
 
-    The puts of these tests list no subject twice, and nothing has to be derived from them.
+    The puts of these tests list no subject twice, and the program derives no connections from them.
     """
     found: dict[Subject, dict[str, Any]] = {}
     for app in goal.get("applications", []):

@@ -20,8 +20,8 @@ _WHOLE = [""]
 class Resource:
     """A custom resource: its last request, and the requesters that its operator counts.
 
-    While it ``is_stuck``, its operator fails. A fusion that was stuck ``is_uncounted``: its
-    operator counts nothing for it.
+    ``is_stuck`` is true while the operator fails on the resource. ``is_uncounted`` is true for a
+    fusion on which the operator failed before, because the operator counts nothing for it any more.
     """
 
     spec: object
@@ -37,7 +37,7 @@ class Operators:
         self._resources: dict[str, Resource] = {}
 
     def books(self) -> dict[str, list[str]]:
-        """Return the sorted requesters by resource; of a fusion, by resource and topic."""
+        """Return the sorted requesters by resource; for a fusion, by resource and topic."""
         return {
             f"{name} {topic}".strip(): sorted(who)
             for name, resource in self._resources.items()

@@ -134,7 +134,7 @@ class Places(Promises):
         self.drained = self.drained | {node} if drained else self.drained - {node}
 
     def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return the priority, the time and the requesters of each waiting demand, by its name."""
+        """Return priority, start of the wait, and requesters of each waiting demand, by name."""
         return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
 
 

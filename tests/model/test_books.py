@@ -1,4 +1,4 @@
-"""The model gives the table of the paper's experiment."""
+"""The model has the requesters of the paper's table after each step of the experiment."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ STEPS = (
     ("7-vehicle02-leaves", "S 3", "", "3"),
     ("8-vehicle03-leaves", "", "", ""),
 )
-"""The requesters after each of the experiment's files.
+"""A row for each of the experiment's files, with the requesters after it.
 
-First come the requesters of the services that the station's data feeds, then those of the services
-that vehicle 0's data feeds, then the other vehicles that have a connection.
+The second column has the requesters of the services that the station's data feeds. The third has
+those of the services that vehicle 0's data feeds. The last has the other vehicles that have a
+connection.
 """
 
 

@@ -1,7 +1,7 @@
 """The ROS packages build in a colcon workspace, as they do in a ROS 2 installation.
 
-In the test, the ROS 2 wheels of PyPI are the underlay of the workspace. They lack ros2run and
-ros2launch, so the tests launch nothing: they find the files that both would look up.
+In the tests, the ROS 2 wheels of PyPI are the underlay of the workspace. These wheels lack ros2run
+and ros2launch, so the tests launch nothing. They only check the files that both would look up.
 """
 
 from __future__ import annotations

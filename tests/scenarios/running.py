@@ -1,7 +1,7 @@
 """Read scenarios, and run them on a state repo in memory.
 
-Time passes only where a step has ``after`` or ``clock``. In every step, before its demand is sent,
-the generator's own lease clock decides which leases have ended.
+Time passes only where a step has ``after``. In every step, before the step's demand is sent, the
+generator's own lease clock decides which leases have ended.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Step(FrozenModel):
     ``config`` changes the configuration from this step on, like a person's commit. ``after`` lets
     time pass. ``clock`` moves only the wall clock, by a duration that may be negative. ``restart``
     discards the generator's memory. ``expires`` lists the demands that the generator releases after
-    these changes, in order; without it, the generator must release none.
+    these changes, in order. In a step without ``expires``, the generator must release none.
     """
 
     why: str = ""
@@ -91,24 +91,24 @@ class Step(FrozenModel):
     @model_validator(mode="after")
     def _checkable(self) -> Step:
         if all(getattr(self, name) is None for name in _CHECKS):
-            raise ValueError(f"checks nothing; say one of {', '.join(_CHECKS)}")
+            raise ValueError(f"checks nothing; add at least one of {', '.join(_CHECKS)}")
         if self.refused is not None and not self.refused:
-            raise ValueError("refused is empty; say which faults are told")
+            raise ValueError("refused is empty; list the faults that the refusal must have")
         if self.holds is not None and not (self.holds and all(self.holds.values())):
-            raise ValueError("holds names no words to look for")
+            raise ValueError("holds is empty, or lists no words for a release")
         if self.send is not None and (self.gives is None) == (self.refused is None):
-            raise ValueError("a demand that is sent needs gives or refused, one of both")
+            raise ValueError("a step with send needs either gives or refused")
         if self.send is None and (self.gives or self.refused or self.desired or self.warns):
-            raise ValueError("gives, refused, desired and warns are about a demand; send one")
+            raise ValueError("gives, refused, desired and warns need a demand; add send")
         return self
 
 
 class Scenario(FrozenModel):
     """A whole scenario.
 
-    ``config`` changes the files that ``demandops init`` writes: its mappings are merged into them,
-    and any other value replaces theirs. ``appdefs`` names folders of ``tests/appdefs`` to add.
-    ``invalid`` lists the faults that the configuration must have.
+    ``config`` changes the files that ``demandops init`` writes. A mapping is merged into that of
+    the file, and any other value replaces that of the file. ``appdefs`` names folders of
+    ``tests/appdefs`` to add. ``invalid`` lists the faults that the configuration must have.
     """
 
     must: str = Field(min_length=1)
@@ -120,7 +120,7 @@ class Scenario(FrozenModel):
     @model_validator(mode="after")
     def _checkable(self) -> Scenario:
         if bool(self.invalid) == bool(self.steps):
-            raise ValueError("needs steps, or what is invalid about its configuration: one of both")
+            raise ValueError("a scenario needs either steps or invalid, not both")
         return self
 
 
@@ -199,7 +199,7 @@ class World(MemoryRepo):
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Return the decision on a goal, without a change of the state repo."""
+        """Return the decision on a goal; the state repo stays unchanged."""
         self._sent += 1
         operation, now = f"hand-in-{self._sent}", now or self.clock.now()
         return decide(
@@ -213,8 +213,8 @@ class World(MemoryRepo):
     def look(self) -> list[str]:
         """Release the demands whose leases have ended; return their ids in order.
 
-        Like the generator, this then removes the replicas that were kept until now, moves placed
-        applications away from drained nodes, and tries the waiting demands.
+        Like the generator, this then removes replicas whose time to be kept is over, moves placed
+        applications away from drained nodes, and tries to book the waiting demands.
         """
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
@@ -259,12 +259,12 @@ class World(MemoryRepo):
         return found
 
     def assert_sound(self) -> None:
-        """Check that the files have exactly the ledger and the releases that follow from it."""
+        """Check that the files are exactly those of the ledger and of the ledger's releases."""
         assert ledger_in(self.files) == self.state.ledger
         asked = rendered_files(self.state)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
-        assert not names, f"these files exist without need, or are missing: {names}"
+        assert not names, f"these files are missing, or no release needs them: {names}"
         assert there == asked
 
 
@@ -300,7 +300,7 @@ def _take(step: Step, world: World, place: str) -> None:
         world.clock.set_by(sign * seconds_of(step.clock.removeprefix("-")))
     if step.restart:
         world.restart()
-    assert world.look() == (step.expires or []), f"{place}: these must expire, and no others"
+    assert world.look() == (step.expires or []), f"{place}: other demands expire than expected"
     if step.send is not None:
         taken = world.take(step.send)
         for problem in _sent(step, taken):
@@ -334,7 +334,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
         if step.refused is None:
             yield f"is refused:\n{told}"
         elif not same_faults(step.refused, taken.faults):
-            yield f"is refused otherwise:\n{told}"
+            yield f"is refused with other faults:\n{told}"
         return
     if step.refused is not None:
         yield f"is {taken.outcome}, but must be refused"
@@ -345,7 +345,7 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     signs = {"start": "+", "change": "~", "stop": "-"}
     desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
     if step.desired is not None and desired != sorted(step.desired):
-        yield f"the desired state changes otherwise: {desired}"
+        yield f"the desired state changes in another way: {desired}"
     if step.warns is not None:
         fitting = len(taken.warnings) == len(step.warns) and all(
             words in warning for words, warning in zip(step.warns, taken.warnings, strict=False)
@@ -367,7 +367,7 @@ def _of_connections(world: World, what: str) -> dict[str, list[str]]:
 
 
 def _since_start(moment: datetime) -> str:
-    """Return a time as the duration since the scenario's start, like ``1h30m``."""
+    """Return the duration from the scenario's start to ``moment``, like ``1h30m``."""
     rest = int((moment - START).total_seconds())
     parts = []
     for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):

@@ -1,4 +1,4 @@
-"""A random history from a seed: about thirty steps; then all faults end, and all is checked."""
+"""A random history from a seed: thirty steps, then the mending of all faults, then a last check."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Send two demands for places at once, after the release of a place if one is held."""
+        """Send two demands for places at once; if a place is held, send its release before them."""
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
@@ -306,10 +306,10 @@ class History:
             machine.is_cut_off, machine.delay = False, 0.0
 
     def set_clocks(self) -> None:
-        """Set the wall clocks forward or back; after a step back, only further back.
+        """Set the wall clocks forward or back; after the first step back, only further back.
 
-        Otherwise a machine might notice neither of two steps. It might then end a lease early that
-        another machine recorded between the steps.
+        A step forward could make up for a step back, so that a machine notices neither. The machine
+        might then end a lease early that another machine recorded between the two steps.
         """
         self.oracle.check()
         self.oracle.counts["faults"] += 1

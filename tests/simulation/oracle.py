@@ -29,7 +29,7 @@ from tests.simulation.world import Machine, World
 
 SLACK_S = 30
 PLACES = frozenset({"rack0", "rack1"})
-"""The nodes with room for one application each; they serve demands that name no node."""
+"""The nodes for demands that name no node; each of these nodes has room for one application."""
 KEPT_REPLICAS = "ledger/replicas"
 VISITOR = "visitor"
 """A requester whose id starts with this needs approval for its demands."""
@@ -37,7 +37,10 @@ VISITOR = "visitor"
 
 @dataclass(eq=False)
 class Asked:
-    """A demand that was sent to a machine: when, and after how many commits (``place``)."""
+    """A demand that was sent to a machine, with its ``time``.
+
+    ``place`` is the number of commits on main before the demand.
+    """
 
     goal: Goal
     machine: Machine
@@ -77,7 +80,7 @@ class Oracle:
         self._pushed_at = world.turns.monotonic()
         """The time at which the oracle last found a new tip of main."""
         self._models = [pickle.dumps(self.books)]
-        """The model after each commit of main. Bytes are copied ten times as fast as the model."""
+        """The pickled model after each commit of main; copying the model takes ten times longer."""
         self._place: dict[str, int] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
@@ -169,7 +172,7 @@ class Oracle:
     def _compare_instances(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> None:
-        """Fail unless the model has the rendered instances and keeps the same replicas."""
+        """Fail unless a commit has the instances of the model and keeps the same replicas."""
         entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
         self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
         for one in self.books.kept.keys() | records.keys():
@@ -237,8 +240,8 @@ class Oracle:
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
         """Return the operations of a commit and of all commits that it merges.
 
-        With each comes whether a proposal had it: the lease of a proposed demand starts at the
-        merge.
+        Each comes with whether a proposal contained it, because the lease of a proposed demand
+        starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:
@@ -258,7 +261,7 @@ class Oracle:
         for demand, subject in gone:
             held, jump = self.books.held[demand][subject], self.world.last_jump
             assert held.promised is not None and held.seconds is not None, f"{demand}: no lease"
-            # after a jump, every lease gets its full term from the machines that saw the jump
+            # a machine that saw a jump grants every lease its full term from the jump on
             full_term = jump + held.seconds if started < jump else jump
             least = held.promised if jump < 0 else min(held.promised, full_term)
             assert time >= least, f"the lease of {demand} ended {least - time} s early"
@@ -305,7 +308,7 @@ class Oracle:
                 self._take(self.books, asked, asked.time)
         elif outcome == "waiting" and place is None:
             self._assert_possible(asked, "waits")
-        elif asked.needs_approval and place is None:  # withdrawn, or main had its claims already
+        elif asked.needs_approval and place is None:  # withdrawn, or its claims were on main before
             if outcome != "released":
                 self._assert_possible(asked, "unchanged")
         else:
@@ -386,7 +389,7 @@ def _made(commit: pygit2.Commit) -> datetime:
 
 
 def _records_in(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    """Return the numbers of replicas that each instance keeps, each with its end."""
+    """Return, for each instance, until when it keeps each number of replicas."""
     return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
 
 

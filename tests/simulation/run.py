@@ -1,8 +1,9 @@
-"""``make simulate``: plays histories for ``SIMULATE_S`` seconds, from ``SEED`` or a random seed on.
+"""``make simulate``: plays histories for ``SIMULATE_S`` seconds; the first seed is ``SEED``.
 
-For each history that fails, it prints the command that plays the history again. It stops after ten
-failures. At the end it prints what was played, and how many histories a minute of one processor
-plays, which does not depend on what else the machine does.
+Without ``SEED``, the first seed is random. For each history that fails, the program prints the
+command that plays the history again. It stops after ten failures. At the end it prints what was
+played, and how many histories it plays in one minute of processor time. This number does not depend
+on what else the machine does.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def main() -> int:
     end = time.monotonic() + float(os.environ.get("SIMULATE_S") or 60)
     counts = Counter[str](histories=0, demands=0, commits=0, failures=0)
     template()
-    gc.freeze()  # what is there now stays, so the garbage collector need not search it
+    gc.freeze()  # all present objects stay, so the garbage collector need not search them
     began = time.process_time()
     try:
         while time.monotonic() < end and counts["histories"] < most and counts["failures"] < 10:
@@ -44,7 +45,7 @@ def main() -> int:
                 counts.update(seen)
             except Exception:
                 traceback.print_exc(limit=-6)
-                print(f"\nfailed; again: make simulate SEED={seed} HISTORIES=1\n", flush=True)
+                print(f"\nfailed; to repeat: make simulate SEED={seed} HISTORIES=1\n", flush=True)
                 counts["failures"] += 1
             else:
                 if most == 1:

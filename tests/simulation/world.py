@@ -2,8 +2,8 @@
 
 The generators are the production code. Only three things are replaced. ``Turns`` replaces the
 clock, random numbers and threads. A push or fetch only moves a reference, because all clones share
-one folder of objects. A forced write of the journal is recorded, so that a crash leaves only what a
-disk may have kept.
+one folder of objects. A call of ``fsync`` for the journal is recorded, so that a crash leaves only
+what a disk may have kept.
 """
 
 from __future__ import annotations
@@ -77,13 +77,13 @@ class Machine(Runtime):
         self.world.on_start(self)
 
     def failed(self, name: str, error: Exception) -> None:
-        """Take an unexpected error for the world's failure."""
+        """Record an unexpected error as the failure of the world."""
         super().failed(name, error)
         if not isinstance(error, DemandOpsError):
             self.world.failure = self.world.failure or error
 
     def may_crash(self) -> None:
-        """Crash if ``crashes_in`` has chosen this call; the calling thread then never goes on."""
+        """Count ``crashes_in`` down and crash at 0; after a crash, this call never returns."""
         if self.crashes_in and getcurrent() in self.threads:
             self.crashes_in -= 1
             if not self.crashes_in:
@@ -114,7 +114,7 @@ class Machine(Runtime):
 
 
 class Disk:
-    """The durable part of a journal: names and contents at the last forced writes."""
+    """The durable part of a journal: file names and contents as of their last ``fsync``."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -122,9 +122,9 @@ class Disk:
         self._contents: dict[int, bytes] = {}
 
     def sync(self, path: Path) -> None:
-        """Record the name or content that a forced write of a folder or file makes durable.
+        """Record what ``fsync`` makes durable: the names in a folder, or the content of a file.
 
-        The machine may crash before or after the write.
+        The machine may crash before or after the call.
         """
         self._machine.may_crash()
         if path.is_dir():
@@ -141,11 +141,11 @@ class Disk:
     def left_of(self, folder: Path) -> bytes | None:
         """Return what is left of a journal after a crash; None if there is no journal.
 
-        Either the process crashes, which loses nothing, or the whole machine does.
+        Chance decides whether only the process crashes, which loses nothing, or the whole machine.
         """
         chance, path = self._machine.turns.chance, folder / _JOURNAL
         now = {_JOURNAL: path.stat().st_ino} if path.exists() else {}
-        if chance.randrange(2):  # the process alone: all that was written stays
+        if chance.randrange(2):  # only the process crashes, so all that was written stays
             return path.read_bytes() if now else None
         inode = chance.choice([now, self._names]).get(_JOURNAL)
         synced = self._contents.get(inode or 0, b"")
@@ -167,7 +167,7 @@ class Clone(RemoteRepository):
         super().__init__(machine.name, folder, lambda text: None, allow_offline)
 
     def tidy(self) -> None:
-        """Do nothing: all clones share one folder of objects."""
+        """Do nothing, because all clones share one folder of objects."""
 
     def _clone(self, notify: Callable[[str], None]) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
@@ -271,11 +271,11 @@ class World:
         self.turns, self.folder, self.numbers = Turns(seed), folder, count(1)
         self.remote = pygit2.Repository(str(shutil.copytree(template, folder / "remote.git")))
         self.pushed_by: dict[str, tuple[Machine, float, float]] = {}
-        """For each pushed tip of main: the machine, its generator's start, the time of the push."""
+        """For each pushed tip of main: the machine, when its generator started, when it pushed."""
         self.dead: list[Any] = []
         self.on_start: Callable[[Machine], object] = lambda machine: None
         self.failure: Exception | None = None
-        """The first event that must not happen, if there was one."""
+        """The first error that must not happen, if there was one."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
         self.last_jump = -1.0
@@ -320,5 +320,5 @@ class World:
             self.last_jump = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
-        """Return a wall clock's time in seconds; it can only be compared with other results."""
+        """Return a time of the wall clock in seconds, to compare it with other such results."""
         return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)

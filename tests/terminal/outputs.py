@@ -99,7 +99,8 @@ _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """Make a fleet with demands, a lease, overrides and contexts in ``folder``.
 
-    Afterwards ``folder`` is the process's working directory, and its clock stands still at ``NOW``.
+    Afterwards the process's working directory is ``folder``, and the program's clock stands still
+    at ``NOW``.
     """
     made, clock = count(), [NOW - timedelta(hours=3)]
     patch.setattr(REAL, "now", lambda: clock[0])
@@ -149,14 +150,14 @@ def _done(command: str) -> None:
 
 
 def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
-    """Return the output of a command without colours, and with the same text for all commit ids."""
+    """Return the output of a command without colours, and with ``c…`` in place of commit ids."""
     with patch.context() as own, TemporaryDirectory() as folder:
         own.setenv("NO_COLOR", "1")
         if command in CHANGING:
             own.chdir(shutil.copytree(Path.cwd(), Path(folder, "fleet")))
             own.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
             own.setenv("HELM_BIN", "no-helm")
-        if command.startswith("config "):  # its contexts name URLs, no local paths
+        if command.startswith("config "):  # these contexts name URLs, no local paths
             own.setenv("XDG_CONFIG_HOME", str(Path.cwd() / "contexts"))
         if command.startswith("watch"):
             own.setattr(REAL, "sleep", _interrupt)

@@ -40,7 +40,7 @@ def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPat
 
 @pytest.fixture(autouse=True)
 def _home(data_home: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let each test use the journals of the fleet instead of its own."""
+    """Let each test use the journals of the fleet instead of journals of its own."""
     with pytest.MonkeyPatch.context() as made:
         made.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
         yield
@@ -53,7 +53,7 @@ def test_it_prints_what_it_printed(command: str, patch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch) -> None:
-    """In a pipe a command prints everything, so each word of the terminal must be there too."""
+    """Each word that a command shows on a terminal is also in its output to a pipe."""
     lines = file_of(command).read_text().splitlines()
     wider = [line for line in lines if line.startswith("more columns in a wider terminal: ")]
     piped = {*words(same_ids(demandops(*shlex.split(command)).out)), *words(" ".join(wider))}

@@ -31,18 +31,18 @@ DEMAND = "send: {kind: Demand, demand: d, requesters: [a]}"
     [
         ("", "must be a mapping"),
         ("steps: [{gives: booked}]", "must: is missing"),
-        ("must: do nothing", "needs steps"),
-        ("must: do nothing\nsteps: []", "needs steps"),
+        ("must: do nothing", "needs either steps"),
+        ("must: do nothing\nsteps: []", "needs either steps"),
         ("must: check nothing\nsteps: [{after: 1h}]", "checks nothing"),
         (f"must: check nothing\nsteps: [{{{DEMAND}}}]", "checks nothing"),
-        (f"must: look away\nsteps: [{{{DEMAND}, runs: {{}}}}]", "needs gives or refused"),
+        (f"must: look away\nsteps: [{{{DEMAND}, runs: {{}}}}]", "needs either gives or refused"),
         (f"must: take all\nsteps: [{{{DEMAND}, refused: []}}]", "refused is empty"),
-        ("must: compare nothing\nsteps: [{gives: booked}]", "send one"),
-        ("must: hold nothing\nsteps: [{holds: {}}]", "holds names no words"),
-        ("must: hold nothing\nsteps: [{holds: {of-edge: []}}]", "holds names no words"),
+        ("must: compare nothing\nsteps: [{gives: booked}]", "add send"),
+        ("must: hold nothing\nsteps: [{holds: {}}]", "holds is empty"),
+        ("must: hold nothing\nsteps: [{holds: {of-edge: []}}]", "lists no words"),
         ("must: misspell\nsteps: [{expire: [d]}]", "expire: is not a field here"),
-        ("must: accept no faults\ninvalid: []", "needs steps"),
-        ("must: be both\ninvalid: [{field: x}]\nsteps: [{runs: {}}]", "one of both"),
+        ("must: accept no faults\ninvalid: []", "needs either steps"),
+        ("must: be both\ninvalid: [{field: x}]\nsteps: [{runs: {}}]", "or invalid, not both"),
     ],
 )
 def test_a_scenario_that_could_not_fail_is_not_read(text: str, told: str) -> None:
@@ -80,12 +80,12 @@ steps:
         ("gives: booked\n  connections: {}", "connections"),
         ("gives: booked\n  carries: {derived/vehicle00/edge: [/other]}", "carries"),
         ("gives: booked\n  leases: {d: 11m}", "leases"),
-        ("gives: booked\n  desired: []", "the desired state changes otherwise"),
+        ("gives: booked\n  desired: []", "the desired state changes in another way"),
         ("gives: booked\n  warns: [something]", "warns of ()"),
         ("gives: booked\n  holds: {of-edge: [nonsense]}", "holds no ['nonsense']"),
         ("gives: booked\n  holds: {xx: [nonsense]}", "0 releases are called xx"),
-        ("gives: booked\n- {after: 10m, expires: [d]}", "these must expire"),
-        ("gives: booked\n- {after: 11m, runs: {}}", "these must expire"),
+        ("gives: booked\n- {after: 10m, expires: [d]}", "other demands expire"),
+        ("gives: booked\n- {after: 11m, runs: {}}", "other demands expire"),
     ],
 )
 def test_a_scenario_fails_where_something_else_comes_out(claimed: str, told: str) -> None:
@@ -102,7 +102,7 @@ def test_a_refusal_must_be_the_one_that_is_expected() -> None:
         f"{{{fault}, says: [nonsense]}}",
         f"{{{fault}}}, {{{fault}, says: [edge]}}",
     ):
-        assert "is refused otherwise" in _failing(f"{bad}  refused: [{claimed}]\n")
+        assert "is refused with other faults" in _failing(f"{bad}  refused: [{claimed}]\n")
 
 
 def test_the_scenarios_are_where_they_are_looked_for() -> None:

@@ -67,7 +67,7 @@ def slip_in(world: World) -> Iterator[SlipIn]:
 
 
 def application(world: World, *, project: str, into: str, namespace: str) -> Manifest:
-    """Return an Application of a project in `namespace` that installs the detection into `into`."""
+    """Return an Application of `project`, in `namespace`, that installs the detection in `into`."""
     source = {
         "repoURL": world.rig.git_url(world.name),
         "path": "appdefs/object-detection-fusion/charts/object-detection",

@@ -119,7 +119,7 @@ def forget_flux(domain: flux_view.Domain) -> None:
 def forget_argocd(domain: Domain) -> None:
     """Delete the Applications, but not the objects that they manage.
 
-    The folder's Application goes first, because it would restore those of the releases.
+    The folder's Application goes first, because it would restore the Applications of the releases.
     """
     apps = [
         (domain.name, CONTROL),

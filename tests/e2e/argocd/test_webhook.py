@@ -51,7 +51,10 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 @pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
-    """Return a function: it names the Applications refreshed by the webhook since its last call."""
+    """Return a function that names the Applications that the webhook has refreshed.
+
+    Each call names those that were refreshed after the previous call.
+    """
     log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
 
     def names() -> set[str]:

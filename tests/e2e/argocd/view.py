@@ -55,7 +55,7 @@ class Domain(Namespace):
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
-        """Refresh the folder's Application now; Argo CD then applies the releases it changes."""
+        """Refresh the folder's Application now, so that Argo CD applies what has changed in it."""
         self.refresh(self.name, NAMESPACE)
 
     def refresh(self, name: str, namespace: str = "") -> None:

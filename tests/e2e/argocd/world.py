@@ -46,7 +46,7 @@ class World(StateRepo[Domain]):
         self.generator.stop()
         for domain in self.domains.values():
             domain.kube.delete("Application", domain.name, NAMESPACE)
-            # after a test killed the API server, Argo CD sees the deletion once it watches again
+            # if a test killed the API server, Argo CD sees this only when it watches again
             domain.kube.wait_gone("Application", domain.name, NAMESPACE, timeout=180.0)
             domain.kube.delete("AppProject", domain.name, NAMESPACE)
         self.remove_wide()

@@ -36,7 +36,10 @@ def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
 def limited(
     kube: Kube, administrator: Path, folder: Path, rights: Mapping[str, Sequence[Manifest]]
 ) -> Path:
-    """Write a kubeconfig whose account has only these rights, by namespace; return its path."""
+    """Create an account with only these rights, and return the path of a kubeconfig for it.
+
+    ``rights`` has the account's role rules by namespace.
+    """
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}

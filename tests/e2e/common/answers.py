@@ -100,10 +100,10 @@ def push_chart(world: World, added: str) -> dict[str, str]:
 
 
 class Answers:
-    """A demand is answered when it is reconciled or healthy, or else with the reason."""
+    """A demand is answered once it is reconciled or healthy; if it never is, with the reason."""
 
     def read_repaired_chart(self, world: World) -> None:
-        """Make the controller read a repaired chart if it does not do so itself."""
+        """Make the controller read a repaired chart; do nothing if it reads the chart by itself."""
 
     def test_answered_when_it_is_healthy_and_when_it_is_gone(
         self, world: World, requester: DemandClient
@@ -119,7 +119,7 @@ class Answers:
             assert held.answer is not None and held.answer.reached == "healthy"
             assert stages[-2:] == ["reconciled", "healthy"]
             assert domain.applied() == held.commit
-        domain.wait_applied(world.tip())  # the `with` block ended once its release was pushed
+        domain.wait_applied(world.tip())  # the `with` block waits only for the push
         answer = requester.put("d", [FUSION], answer="healthy")
         assert answer.outcome == "booked"
         file = str(world.folder / "clusters.yaml")

@@ -1,7 +1,7 @@
 """The objects that must exist after each step of the paper's experiment, one per line.
 
-The lines follow from the paper's table, not from the program; their names are literals. An object
-exists if its row of `examples/experiment/paper.py` has requesters.
+The lines follow from the paper's table, not from the program, so the names of objects are written
+out here. An object exists if its row of `examples/experiment/paper.py` has requesters.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def source_end(node: str) -> str:
 
 
 def target_end(node: str) -> str:
-    """Return the name of the client at the edge of a node's connection to the edge."""
+    """Return the name of the client that runs on the edge for a node's connection to the edge."""
     return f"mqtt-{node}-edge-target-{_ENDS[node][1]}"
 
 

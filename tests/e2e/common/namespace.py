@@ -42,7 +42,7 @@ class Namespace:
     GITOPS: ClassVar[str]
     RELEASE: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's objects
-    STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit for other releases keeps
+    STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit must not touch without need
 
     def __init__(self, kube: Kube, namespace: str, name: str) -> None:
         self.kube, self.namespace, self.name = kube, namespace, name
@@ -57,7 +57,7 @@ class Namespace:
         return found
 
     def find(self, kind: str, instance: str = "") -> list[Manifest]:
-        """Return the namespace's objects of a kind, or those of one release."""
+        """Return the namespace's objects of a kind; with ``instance``, only that release's."""
         selector = f"{_INSTANCE}={instance}" if instance else ""
         return self.kube.find(kind, self.namespace, selector)
 
@@ -148,7 +148,7 @@ class Namespace:
     def restore(self, *releases: str) -> None:
         """Make the controller restore these releases, or the domain's folder if none is named.
 
-        By default this does nothing, for a controller that restores them by itself.
+        The default does nothing, which is right for a controller that restores them by itself.
         """
 
     # --- waiting ----------------------------------------------------------------------------
@@ -162,7 +162,7 @@ class Namespace:
         self._wait_same(self.inventory, wanted, timeout)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
-        """Wait until no object of a release has changed for so many seconds; return `versions`.
+        """Wait until no object of a release has changed for ``seconds``; return `versions`.
 
         The status of a Deployment counts too; Kubernetes updates it after the pods are ready.
         """

@@ -2,13 +2,13 @@
 
 The process has a read-only root file system of its own, the pod's volumes at their mount paths, the
 pod's user, no privileges, and only the container's environment. It uses the network and the process
-ids of the machine. Starting it requires root.
+ids of the machine. Only root can start such a process.
 
 Unlike in a cluster, the process has no shared memory. Tests restrict ROS 2 to the loopback, where
 ROS 2 would use shared memory, and a client outside the container would miss every message.
 
 By default the image consists of this machine's programs and this checkout. If ``E2E_IMAGE_ROOT``
-names a folder, the image is the root file system in it (made by ``deploy/fresh-root``).
+names a folder, the image is the root file system in that folder (made by ``deploy/fresh-root``).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ exec chroot "$root" setpriv --reuid "$user" --regid "$group" --groups "$group" \
 class Pod:
     """A pod's only container as a process.
 
-    ``folder`` keeps the data of the pod's volume claims and its log after its end.
+    When the pod has ended, ``folder`` still has its log and the data of its volume claims.
     """
 
     def __init__(self, kube: Kube, name: str, namespace: str, server: str, folder: Path) -> None:

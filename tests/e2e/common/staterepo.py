@@ -108,9 +108,9 @@ class StateRepo(Generic[Domain]):
         self._wide: list[tuple[Kube, Manifest]] = []
 
     def bootstrap(self, cluster: str, rig: Rig) -> Domain:
-        """Apply `bootstrap/<cluster>.yaml` to a cluster, and wait until the cluster follows.
+        """Let a cluster follow the state repo, and return the access domain on that cluster.
 
-        Return the access domain on that cluster.
+        Apply `bootstrap/<cluster>.yaml`, and wait until it has taken effect.
         """
         raise NotImplementedError
 
@@ -195,7 +195,7 @@ class StateRepo(Generic[Domain]):
         applied = domain.wait_applied(sent.commit)
         ready = domain.wait_lines(wanted)
         pushed = sent.stages["pushed"]
-        committed = sent.stages.get("committed", pushed)  # not sent if nothing changed
+        committed = sent.stages.get("committed", pushed)  # no commit if nothing changed
         return Times(sent.at, committed, pushed, fetched, applied, ready)
 
     def _pull(self) -> None:

@@ -64,7 +64,7 @@ def test_eight_steps_and_the_fusion_is_never_restarted(world: World, say: Report
 def test_a_service_that_cannot_start_is_reconfigured_and_removed(
     world: World, edge_is_full: object
 ) -> None:
-    """Later demands do not wait for it, although Helm waits five minutes by default."""
+    """Later demands do not wait for the service, although Helm waits five minutes by default."""
     domain = world.domain
     for step in (1, 2, 3):
         sent = world.demand(expected.demand(step))
@@ -155,7 +155,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Set replicas as an autoscaler does, change the image, and wait until it is restored."""
+        """Set replicas as an autoscaler does, change an image, and wait for the former image."""
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)
@@ -166,7 +166,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
     original = world.file(APPDEF)
     merge(_autoscaled(world))
     domain.kube.apply(world.file(f"bootstrap/{CLUSTER}.yaml"))  # allows autoscalers
-    domain.restore(*DETECTION.values(), FUSION)  # they failed without that right
+    domain.restore(*DETECTION.values(), FUSION)  # these releases failed without that right
     domain.kube.wait("an autoscaler", lambda: bounds() == (2, 4))
     domain.kube.wait("two replicas", lambda: (replicas(), replicas(FUSION)) == (2, 2))
     domain.wait_releases()
@@ -213,8 +213,8 @@ def _autoscaled(world: World) -> dict[str, str | None]:
 def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World) -> None:
     """The state repo moves to the other controller while the cluster still runs the former one.
 
-    `demandops upgrade` prints how to retire the former controller first. This is impossible on a
-    cluster that cannot be reached.
+    `demandops upgrade` prints how to retire the former controller first. An operator cannot do so
+    on a cluster that cannot be reached.
     """
     domain = world.domain
     other, foreign = {"flux": ("argocd", "Application"), "argocd": ("flux", "HelmRelease")}[

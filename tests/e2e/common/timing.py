@@ -12,8 +12,8 @@ _STAGES = ("committed", "pushed", "fetched", "applied", "ready", "in all")
 class Times:
     """The monotonic times in seconds at which a demand reached each stage.
 
-    `committed` and `pushed` come from the node's feedback. The test finds the later ones by a poll
-    every 0.1 s.
+    `committed` and `pushed` come from the node's feedback. The test finds the later times by
+    polling every 0.1 s.
     """
 
     goal: float
@@ -25,7 +25,7 @@ class Times:
 
     @property
     def total(self) -> float:
-        """Return the seconds from the goal until the last pod is ready or gone."""
+        """The seconds from the goal until the last pod is ready or gone."""
         return self.ready - self.goal
 
     def row(self) -> list[float]:

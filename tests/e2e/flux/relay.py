@@ -1,4 +1,4 @@
-"""A link between a cluster and the Git server that a test can cut, like a vehicle's radio link."""
+"""A link from a cluster to the Git server; a test can cut it, as a vehicle's radio link breaks."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Relay:
         """Refuse new connections and close the open ones."""
         if self._listener is not None:
             with contextlib.suppress(OSError):
-                self._listener.shutdown(socket.SHUT_RDWR)  # else the thread would still accept
+                self._listener.shutdown(socket.SHUT_RDWR)  # the thread's accept() then returns
             self._listener.close()
             self._listener = None
         with self._lock:

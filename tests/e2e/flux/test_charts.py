@@ -195,7 +195,7 @@ class TestCheck:
     ) -> Callable[..., tuple[int, list[str], str]]:
         """Return a function that changes files and runs `demandops check`.
 
-        It returns the exit code, the lines of errors, and the output.
+        The function returns the exit code, the lines of errors, and the output.
         """
         monkeypatch.setenv(HELM_BIN, str(rig.helm_program()))
 

@@ -51,12 +51,12 @@ def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[
         node["cluster"] = FLEET if node["id"] in VEHICLES else CLUSTER
     made.push({CLUSTERS: yaml.safe_dump(clusters), INVENTORY: yaml.safe_dump(inventory)})
     made.generator.start()
-    made.demand(expected.demand(1))  # its commit contains the inventory
+    made.demand(expected.demand(1))  # its commit applies the inventory
     made.bootstrap(CLUSTER, rig)
     url = rig.git_url(made.name)
     made.bootstrap(FLEET, fleet, url=url if rig.existing else link.url + made.name)
     yield made
-    made.remove()  # both clusters still run
+    made.remove()  # while both clusters still run
 
 
 def test_each_cluster_gets_the_services_of_its_own_nodes(world: World) -> None:

@@ -91,8 +91,8 @@ def generator_without_git(world: World, goal: dict[str, Any]) -> None:
 def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
     """Kill the generator in a `git push`, then start it again and send the goal again.
 
-    The push survives the generator and may succeed; the next generator must notice that. The goal
-    must add demands: the repetition of a release could never make a second commit.
+    The push survives the generator and may succeed, which the next generator must notice. The goal
+    must be a join, because a repeated shutdown could never make a second commit.
     """
     world.rig.pause("git")
     try:
@@ -119,5 +119,5 @@ KILLS: dict[int, tuple[str, Act]] = {
     5: ("helm-controller while it uninstalls", helm_at_uninstall),
     6: ("kustomize-controller while it prunes", kustomize),
     7: ("source-controller while it fetches", source),
-    8: ("source-controller while it fetches the last", source),
+    8: ("source-controller while it fetches the last commit", source),
 }

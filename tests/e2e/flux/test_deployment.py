@@ -179,7 +179,7 @@ def deployed(
     if os.geteuid():
         pytest.skip("only root can start a container")
     folder = tmp_path_factory.mktemp("deployed")
-    for parent in (folder, *folder.parents):  # the pod's user must reach its folders
+    for parent in (folder, *folder.parents):  # the pod's user must reach them
         if parent.owner() == "root" and parent != Path("/tmp"):
             parent.chmod(parent.stat().st_mode | 0o011)
     made = Deployed(rig, folder, ros_domain)
@@ -292,7 +292,7 @@ def test_a_pod_that_ends_leaves_the_lease_at_once(
 def test_a_pod_that_loses_the_lease_ends(deployed: Deployed, active: Pod) -> None:
     spec = {"holderIdentity": "a person", "leaseDurationSeconds": 3}
     deployed.rig.kube.patch("Lease", RELEASE, {"spec": spec}, NAMESPACE)
-    assert deployed.rig.kube.wait("its end", lambda: active.code) == 3
+    assert deployed.rig.kube.wait("the pod's end", lambda: active.code) == 3
     told = f"the Lease {NAMESPACE}/{RELEASE} is held by 'a person'; another process may be the "
     assert f"error: {told}leader now, so this one must start again" in active.text()
 

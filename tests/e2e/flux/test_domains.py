@@ -44,7 +44,8 @@ SlipIn = Callable[..., None]
 def slip_in(world: World, neighbour: Domain) -> Iterator[SlipIn]:
     """Return a function that commits manifests to the domain's folder.
 
-    It waits until Flux has tried to apply them. The end of the test removes them.
+    The function waits until Flux has tried to apply the manifests. The end of the test removes
+    them.
     """
 
     def push(*manifests: dict[str, Any], file: str = FILE) -> None:
@@ -69,7 +70,7 @@ def remove_committed(world: World) -> None:
 def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applied(
     world: World, neighbour: Domain, slip_in: SlipIn
 ) -> None:
-    """Services run on, and the generator removes the file with the next demand."""
+    """Services run on, and the generator removes the foreign file with the next demand."""
     domain, untouched = world.domain, neighbour.inventory()
     world.step(1, expected.after(1))
     slip_in(config("foreign", NEIGHBOUR), config("own", domain.namespace))
@@ -188,7 +189,7 @@ def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
     nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
     policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")
     world.push({NODES: nodes, POLICY: policy})
-    sent = world.demand(expected.demand(2))  # booked or not, it makes the generator fetch
+    sent = world.demand(expected.demand(2))  # booked or not, this makes the generator fetch
     bootstrap = world.file("bootstrap/c-its.yaml")
     assert "podSecurity: baseline" in bootstrap
     world.apply(domain.kube, list(yaml.safe_load_all(bootstrap)))

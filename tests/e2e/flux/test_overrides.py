@@ -66,7 +66,7 @@ def test_a_denial_stops_a_service_and_a_keep_restores_it(world: World) -> None:
     world.follow(world.demand(goal), expected.after(1))
     fields = yaml.safe_load(override({"nodes": ["*"]}, deny=True))
     world.push({"overrides/closed.yaml": yaml.safe_dump(fields)})
-    sent = world.demand(goal)  # the claims stay booked while suspended
+    sent = world.demand(goal)  # the claims stay booked while they are denied
     world.follow(sent, expected.WITHOUT_DEMANDS)
     fields["keep"] = fields.pop("deny")
     world.push({"overrides/closed.yaml": yaml.safe_dump(fields)})

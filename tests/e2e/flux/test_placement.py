@@ -62,7 +62,7 @@ def test_services_wait_follow_a_drain_and_an_override_and_run_apart(
 
 
 def merge(world: World, requester: DemandClient, files: dict[str, str | None]) -> None:
-    """Push files as a person; then renew a demand, so that the generator fetches them at once."""
+    """Push files as a person; then renew a demand, so that the generator fetches at once."""
     world.push(files)
     requester.renew("first")
 
@@ -73,7 +73,7 @@ def application(id: str, vehicle: str) -> dict[str, Any]:
 
 
 def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> set[tuple[str, str]]:
-    """Return the expected pods of an application as pairs of a name without its hash and a node."""
+    """Return the expected pods of an application as pairs: name without hash, and node."""
     ways = [(vehicle, node), *([(node, vehicle)] if delivered else [])]
     clients = {
         (f"mqtt-derived-{source}-{target}-{side}", end)

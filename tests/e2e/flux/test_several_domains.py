@@ -50,7 +50,7 @@ def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
     made.push(two_domains(made))
     made.generator.start()
     with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=120) as first:
-        first.put("first", [application("first")])  # its commit contains the policy
+        first.put("first", [application("first")])  # its commit applies the policy
         first.release("first")
     manifests = list(yaml.safe_load_all(made.file(f"bootstrap/{CLUSTER}.yaml")))
     made.apply(rig.kube, manifests)
@@ -65,7 +65,7 @@ def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
             rig.kube.wait_ready("HelmChart", name_of(chart), domain.namespace)
         domain.wait_lines(WITHOUT_DEMANDS)
     yield made
-    made.remove()  # its namespaces still exist
+    made.remove()  # while its namespaces still exist
     rig.kube.delete("Namespace", CITY)
 
 
@@ -143,7 +143,7 @@ def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
 
 
 def running(domain: Domain) -> set[tuple[str, str]]:
-    """Return name without hash and node of each ready pod; a pod that is not ready becomes '?'."""
+    """Return each ready pod's name without the hash, and its node; '?' if a pod is not ready."""
     lines = (line for line in domain.lines() if line.startswith("pod of "))
     matches = map(_POD.fullmatch, lines)
     return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}

@@ -45,7 +45,7 @@ class TestFlux(Answers):
 
 
 def orphans(world: World) -> list[dict[str, str]]:
-    """Return the orphans that `status` lists; its exit code is 1 if there are some."""
+    """Return the orphans that `status` lists; check that it exits with 1 if there are some."""
     command = [sys.executable, "-m", "demandops.cli.main", "status", "--output", "json"]
     command += ["--state-repo", world.push_url, "--clusters", str(world.folder / "clusters.yaml")]
     done = subprocess.run(

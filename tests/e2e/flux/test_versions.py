@@ -68,7 +68,10 @@ def versions() -> str:
 
 
 def request(world: World, goal: dict[str, object]) -> None:
-    """Run `demandops request` with a `Demand` beside the generator; wait until Flux applied it."""
+    """Send a `Demand` by `demandops request`; wait until Flux has applied its commit.
+
+    The command runs beside the generator.
+    """
     file = world.folder / "demand.yaml"
     file.write_text(json.dumps(goal))
     demandops(world.folder, "request", str(file), "--state-repo", world.push_url)

@@ -57,7 +57,7 @@ def test_a_trigger_saves_the_wait_for_the_next_fetch(world: World, say: Report) 
 
 
 def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
-    """If it were busy, it could forget what it is just creating, and never remove that."""
+    """A busy Flux could forget an object that it is just creating, and then never remove it."""
     domain = world.domain
     with wakes(domain) as found:
         for step in (*STEPS,) * ROUNDS:
@@ -70,7 +70,7 @@ def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
 
 @contextmanager
 def wakes(domain: Domain) -> Iterator[list[bool]]:
-    """Yield a list that gets, for each request to fetch, whether Flux was idle before it."""
+    """Yield a list that gets one entry per request to fetch: whether Flux was idle just before."""
     found: list[bool] = []
     over = threading.Event()
 

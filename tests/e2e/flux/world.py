@@ -19,9 +19,10 @@ class World(StateRepo[Domain]):
     """A state repo that Flux follows."""
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Domain:
-        """Apply `bootstrap/<cluster>.yaml` to a cluster, and wait until the cluster follows.
+        """Let a cluster follow the state repo, and return the access domain on that cluster.
 
-        `source` replaces fields of the GitRepository's spec, as an operator may with an overlay.
+        `source` replaces fields of the GitRepository's spec in `bootstrap/<cluster>.yaml`, as an
+        operator may do with an overlay.
         """
         manifests = list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
         (git,) = [item for item in manifests if item["kind"] == "GitRepository"]
@@ -43,7 +44,7 @@ class World(StateRepo[Domain]):
             for kind, name in (("Kustomization", domain.name), ("GitRepository", SOURCE)):
                 kube.delete(kind, name, namespace)
                 kube.wait_gone(kind, name, namespace)
-            for kind in ("HelmRelease", "HelmChart"):  # else the next world loses its own
+            for kind in ("HelmRelease", "HelmChart"):  # or the next world loses its own
                 kube.wait(f"each {kind} to go", lambda d=domain, k=kind: d.find(k) == [])
         self.remove_wide()
         self.domains.clear()

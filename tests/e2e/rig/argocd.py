@@ -1,9 +1,9 @@
 """Argo CD's application-controller, repo-server and server, and their Redis, as plain processes.
 
 One program contains all three parts; `ARGOCD_BINARY_NAME` selects one. The server serves the
-webhook. The controller runs as the cluster's administrator. A release's AppProject, and the service
-account that the controller impersonates for the release, limit what it may do, as docs/argocd.md
-requires. Redis is the machine's own `redis-server`.
+webhook. The controller runs as the cluster's administrator. As docs/argocd.md requires, a release
+may do only what its AppProject permits, and what the service account may do that the controller
+impersonates for it. Redis is the machine's own `redis-server`.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def components(
         "--insecure",
     ]
     environment = {
-        "ARGOCD_FAKE_IN_CLUSTER": "true",  # "in the cluster" is the kubeconfig's cluster
+        "ARGOCD_FAKE_IN_CLUSTER": "true",  # "in-cluster" then means the kubeconfig's cluster
         "ARGOCD_GPG_ENABLED": "false",
         "ARGOCD_PLUGINSOCKFILEPATH": str(data / "plugins"),
         "ARGOCD_SSH_DATA_PATH": str(data / "ssh"),
@@ -123,7 +123,8 @@ def _part(
     environment: dict[str, str],
     serves: int | None = None,
 ) -> Component:
-    port = free_port()  # serves health on all addresses: the controller has no flag for one
+    # this port listens on all addresses, because the controller has no flag for the address
+    port = free_port()
     return Component(
         name,
         (str(binary), f"--metrics-port={port}", "--loglevel=info", *arguments),

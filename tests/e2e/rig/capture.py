@@ -1,4 +1,4 @@
-"""Print progress although pytest captures output: a cold build takes twenty minutes."""
+"""Print progress past pytest's capture, because a cold build takes twenty minutes."""
 
 from __future__ import annotations
 

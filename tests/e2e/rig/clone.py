@@ -9,7 +9,7 @@ from tests.kit.repo import git
 
 
 class Clone:
-    """A clone of a repository on the rig's Git server, which the first push creates."""
+    """A clone of a repository on the rig's Git server; the first push creates the repository."""
 
     def __init__(self, url: str, folder: Path) -> None:
         self.folder = folder

@@ -109,7 +109,7 @@ class Rig:
         work, processes, kube = self._work, self._processes, getattr(self, "kube", None)
         try:
             if kube is not None and self.existing:
-                for name in self._nodes:  # the rig's own cluster goes with its nodes
+                for name in self._nodes:  # a cluster that the rig started goes as a whole
                     kube.delete("Node", name)
             if kube is not None:
                 kube.close()
@@ -264,7 +264,7 @@ class Rig:
                 ),
             ]
         )
-        # A namespace accepts no pods until the controller manager has created it.
+        # A namespace accepts no pods until the controller manager has created its account.
         account = ("ServiceAccount", "default", "default")
         self.kube.wait("the default service account", lambda: self.kube.get(*account))
         clock.lap("controllers")

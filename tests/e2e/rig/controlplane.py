@@ -1,8 +1,8 @@
 """The components of a control plane without containers: etcd, API server, controllers, scheduler.
 
 This module returns `Component`s and starts nothing. Everything listens on loopback. etcd does not
-force writes to disk, because tests need no data after a power cut. Each part runs once, so there is
-no leader election.
+flush its files to the disk, because tests need no data after a power cut. Each part runs once, so
+there is no leader election.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class ControlPlane:
             "--authorization-mode=RBAC",
             "--allow-privileged=true",
             "--kubelet-preferred-address-types=InternalIP",  # `kubectl exec` needs it
-            # A Service's endpoint must not be on loopback: the API server would refuse its own.
+            # The API server refuses endpoints on loopback, so it must not publish its own.
             "--endpoint-reconciler-type=none",
         ]
         probe = answers(self.api_port, "/readyz", pki.authority)
@@ -88,7 +88,7 @@ class ControlPlane:
             # With the defaults of 20 and 30 this client would slow down a burst of releases.
             "--kube-api-qps=200",
             "--kube-api-burst=400",
-            # A slow machine must not lose a node.
+            # On a slow machine, a node must not count as lost.
             "--node-monitor-grace-period=10m",
             *self._serving(port),
         ]

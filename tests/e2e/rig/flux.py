@@ -1,9 +1,9 @@
 """Flux's source-, kustomize- and helm-controller as plain processes.
 
-The controllers get the cluster from `KUBECONFIG`, because they have no flag for it, and run as its
-administrator. For a release they impersonate its service account, which limits what the release may
-do. As docs/flux.md requires, they are locked down: for an object that names no service account,
-they impersonate the account `default` of the object's namespace.
+The controllers find the cluster by `KUBECONFIG`, because they have no flag for a kubeconfig. They
+run as the cluster's administrator. For a release they impersonate the release's service account,
+which limits what the release may do. As docs/flux.md requires, they are locked down: for an object
+that names no service account, they impersonate the account `default` of the object's namespace.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class Handler(BaseHTTPRequestHandler):
     server: GitServer
 
     def serve(self) -> None:
-        self.close_connection = True  # else the client waits for the answer's end
+        self.close_connection = True  # this tells the client where the answer ends
         path, _, query = self.path.partition("?")
         path = unquote(path)
         if path == HEALTH:
@@ -136,7 +136,7 @@ class Handler(BaseHTTPRequestHandler):
         assert backend.stdin is not None
         assert backend.stdout is not None
         feeder = threading.Thread(target=self._feed, args=(backend.stdin,), daemon=True)
-        feeder.start()  # in parallel: the backend may answer before it has read all
+        feeder.start()  # in a thread, because the backend may answer before it has read all
         try:
             self._relay(backend.stdout)
         except OSError:
@@ -230,7 +230,7 @@ def _main() -> None:
     parser = argparse.ArgumentParser(description="serve the Git repositories below a folder")
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--port", type=int, required=True)
-    parser.add_argument("--address", default="127.0.0.1", help="for a cluster in containers")
+    parser.add_argument("--address", default="127.0.0.1", help="where to listen")
     options = parser.parse_args()
     options.root.mkdir(parents=True, exist_ok=True)
     server = GitServer(options.root, options.address, options.port, Handler)

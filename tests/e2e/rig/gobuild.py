@@ -228,7 +228,7 @@ def _follow(
 ) -> deque[str]:
     """Pass each line to `line` until None comes; return the last lines that do not report progress.
 
-    `tick` is called after each second without a line; Go prints none for long while it links.
+    `tick` is called after each second without a line, because Go links for long without a line.
     """
     shown: deque[str] = deque(maxlen=_SHOWN_LINES)
     while True:
@@ -246,7 +246,7 @@ def _follow(
 def _environment() -> dict[str, str]:
     jobs = os.environ.get(JOBS_VARIABLE, "")
     if jobs and not jobs.isdigit():
-        raise RigError(f"{JOBS_VARIABLE}={jobs!r} is not a number: give the processes Go may use")
+        raise RigError(f"{JOBS_VARIABLE}={jobs!r} is not a number; set how many jobs Go may run")
     # The linker strips debug information. Without it the compiler needs a third less disk space.
     flags = "-mod=readonly -modcacherw -gcflags=all=-dwarf=false" + (f" -p={jobs}" if jobs else "")
     settings = {"GOTOOLCHAIN": "local", "GOWORK": "off", "CGO_ENABLED": "0", "GOFLAGS": flags}

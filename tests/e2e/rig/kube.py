@@ -1,7 +1,7 @@
 """A cluster's API: apply, read, wait. The rig's only module that imports `kubernetes`.
 
-Objects are plain dictionaries, like their manifests. Each wait polls often until its deadline; its
-error contains the last state that it saw.
+Objects are plain dictionaries, like their manifests. A wait polls often until its deadline. If it
+fails, the error contains the last state that the wait saw.
 """
 
 from __future__ import annotations

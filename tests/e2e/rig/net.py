@@ -17,8 +17,8 @@ from pathlib import Path
 LOOPBACK = "127.0.0.1"
 Probe = Callable[[], "str | None"]
 
-# Below the kernel's usual range for outgoing connections (32768 and up): a client's connection
-# could take a port of that range before the server binds it.
+# Below the kernel's usual range for outgoing connections (32768 and up), because a client's
+# connection could take a port of that range before the server binds the port.
 _PORTS = range(20000, 32000)
 _given: set[int] = set()
 _lock = threading.Lock()
@@ -40,7 +40,7 @@ def url(port: int, scheme: str = "http") -> str:
 
 
 def answers(port: int, path: str, authority: Path | None = None) -> Probe:
-    """Return a probe that is ready if `path` answers 200; with an authority it uses HTTPS."""
+    """Return a probe that checks that `path` answers 200; with an authority it uses HTTPS."""
     context = ssl.create_default_context(cafile=str(authority)) if authority else None
 
     def probe() -> str | None:
@@ -63,7 +63,7 @@ def answers(port: int, path: str, authority: Path | None = None) -> Probe:
 
 
 def accepts(port: int) -> Probe:
-    """Return a probe that is ready if the port accepts connections."""
+    """Return a probe that checks that the port accepts connections."""
 
     def probe() -> str | None:
         try:

@@ -59,7 +59,7 @@ def make(folder: Path) -> Pki:
     request = request.add_extension(addresses, critical=False)
     _write(paths.server_certificate, _pem(request.sign(authority, hashes.SHA256())))
     _write(paths.server_key, _private(server))
-    # Each cluster binds this group to the role of an administrator from its start.
+    # Each cluster makes the group system:masters administrators from the start.
     admin = ec.generate_private_key(ec.SECP256R1())
     request = _builder(_name("rig-admin", "system:masters"), admin.public_key(), authority)
     _write(paths.admin_certificate, _pem(request.sign(authority, hashes.SHA256())))

@@ -27,7 +27,7 @@ from .net import Probe
 
 _POLL_SECONDS = 0.05
 _TAIL_LINES = 30
-_GROUP_SECONDS = 3.0  # some init processes never reap orphans, which must not delay a stop
+_GROUP_SECONDS = 3.0  # the longest wait for orphans, because some init processes never reap them
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ class Processes:
     def _stop_batch(self, names: list[str]) -> None:
         going = {name: self._running[name] for name in names if name in self._running}
         for process in going.values():
-            # SIGCONT too: a paused process would not handle the SIGTERM.
+            # SIGCONT too, because a paused process would not handle the SIGTERM.
             for number in (signal.SIGTERM, signal.SIGCONT):
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
@@ -192,7 +192,7 @@ class Processes:
 def _exit_code(process: subprocess.Popen[bytes]) -> int | None:
     """Return the exit code of a process without reaping it; None while it runs.
 
-    After a reap, the kernel could give the pid to a new process, and `_end` would kill its group.
+    After a reap, the kernel could give the pid to a new process, whose group `_end` would kill.
     """
     if process.returncode is not None:
         return process.returncode

@@ -78,8 +78,8 @@ TOOLS = {
 def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
     """Return the paths of the named programs, by default of all; build those that the cache lacks.
 
-    `report` gets lines of progress; by default they go to standard error.  Raises RigError if a
-    name is unknown, if Go is missing or too old, or if a build fails.
+    `report` gets lines of progress; by default they go to standard error. Raises RigError if a name
+    is unknown, if Go is missing or too old, or if a build fails.
     """
     wanted = list(TOOLS) if names is None else list(names)
     unknown = sorted(set(wanted) - set(TOOLS))
@@ -157,7 +157,7 @@ def _pinned(go_mod: Path, module: str) -> str:
 
 @contextlib.contextmanager
 def _turn(root: Path, say: Report) -> Iterator[None]:
-    """Hold the build lock: two builds of Kubernetes at once would not fit into memory."""
+    """Hold the build lock, because two builds of Kubernetes at once do not fit into memory."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / "build.lock").open("w") as lock:
         waited = False
@@ -170,7 +170,7 @@ def _turn(root: Path, say: Report) -> Iterator[None]:
                     say(f"another run is building into {root}, waiting for it")
                 waited = True
                 time.sleep(0.5)
-        for leftover in root.glob(".building-*"):  # of killed builds only: we hold the lock
+        for leftover in root.glob(".building-*"):  # only of killed builds, as we hold the lock
             shutil.rmtree(leftover, ignore_errors=True)
         yield
 
@@ -193,7 +193,7 @@ def _build(
         seconds = round(time.monotonic() - start, 1)
         (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
         with binary.open("rb") as written:
-            os.fsync(written.fileno())  # else a power cut could leave an empty file
+            os.fsync(written.fileno())  # otherwise a power cut could leave an empty file
         staging.chmod(0o755)
         staging.rename(entry)
         say(f"built in {seconds:.0f} s")

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO
 
 _PREFIX = "demandops-rig-"
-_YOUNG_SECONDS = 60  # a younger lock file may be one that its rig has not locked yet
+_YOUNG_SECONDS = 60  # a younger lock file may belong to a rig that is about to lock it
 
 
 class Workdir:

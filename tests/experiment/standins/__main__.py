@@ -20,7 +20,7 @@ def main(launch: str, package: str, file: str, *arguments: str) -> None:
     assert launch == "launch", launch
     given = dict(argument.split(":=", 1) for argument in arguments)
     if (package, file) == OURS:
-        # the launch file's command; ROS's launch has no Python wheels
+        # what the launch file runs; ROS's `launch` itself does not come as a Python wheel
         ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params"]]
         command = [sys.executable, "-m", "demandops.cli.main", "parameter-sync", "--ros-args"]
         os.execv(sys.executable, [*command, *ros_args])  # noqa: S606 - no shell on purpose

@@ -27,8 +27,8 @@ _INPUTS = {
 class Fusion(Node):
     """Fuses the newest message of each input, and publishes all objects and the vehicles' tracks.
 
-    It takes times from the messages and a steady clock, not from ROS: the chart sets `use_sim_time`
-    by default, and no simulated clock runs here.
+    It takes times from the messages and a steady clock, not from ROS, because the chart sets
+    `use_sim_time` by default, and no simulated clock runs here.
     """
 
     def __init__(self, given: dict[str, str]) -> None:
