@@ -247,5 +247,6 @@ def test_a_topic_names_requesters_of_the_claim_only() -> None:
         (found,) = error.value.faults
         assert found.field == place
         assert found.message == (
-            "x is not among the requesters of the claim; add it there, or remove it here"
+            "x is not among the requesters of the claim; add this name to the claim's requesters, "
+            "or remove the name from this topic"
         )

@@ -78,8 +78,8 @@ def test_it_goes_up_at_once_and_says_until_when_it_stays_up() -> None:
     fewer = repo.send(demand(topics=2), NOW + timedelta(minutes=1))
     name = release(repo)["metadata"]["name"]
     assert fewer.warnings[-1:] == (
-        f"{name} keeps 4 replicas until 2026-01-31T12:11:00Z (downAfter), then as many as its "
-        "demands need",
+        f"{name} keeps 4 replicas until 2026-01-31T12:11:00Z (downAfter in its definition), "
+        "although its demands need fewer",
     )
     assert fact(repo) == "4 until 2026-01-31T12:11:00Z"
     assert repo.scale_down(NOW + timedelta(minutes=10, seconds=59)) == []
