@@ -202,7 +202,7 @@ def test_the_node_of_the_application_comes_first_and_the_commit_says_why() -> No
 
     nodes = {"cloud": GPU | at(0), "vehicle00": at(0), "edge": {"capabilities": ["gpu"]} | at(9)}
     decision = repo_with([], **nodes).send(DEMAND)
-    told = f"{WHY}'edge', the node of its application of 2 nodes that fit"
+    told = f"{WHY}'edge', the node of its application among 2 nodes that fit"
     assert decision.placed == (told,)
     assert f" {told[0].upper()}{told[1:]}." in commit_message.of_decision(decision, "o", NOW)
     del nodes["edge"]

@@ -181,11 +181,15 @@ def asking(*items: dict[str, Any], demand: str = "d", **more: Any) -> dict[str, 
     ("place", "more", "says"),
     [
         ({"role": "edge"}, {}, "'edge', the only node that fits"),
-        ({"capabilities": ["gpu"]}, {}, "'edge', the nearest to its sources of 2 nodes that fit"),
+        (
+            {"capabilities": ["gpu"]},
+            {},
+            "'edge', the nearest to its sources among 2 nodes that fit",
+        ),
         (
             {"capabilities": ["gpu"]},
             {"positions": [{"node": "cloud", "x": 3, "y": 4}]},
-            "'cloud', the nearest to its sources of 2 nodes that fit",
+            "'cloud', the nearest to its sources among 2 nodes that fit",
         ),
         ({"role": "vehicle", "labels": ["node_id=vehicle00"]}, {}, "'vehicle00', the only node"),
     ],
