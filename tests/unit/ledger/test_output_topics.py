@@ -30,7 +30,7 @@ def join(*clouds: Topic, who: str = "vehicle01", id: str = APP, shutdown: bool =
 
 
 def published(repo: MemoryRepo) -> dict[str, str]:
-    """Return the topic of each detection's object list, by the topic of its point cloud."""
+    """Return the topic of the object list of each detection, by the topic of its point cloud."""
     values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
     detections = [one["detection"] for one in values if "detection" in one]
     return {one["pointCloudTopic"]: one["objectListTopic"] for one in detections}
@@ -198,7 +198,7 @@ def test_a_connection_that_brings_what_a_service_publishes_is_refused(
 
 
 def claims_after(*goals: Any) -> list[Claim]:
-    """Return the claims of all goals, each decided in a new repo."""
+    """Return the claims that the goals get, if each goal is decided in a new repo."""
     repos = [MemoryRepo() for _ in goals]
     for repo, one in zip(repos, goals, strict=True):
         repo.send(one)

@@ -1,4 +1,4 @@
-"""Routes in claims: their form in files, contradictions between claims, and the linked nodes."""
+"""Routes in claims: their form in files, contradictions, and the nodes that connections link."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def refusal(ledger: Ledger, *routes: Route, who: str = "w") -> list[str]:
 
 
 class TestFiles:
-    """In a claim's file, a route without options is one line; any other lists only its options."""
+    """In a claim's file, a route without options is one line. Other routes list their options."""
 
     def test_topics_stay_readable(self) -> None:
         held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
