@@ -291,7 +291,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return by how much services request more, as a map from (node, resource) to the amount.
+    """Return how much more the services request, as a map from (node, resource) to the amount.
 
     The map is empty if no node has a capacity.
     """

@@ -56,7 +56,7 @@ Each step has fewer replicas and a later end than the previous step.
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    """Return the steps of a service after the number of replicas that its demands need changed.
+    """Return the steps of a service after its demands begin to need more or fewer replicas.
 
     Args:
         steps: the steps before.
@@ -174,7 +174,7 @@ def read(text: str, path: str) -> tuple[Instance, Steps] | None:
 
 
 def read_all(files: Mapping[str, str]) -> KeptReplicas:
-    """Return the records in ``files``, a map from path to text; files not valid are skipped."""
+    """Return the records in ``files``, a map from path to text; invalid files are skipped."""
     kept = KeptReplicas()
     for path, text in files.items():
         if record := read(text, path):

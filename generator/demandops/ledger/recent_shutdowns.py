@@ -187,7 +187,7 @@ def read(text: str, path: str) -> RecentShutdown | None:
 
 
 def read_all(files: Mapping[str, str]) -> RecentShutdowns:
-    """Return the records in ``files``, a map from path to text; files not valid are skipped."""
+    """Return the records in ``files``, a map from path to text; invalid files are skipped."""
     found = [one for path, text in files.items() if (one := read(text, path))]
     shutdowns = RecentShutdowns()
     for one in sorted(found, key=lambda one: one.at):

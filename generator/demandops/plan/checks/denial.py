@@ -91,9 +91,10 @@ def _message(override: Override) -> str:
 
 
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each suspended claim of a demand's requesters that concerns the demand.
+    """Yield a warning for each suspended claim that concerns a demand.
 
-    Such a claim is the demand's own, or a claim on an application or connection that it lists.
+    Such a claim has a requester of the demand. It is a claim of the demand itself, or a claim on an
+    application or connection that the demand lists.
     """
     if not any(override.deny for override in world.overrides):
         return

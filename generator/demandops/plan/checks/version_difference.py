@@ -39,7 +39,7 @@ With ``separate`` each version is an application of its own, so only shared serv
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A difference between versions that demands ask for of one application or service.
+    """A difference: demands ask for different versions of one application or service.
 
     ``what`` describes this application or service. ``demanded`` is the version that the new demand
     asks for. ``others`` is the newest version that the other demands ask for.

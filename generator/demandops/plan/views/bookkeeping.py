@@ -196,7 +196,7 @@ def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
 
 
 def _demands(world: World) -> dict[str, DemandEntry]:
-    """Return a map from demand id to entry, with each demand that holds claims.
+    """Return an entry for each demand that holds claims, by demand id.
 
     Claims that overrides keep belong to no demand, so they are left out.
     """

@@ -71,7 +71,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
-    """Return (file, entry of the file, what the entry decides) for each entry behind a release."""
+    """Return (file, entry, what the entry decides) for each file entry that shapes a release."""
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}
