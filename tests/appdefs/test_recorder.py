@@ -279,7 +279,8 @@ class TestParameters:
         (found,) = books.faults(self.demand("vehicle01", format="bag"))
         assert found == (
             'parameters.format: demands contradict each other: "mcap" for vehicle00 and "bag" for '
-            "vehicle01; agree, or ask that the application definition say how to merge them"
+            "vehicle01; demand the same value, or ask that the application definition say how to "
+            "merge the values"
         )
 
     @pytest.mark.parametrize(

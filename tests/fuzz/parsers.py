@@ -243,9 +243,9 @@ def claim(data: bytes) -> None:
     except InvalidInput as error:
         _told(error)
         (found, *_) = error.faults
-        if not found.message.startswith("its ids belong to "):
+        if not found.message.startswith("the ids in this file belong to "):
             return
-        path = found.message.removeprefix("its ids belong to ").partition(";")[0]
+        path = found.message.removeprefix("the ids in this file belong to ").partition(";")[0]
     read = claim_file.read(text, path)
     assert claim_file.read(claim_file.text_of(read), path) == read
     assert read.lease is None or read.lease.has_ended(NOW) in (True, False)

@@ -130,10 +130,11 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     found = demandops("check", clone)
     assert found.code == 0
     assert found.err.splitlines() == [
-        "warning: overrides/idle.yaml: matches nothing now; if it should, correct select",
+        "warning: overrides/idle.yaml: matches nothing now; if it should match something, correct "
+        "select",
         "warning: overrides/many.yaml: runs 2 replicas of object-detection, each of which "
-        "publishes every output; keep one, or say dividesWork: true in the application definition "
-        "if the program divides its work",
+        "publishes every output; run only one, or set dividesWork: true in the application "
+        "definition if the program divides its work among replicas",
         "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z and no longer applies; "
         "remove the file, or write a later time",
     ]
@@ -152,7 +153,7 @@ def test_a_dry_run_tells_of_a_denial_and_books_nothing(demandops: Run, overridde
     goal = yaml.safe_dump(perception(id="another"))
     ran = demandops("request", "-", "--state-repo", overridden.path, "--dry-run", stdin=goal)
     assert ran.code == 1
-    assert "connections[0].id: is denied by overrides/closed.yaml: why; ask its owner" in ran.err
+    assert "connections[0].id: is denied by overrides/closed.yaml: why; ask the" in ran.err
     assert overridden.tip == tip
 
 

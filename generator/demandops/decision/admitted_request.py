@@ -28,7 +28,7 @@ _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
-"""A function that yields a fault if a request follows others of its requesters too soon."""
+"""A function that yields faults if a request comes too soon after others of its requesters."""
 
 
 def admitted(
@@ -38,7 +38,9 @@ def admitted(
     throttle: Throttle,
     trial: placement.Trial | None = None,
 ) -> DemandRequest:
-    """Return the request of a goal, or a request to wait if only room on a node is lacking.
+    """Return the request that a goal becomes.
+
+    If nothing but room on a node is lacking, the result is a request to wait for room.
 
     Raises:
         Refused: if the demand can neither be booked nor wait. A demand that already holds claims
@@ -49,7 +51,7 @@ def admitted(
     except Refused as refused:
         if any(found.code != NO_ROOM for found in refused.faults):
             raise
-        assert isinstance(goal, dict)  # noqa: S101 - only a demand is placed
+        assert isinstance(goal, dict)  # noqa: S101 - a goal of another form has other faults
         parsed = separate_instance.with_separate_instances(demand_goal.parse(goal)[0], state.config)
         known = state.ledger.waiting.get(parsed.demand)
         mine = known is None or {*known.requesters} & {*parsed.requesters()}
@@ -72,12 +74,14 @@ def admit(
     throttle: Throttle = lambda request, config: (),
     trial: placement.Trial | None = None,
 ) -> DemandRequest:
-    """Return the request of a goal, checked against the configuration and the throttle.
+    """Return the request that a goal becomes, after the checks of the configuration and throttle.
 
-    If ``trial`` is given, nodes for which it returns ``False`` are not chosen.
+    If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
+    this node.
 
     Raises:
-        Refused: with every fault, of form and of content.
+        Refused: with every fault in the form and in the content of the goal. If there is none, with
+            the faults of ``throttle``.
     """
     config, ledger = state.config, state.ledger
     not_placed: list[Fault] = []
@@ -107,7 +111,7 @@ def admit(
         *admission.faults(request, config),
         *permission.faults(request, config),
     ]
-    # do not report as missing what could not be read
+    # a list that could not be read must not be reported as empty
     unread = bool(malformed & {"apps", "applications", "connections"})
     faults += [
         found
@@ -137,7 +141,7 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
 
 
 def leaves_nodes_open(state: State, goal: object) -> bool:
-    """Return whether the generator chooses nodes for a goal's applications or services."""
+    """Return whether the generator chooses a node for an application or a service of a goal."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request: DemandRequest | None = demand_goal.parse(goal)[0]
     else:
@@ -167,9 +171,10 @@ def _with_parents(field: str) -> Iterator[str]:
 
 
 def _subject_of(field: str) -> tuple[str, int]:
-    """Return (list, index) of the subject that a field belongs to.
+    """Return the list of the goal, and the index in this list, to which a field belongs.
 
-    Faults are sorted by this key, so that the faults of one subject are reported together.
+    Faults are sorted by this pair, so that the faults of one application or connection are reported
+    together.
     """
     match = _SUBJECT.match(field)
     return (match[1], int(match[2])) if match else ("", 0)

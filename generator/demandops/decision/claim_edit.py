@@ -1,4 +1,4 @@
-"""Claims that a person edits: the changes that an edit causes, and the faults of an edit."""
+"""Claims that a person edits in the ledger: the effect of the edit, and the faults in it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ from demandops.subject import Subject
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes to rendered files after a person edited the claims on ``subjects``."""
+    """Return the changes to rendered files after a person edited claims on ``subjects``.
+
+    ``before`` is the ledger before the edit, and ``state`` has the ledger after it.
+    """
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
     return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
@@ -38,9 +41,9 @@ def changeset_of_edit(
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
     """Yield the faults of claims that a person wrote, each located in the claim's file.
 
-    A claim must be valid, permitted, within the quotas and capacities, and without a topic clash,
-    as if a demand asked for it. An edit that only takes requesters away is always allowed, like a
-    release.
+    A claim must pass the same checks as a demand: it must be valid, permitted, within the quotas
+    and capacities, and without a topic clash. An edit that only takes requesters away is always
+    allowed, because it has the effect of a release.
 
     Args:
         before, after: the world before and after the edit.
@@ -63,7 +66,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
 
 
 def _above_capacity(change: ClaimChange, after: State) -> Iterator[Fault]:
-    """Yield a fault for each capacity that a person's change of a claim exceeds."""
+    """Yield a fault for each capacity of a node that a person's change of a claim exceeds."""
     without = replace(after, ledger=after.ledger.replace(change.key, change.before))
     with suppress(Refused):  # other checks report a claim that cannot be planned
         grown = capacity.growth_by(without, after, [change])

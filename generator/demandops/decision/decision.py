@@ -63,16 +63,19 @@ _OUTCOMES: dict[str, Outcome] = {
     "rollback": "restored",
     "wait": "waiting",
 }
-"""Operation → its outcome in the receipt; an operation that is not listed gives ``released``."""
+"""Operation → its outcome in the receipt.
+
+The outcome of an operation that is not listed is ``released``.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
     """The effect of a demand.
 
-    ``files`` maps each path to the new text, or to ``None`` if the file is to be removed. It is
-    empty if the demand changes nothing. ``approval`` names the access domains, rules and appdefs
-    that require a person's approval first.
+    ``files`` maps each path to the new text, or to ``None`` if the file is to be removed. If the
+    demand changes nothing, ``files`` is empty. ``approval`` names the access domains, rules and
+    appdefs because of which a person must approve the demand before it is booked.
     """
 
     request: DemandRequest
@@ -84,23 +87,23 @@ class Decision:
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
     overrides: tuple[str, ...] = ()
-    """The files of the overrides that shaped the rendered files."""
+    """The paths of the overrides that change the content of the rendered files."""
     frees: bool = False
-    """Whether room becomes free on a node, because services request less there than before."""
+    """Whether room becomes free on a node, because services now request less of the node."""
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """For each placed application or service: the chosen node, and why, in words."""
+        """One text for each placed application or service: the chosen node and the reason."""
         if isinstance(self.request, Drain):
             return self.request.moved
         return tuple(text for one in self.request.demanded for text in one.placed)
 
     @property
     def lease_s(self) -> int | None:
-        """The shortest lease of the demand, in seconds; ``None`` if it has no lease.
+        """The shortest lease of the demand in seconds, or ``None`` if the demand has no lease.
 
-        For a waiting demand this is the shortest lease that the demand may get, so that the client
-        renews the demand often enough.
+        For a waiting demand, this is the shortest lease that the demand may get later. So the
+        client renews the demand often enough.
         """
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:
@@ -128,13 +131,13 @@ def decide(
     Args:
         state: the configuration and ledger to decide on.
         goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`,
-            :mod:`demandops.demand.demand_goal`), or a request that the generator makes itself,
-            which is not checked again.
+            :mod:`demandops.demand.demand_goal`), or a request that the generator makes itself.
+            The form and the permissions of the generator's own request are not checked.
         now: when the demand was received, with time zone.
         read: returns the current text of a file in the state repo, or ``None``.
         on_stage: called when the demand is admitted and when it is booked.
-        throttle: called last before a request is admitted; the faults that it yields refuse the
-            request.
+        throttle: called after all other checks of admission, and only if these find no fault. If
+            ``throttle`` yields faults, the request is refused.
 
     Raises:
         Refused: with every fault, each with its field in the goal.
@@ -159,7 +162,8 @@ def decide(
         by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
         if not by_node or not leaves_nodes_open(state, goal):
             raise
-        # look for a node on which the demand is not refused; only a refused demand costs this time
+        # Look for nodes on which the demand is not refused. Booking it on many nodes on trial takes
+        # time, but only a demand that is refused on the nodes chosen first takes this time.
         with suppress(Refused):
             request = admit(state, goal, throttle, partial(_can_be_booked, state, now))
             return _decided(state, request, now, read, once)
@@ -169,7 +173,7 @@ def decide(
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
 )
-"""The fault codes of demands that are refused, but may be possible on another node."""
+"""The codes of faults that a demand may avoid on another node."""
 
 
 def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:
@@ -287,9 +291,9 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return (node, resource) → by how much the requests of services grow.
+    """Return how much more the services request, as a map from (node, resource) to the amount.
 
-    The result is empty if no node has a capacity.
+    The map is empty if no node has a capacity.
     """
     return (
         capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
@@ -299,7 +303,7 @@ def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.N
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state without a service's kept replicas whose time has ended.
+    """Return the state in which a service no longer keeps the replicas whose time has ended.
 
     The second value is the changeset, which has the files to write.
 

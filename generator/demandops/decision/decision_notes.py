@@ -1,4 +1,4 @@
-"""Notes for the requester on a decision, in addition to its outcome."""
+"""Notes that the requester gets about a decision, in addition to the outcome."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def notes_on(
 
 
 def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield warnings about inputs without a connection and topics that are bridged already.
+    """Yield a warning for each input that no connection carries, and for each bridged topic.
 
-    Each note on a connection of the request is a warning, too.
+    If a connection differs from the requested one, the note about this difference is a warning too.
     """
     ledger = without_suspended(world).ledger
     for one in request.demanded if request.adds_claims else ():
@@ -62,8 +62,9 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
         for route in held.topics:
             if is_bridged(route, *held.nodes, world.config):
                 yield (
-                    f"connection '{held.id}': {route.read_topic} is bridged between "
-                    f"'{held.source}' and '{held.target}' already, so no client carries it"
+                    f"connection '{held.id}': the initial deployment already carries "
+                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
+                    "the inventory), so no client of this connection carries it"
                 )
 
 
@@ -71,7 +72,7 @@ def _repeat(changes: Changes) -> Iterator[str]:
     """Yield a warning if the request repeats a shutdown that was carried out before."""
     if changes.repeats is not None:
         at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
-        yield f"the same shutdown was carried out at {at}; this one releases nothing more"
+        yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
 
 
 def _kept_replicas(changes: Changes, plans: Mapping[ReleaseKey, Release | None]) -> Iterator[str]:
@@ -80,6 +81,6 @@ def _kept_replicas(changes: Changes, plans: Mapping[ReleaseKey, Release | None])
         if isinstance(release, ServiceRelease) and release.keeps:
             until = format_time(release.keeps.until)
             yield (
-                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter), then "
-                "as many as its demands need"
+                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
+                "definition), although its demands need fewer"
             )

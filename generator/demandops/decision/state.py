@@ -28,7 +28,7 @@ class State(World):
     """The world at one commit, with the engine that renders its configuration's templates.
 
     ``plans`` are the releases that earlier decisions on this configuration planned. A copy made
-    with ``replace`` has no plans: only :func:`decide` knows which plans are still valid.
+    with ``replace`` has no plans, because only :func:`decide` knows which plans are still valid.
     """
 
     engine: Engine
@@ -43,9 +43,9 @@ class State(World):
         return cls(config, ledger, Engine(config.files))
 
     def usage(self) -> Usage:
-        """Return how much of each resource services request on each node.
+        """Return, for each node and resource, how much the services request.
 
-        Only the first call counts all services.
+        Only the first call counts all services; later calls return the same result.
         """
         if self._usage is None:
             object.__setattr__(self, "_usage", capacity.whole_usage(self))
@@ -55,7 +55,7 @@ class State(World):
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
         """Return the state after a decision, with the releases that the decision planned.
 
-        ``usage`` is how much services request on each node after the decision.
+        ``usage`` is the total that services request on each node after the decision.
         """
         known = self.plans
         for key, release in rendered.plans.items():
@@ -72,7 +72,7 @@ class State(World):
         """
         state = replace(self, ledger=ledger)
         if self._usage is not None:
-            with suppress(Refused):  # a definition is gone; ``usage`` then counts all services
+            with suppress(Refused):  # if a definition is gone; then ``usage`` counts all services
                 usage = self._usage.plus(capacity.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state
@@ -81,18 +81,20 @@ class State(World):
 def rendered_files(
     state: State, current: Mapping[str, str] = MappingProxyType({})
 ) -> dict[str, str]:
-    """Return every generated file that the state requires, path → text.
+    """Return every generated file that the state requires, as a map from path to text.
 
     Args:
-        current: the current generated files; an override with ``hold`` keeps some of them.
+        state: the world to render.
+        current: the current generated files. An override with ``hold`` keeps some of these files.
     """
     return changeset.render_all(state, state.engine, all_keys(state), current)
 
 
 def try_configuration(state: State) -> None:
-    """Render trial demands for every appdef and every override in effect.
+    """Render trial demands, so that every appdef and every override in effect is tried once.
 
     Raises:
-        Refused, InvalidInput: with the template, the values or the override that does not work.
+        Refused, InvalidInput: if a template, its values or an override does not work. The faults
+            name the one that does not work.
     """
     trial_render.render_trial_demands(state, state.engine)

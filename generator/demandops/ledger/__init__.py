@@ -1,4 +1,5 @@
 """Stage 3, what is booked: the set of claims, the operations on it, and its files.
 
-Pure: no clock, no disk, no Git. This stage does not know what runs because of a claim.
+This stage is pure: it uses no clock, no disk and no Git. It does not know what runs because of a
+claim.
 """

@@ -33,20 +33,20 @@ from demandops.ledger.waiting import Wait
 
 
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Book, replace, renew or release what ``request`` asks for.
+    """Return the ledger after a request is carried out, and the changes.
 
     Args:
         ledger: the claims before the request.
         request: an admitted request (:mod:`demandops.demand.admission`).
-        now: when the request was received, with time zone; changed claims record it.
+        now: when the request was received, with time zone. Changed claims record this time.
 
     Returns:
         The new ledger and what changed. If the same request is booked already, at most the leases
         of its claims change.
 
     Raises:
-        Refused: with every conflict with an existing claim, or if the request releases or renews
-            what is not held. Nothing is booked then.
+        Refused: with every contradiction between the request and existing claims, or if the request
+            releases or renews what is not held. A refused request books nothing.
     """
     match request:
         case Join():

@@ -1,4 +1,4 @@
-"""The changes of a request to the ledger: claims before and after, and other records."""
+"""What a request changes in the ledger: claims, before and after the change, and other records."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class ClaimChange:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """The claims that a request changed.
+    """What a request changed in the ledger.
 
-    ``not_held``: the items that a shutdown lists, but that its requesters do not hold.
-    ``shutdowns``: the digests of shutdowns that the ledger now records or forgets. ``repeats``: the
-    earlier shutdown that the request repeats, or ``None``. ``kept``: the service instances whose
-    kept replicas changed. ``waiting``: the ids of the demands that begin or cease to wait.
+    ``not_held``: in words, what a shutdown lists, but its requesters do not hold. ``shutdowns``:
+    the digests of shutdowns that the ledger now records or forgets. ``repeats``: the earlier
+    shutdown that the request repeats, or ``None``. ``kept``: the service instances whose kept
+    replicas changed. ``waiting``: the ids of the demands that begin or cease to wait.
     """
 
     claims: tuple[ClaimChange, ...] = ()
@@ -60,7 +60,7 @@ class Changes:
 def changes_on(
     before: Ledger, after: Ledger, subjects: Iterable[Subject]
 ) -> tuple[ClaimChange, ...]:
-    """Return the changes of claims on these subjects between two ledgers."""
+    """Return the claims on ``subjects`` that differ between two ledgers."""
     claims = (
         claim
         for subject in subjects
@@ -73,6 +73,6 @@ def changes_on(
 def claim_changes(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> tuple[ClaimChange, ...]:
-    """Return the changes of the claims at ``keys`` between two ledgers."""
+    """Return the claims at ``keys`` that differ between two ledgers."""
     changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
     return tuple(change for change in changes if change.before != change.after)

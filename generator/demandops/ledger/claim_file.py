@@ -33,9 +33,9 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders for the nodes of services, which only newer versions of the generator write."""
+"""Folders that only newer generators write; they are for records of the nodes of services."""
 
-_JOINED = re.compile(r"[0-9a-f]{20}")  # the form of ids of demandops.demand.claim.demand_id
+_JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
 
 
@@ -63,7 +63,11 @@ def _timestamp(text: str) -> str:
 
 
 def parse_timestamp(text: str) -> datetime:
-    """Return a time of a ledger file, in UTC; raise :class:`ValueError` for other text."""
+    """Return the time that a text in a ledger file states, in UTC.
+
+    Raises:
+        ValueError: if the text is not a time with a time zone.
+    """
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
         in_utc = moment.astimezone(timezone.utc)
@@ -122,14 +126,14 @@ class _Route(RouteOptions):
 
 
 def _plain_route(value: object) -> object:
-    """Return the data of a route as a mapping; a plain text, as in ``/a: /b``, is the target."""
+    """Return the data of a route as a mapping; a text alone, as in ``/a: /b``, is the target."""
     return {"target": value} if isinstance(value, str) else value
 
 
 class _Lease(FrozenModel):
     seconds: int = Field(ge=1, le=LONGEST_S)
     slack: int = Field(default=0, ge=0, le=LONGEST_S)
-    until: _EndOfLease | None = None  # None: the lease starts with the approval
+    until: _EndOfLease | None = None  # None: the lease starts when the claim is approved
 
     def lease(self) -> Lease:
         until = parse_timestamp(self.until) if self.until else UNSTARTED
@@ -149,7 +153,7 @@ class _Claim(FrozenModel):
         raise NotImplementedError
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
-        """Yield (place in the file, topic, requesters) for each topic that lists requesters."""
+        """Yield (field of the file, topic, requesters) for each topic that lists requesters."""
         raise NotImplementedError
 
     def faults(self) -> Iterator[Fault]:
@@ -158,7 +162,7 @@ class _Claim(FrozenModel):
             if unknown := set(names) - set(self.requesters):
                 message = (
                     f"{', '.join(sorted(unknown))} is not among the requesters of the claim; add "
-                    "it there, or remove it here"
+                    "this name to the claim's requesters, or remove the name from this topic"
                 )
                 yield fault(f"{place}.requesters", message)
 
@@ -351,7 +355,8 @@ def read(text: str, path: str) -> Claim:
     """Return the claim in a file.
 
     Raises:
-        InvalidInput: with every fault, also if the path does not match the ids in the file.
+        InvalidInput: with every fault. One of these is that the path does not match the ids in the
+            file.
     """
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
@@ -387,8 +392,8 @@ def read(text: str, path: str) -> Claim:
             [
                 fault(
                     "",
-                    f"its ids belong to {path_of(claim.key)}; move the file there, or restore "
-                    "the ids",
+                    f"the ids in this file belong to {path_of(claim.key)}; move the file to that "
+                    "path, or restore the ids",
                 ).within(path)
             ]
         )
@@ -396,7 +401,10 @@ def read(text: str, path: str) -> Claim:
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return the kind of the claim file at a path, or ``None`` for other files."""
+    """Return the kind of subject that the claim file at a path is for.
+
+    Return ``None`` if the path is not that of a claim file.
+    """
     parts = path.split("/")
     if len(parts) != 5 or parts[0] != LEDGER_ROOT or not path.endswith(".yaml"):
         return None

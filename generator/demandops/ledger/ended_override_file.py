@@ -46,9 +46,9 @@ def text_of(override: Override) -> str:
 
 
 def read(files: Mapping[str, str]) -> dict[str, str]:
-    """Return override name → the end that the override had when it ended.
+    """Return a map from the name of each ended override to the end that the override then had.
 
-    Files that are not markers are skipped; :func:`stale_markers` lists them for removal.
+    Files that are not valid markers are skipped; :func:`stale_markers` lists them for removal.
     """
     ended = {}
     for path, text in files.items():

@@ -1,11 +1,11 @@
-"""Replicas that services keep for a while after the demands for them ended.
+"""Kept replicas: those that a service keeps for a while although its demands need fewer.
 
 A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service has
-the highest number of replicas that its demands needed within this time. Each record is one file,
-``ledger/replicas/<hh>/<name>.yaml``. It lists each number of replicas above the present need, with
-the time until which the service keeps this number. When that time passes, the generator publishes a
-commit that removes the number from the record. Only this commit reduces the replicas, so a replay
-gives the same bytes.
+the highest number of replicas that its demands needed within this time. A service instance with
+kept replicas has one record, the file ``ledger/replicas/<hh>/<name>.yaml``. The record lists each
+number of replicas above the present need, with the time until which the service keeps this number.
+When that time passes, the generator publishes a commit that removes the number from the record.
+Only this commit reduces the replicas, so a replay gives the same bytes.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Each step has fewer replicas and a later end than the previous step.
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    """Return the steps of a service after its demands need another number of replicas.
+    """Return the steps of a service after its demands begin to need more or fewer replicas.
 
     Args:
         steps: the steps before.
@@ -84,14 +84,14 @@ class KeptReplicas:
     """The replicas that all services keep.
 
     ``steps`` maps each service instance to its steps. ``by_minute`` maps a minute to the instances
-    whose first step ends in it.
+    whose first step ends in this minute.
     """
 
     steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        """Return the records with these steps for an instance; empty steps remove its record."""
+        """Return the records with these steps of an instance; empty steps remove its record."""
         known = self.steps.get(instance) or ()
         if known == steps:
             return self
@@ -174,7 +174,7 @@ def read(text: str, path: str) -> tuple[Instance, Steps] | None:
 
 
 def read_all(files: Mapping[str, str]) -> KeptReplicas:
-    """Return the records in these files, path → text."""
+    """Return the records in ``files``, a map from path to text; invalid files are skipped."""
     kept = KeptReplicas()
     for path, text in files.items():
         if record := read(text, path):

@@ -1,7 +1,7 @@
 """The ledger: which demand holds which subject, as a set of persistent maps.
 
-A :class:`Ledger` never changes: a request gives a new one. The cost of the new ledger depends on
-the request, not on the ledger's size.
+A :class:`Ledger` never changes, because each request makes a new one. How long that takes depends
+on the size of the request, not on the size of the ledger.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ class Ledger:
 
     ``claims`` maps each subject to the claims on it, sorted by demand id, because the planner asks
     for all claims on a subject. All claims on a subject agree on its type and nodes. If a person
-    writes a claim that disagrees, the first claim decides.
+    writes a claim that disagrees, the first claim on the subject decides.
     ``index`` maps each entry of :func:`index_entries` to the claims that have this entry.
-    ``minutes`` has each minute in which a lease ends, to find the next end without a full scan.
+    ``minutes`` has each minute in which a lease ends, so that the next end is found without a scan
+    of all claims.
     ``ended`` maps the name of each ended override to the end that the override then had.
     ``shutdowns`` are the recent shutdowns.
     ``applications_on`` maps each node to the number of applications for which the node was chosen.
@@ -82,19 +83,19 @@ class Ledger:
         return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
 
     def application(self, id: str) -> Application | None:
-        """Return a claimed application as its first claim has it; ``None`` without a claim."""
+        """Return an application as its first claim has it, or ``None`` if no claim holds it."""
         first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
         return first.application if first else None
 
     def connection(self, id: str) -> Connection | None:
-        """Return a claimed connection as its first claim has it; ``None`` without a claim."""
+        """Return a connection as its first claim has it, or ``None`` if no claim holds it."""
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions that claims on an application ask for.
 
-        The result has an empty text if a claim asks for no version, or for an unknown one.
+        The result also has an empty text if a claim asks for no version, or for an unknown version.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         found = {word: len(keys) for word, keys in by_version.items() if keys}
@@ -106,33 +107,42 @@ class Ledger:
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
     def claims_reading(self, source: str, topic: str) -> tuple[Claim, ...]:
-        """Return the claims with ``topic`` of ``source`` as an input, sorted by application."""
+        """Return the claims with ``topic`` of the node ``source`` as an input.
+
+        They are sorted by application, then by demand.
+        """
         return self._claims("takes", source, topic)
 
     def each_reading(self, source: str, topic: str) -> Iterator[Claim]:
-        """Yield the claims with ``topic`` of ``source`` as an input, in no order."""
+        """Yield the claims with ``topic`` of the node ``source`` as an input, in no order."""
         for key in self.index.get(("takes", source, topic)) or ():
             claim = self.get(key)
             if claim is not None:
                 yield claim
 
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
-        """Return the input ``topic`` of ``source`` in ``role`` as a claim has it, or ``None``."""
+        """Return the booked input with this topic and source in ``role``.
+
+        Return ``None`` if no claim has such an input.
+        """
         for claim in self.each_reading(source, topic):
             if found := claim.application.inputs_from(role, source, topic):
                 return found[0]
         return None
 
     def has_usual_topic(self, role: str, source: str, *, but_of: str | None = None) -> bool:
-        """Return whether a claim has the usual topic of ``source`` in ``role``.
+        """Return whether a claim has the usual topic of ``source`` as an input in ``role``.
 
-        Claims of the demand ``but_of`` do not count.
+        The claims of the demand ``but_of`` are not considered.
         """
         keys = self.index.get(("usual", source, role)) or ()
         return any(key.demand != but_of for key in keys)
 
     def usual_topics(self, role: str, source: str, *, but: str) -> Iterator[str]:
-        """Yield the usual topics of ``source`` in ``role`` that claims have, except ``but``."""
+        """Yield each usual topic of ``source`` that a claim has as an input in ``role``.
+
+        The topic ``but`` is left out.
+        """
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("takes", source, but)) or ()):
             return  # all these claims have the topic ``but``
@@ -142,11 +152,11 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for the inputs in ``role`` that have ``part`` in topic names.
+        """Yield (input, version) for each input in ``role`` that has ``part`` in topic names.
 
-        ``part`` replaces ``{instance}`` in the patterns of topics. Only further inputs and the
-        inputs of separate instances are yielded. ``version`` is the version of the separate
-        instance, else empty.
+        ``part`` is the text that replaces ``{instance}`` in output patterns. Only further topics
+        and the inputs of separate instances are yielded. ``version`` is the version of the separate
+        instance; it is empty for an input of any other application.
         """
         for claim in self._claims("further", part):
             app = claim.application
@@ -165,7 +175,7 @@ class Ledger:
         return self._claims("demand", demand)
 
     def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
-        """Return the claims that overrides keep, on one subject or on all."""
+        """Return the claims that overrides keep on ``subject``, or on all subjects."""
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def moved_applications(self) -> tuple[str, ...]:
@@ -189,7 +199,7 @@ class Ledger:
         return len(self.index.get(("requester", requester)) or ())
 
     def claims_of_definition(self, appdef: str) -> tuple[Claim, ...]:
-        """Return the claims on applications of a definition, sorted by subject and demand."""
+        """Return the claims on the applications of an appdef, sorted by subject and demand."""
         return self._claims("definition", appdef)
 
     def claims_at(self, node: str) -> tuple[Claim, ...]:
@@ -201,7 +211,7 @@ class Ledger:
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the ids of the applications that have the text ``part`` in topic names, sorted."""
+        """Return the ids of the applications that ``part`` stands for in topic names, sorted."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
@@ -210,10 +220,11 @@ class Ledger:
         return min((claim.lease.expires_at for claim in found if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
-        """Return the keys of the claims whose leases end first: those that end in the same minute.
+        """Return the keys of the claims whose leases end in the earliest minute.
 
-        Return ``None`` if there is no lease. As long as no claim enters the set, leaves it or gets
-        another end, each call returns the same object.
+        Return ``None`` if there is no lease. Each call returns the same object until a claim enters
+        the set, leaves the set or gets another lease. So a caller that compares the objects sees
+        each change.
         """
         return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 
@@ -256,9 +267,9 @@ class Ledger:
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return all names that the index has in one kind of entry, such as ``requester``.
+        """Return all names in the index entries of one kind, such as ``requester``.
 
-        This scans the whole index.
+        This scans the whole index, so it is slow for a large ledger.
         """
         return {known[-1] for known in self.index if known[0] == entry}
 
@@ -285,7 +296,7 @@ class Ledger:
             if not others and entry[0] == _ENDS:
                 minutes = minutes.remove(entry[1])
         added = after - before
-        if old and claim and old.lease != claim.lease:  # makes a new set even in the same minute
+        if old and claim and old.lease != claim.lease:  # so ``first_to_end`` returns a new object
             added |= {entry for entry in after if entry[0] == _ENDS}
         for entry in added:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
@@ -334,7 +345,8 @@ def _counted(
 ) -> HashTrieMap[str, int]:
     """Return ``counts`` after the first claim on an application changed.
 
-    ``counts`` is :attr:`Ledger.applications_on`. The claim was ``before`` and is ``after`` now.
+    ``counts`` is :attr:`Ledger.applications_on`. The first claim was ``before`` and is ``after``
+    now.
     """
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):

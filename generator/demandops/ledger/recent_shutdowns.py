@@ -1,8 +1,9 @@
 """Recent shutdowns, so that a shutdown that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
-record the repeat would release another demand of the same requesters. If a join adds something for
-one of the requesters, the record is removed, because the next shutdown may mean what was added.
+record of the first shutdown, the repeat would release another demand of the same requesters. If a
+join adds something for one of the requesters, the record is removed, because the next shutdown may
+mean what the join added.
 
 Each record is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
 """
@@ -35,11 +36,12 @@ REMEMBERED = timedelta(minutes=15)
 _KEPT = timedelta(hours=1)
 """How long a record is kept.
 
-This is longer than :data:`REMEMBERED`, because a repeat may have waited in a journal.
+This is longer than :data:`REMEMBERED`, because a repeat that was received in time may wait in a
+journal before it is decided.
 """
 
 _FORGOTTEN = 10
-"""The highest number of old records of shutdowns that one booking removes."""
+"""The highest number of old records that one booking removes."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
@@ -84,12 +86,15 @@ class RecentShutdowns:
     by_minute: _Index = field(default_factory=HashTrieMap)
 
     def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
-        """Return the same shutdown if it was received in the last 15 minutes, or ``None``."""
+        """Return the record of the same shutdown.
+
+        Return ``None`` if no such record is within 15 minutes of the time of ``shutdown``.
+        """
         known = self.by_digest.get(shutdown.digest)
         return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        """Return the shutdowns with ``shutdown`` as the one at ``digest``, or with none there."""
+        """Return the records with ``shutdown`` at ``digest``; ``None`` removes this record."""
         known = self.by_digest.get(digest)
         if known == shutdown:
             return self
@@ -109,10 +114,10 @@ class RecentShutdowns:
     def forget(
         self, now: datetime, requesters: Iterable[str] = ()
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the shutdowns that are left, and the digests of the forgotten ones.
+        """Return the records that are left, and the digests of those that are removed.
 
-        All shutdowns of ``requesters`` are forgotten. Of the shutdowns that are older than an hour,
-        the oldest are forgotten, at most ten.
+        All records that name one of ``requesters`` are removed. Of the records that are older than
+        an hour, the ten oldest are removed.
         """
         first = _minute(now - _KEPT)
         ended = sorted(one for one in self.by_minute if one < first)
@@ -139,17 +144,17 @@ def _removed(index: _Index, key: str, digest: str) -> _Index:
 
 
 def path_of(digest: str) -> str:
-    """Return the path of a shutdown's file."""
+    """Return the path of the file that records a shutdown."""
     return f"{SHUTDOWNS_ROOT}/{digest[:2]}/{digest}.yaml"
 
 
 def digest_in(path: str) -> str:
-    """Return the digest that the path of a shutdown's file names."""
+    """Return the digest in the path of a file that records a shutdown."""
     return path.rsplit("/", 1)[-1].removesuffix(".yaml")
 
 
 def text_of(shutdown: RecentShutdown) -> str:
-    """Return the text of a shutdown's file."""
+    """Return the text of the file that records a shutdown."""
     return strict_yaml.dump(
         {
             "apiVersion": LEDGER_API_VERSION,
@@ -172,7 +177,7 @@ class _ShutdownFile(FrozenModel):
 
 
 def read(text: str, path: str) -> RecentShutdown | None:
-    """Return the shutdown in a file, or ``None`` if the file is not valid."""
+    """Return the record in a file, or ``None`` if the file is not valid."""
     try:
         file = parse_file(_ShutdownFile, text, path)
     except InvalidInput:
@@ -182,7 +187,7 @@ def read(text: str, path: str) -> RecentShutdown | None:
 
 
 def read_all(files: Mapping[str, str]) -> RecentShutdowns:
-    """Return the shutdowns in these files, path → text."""
+    """Return the records in ``files``, a map from path to text; invalid files are skipped."""
     found = [one for path, text in files.items() if (one := read(text, path))]
     shutdowns = RecentShutdowns()
     for one in sorted(found, key=lambda one: one.at):

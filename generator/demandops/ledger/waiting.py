@@ -1,4 +1,4 @@
-"""Waiting demands: no node has room for them, so they are kept until a node has.
+"""Waiting demands: no node has room for them, so the ledger keeps them until a node has room.
 
 A waiting demand holds nothing. When room may be free, the generator tries to book the waiting
 demands: those with the highest priority first and, if the priority is the same, the oldest first. A
@@ -36,7 +36,11 @@ WAITING_ROOT = f"{LEDGER_ROOT}/waiting"
 
 @dataclass(frozen=True, slots=True)
 class WaitingDemand:
-    """A demand that waits. ``goal`` is plain data; ``since`` is when it was first received."""
+    """A demand that waits for room.
+
+    ``goal`` is the demand's goal as plain data. ``since`` is the time when the demand was first
+    received.
+    """
 
     demand: str
     request: str
@@ -52,12 +56,12 @@ class WaitingDemand:
 
 
 WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
-"""The waiting demands by their ids."""
+"""A map from demand id to waiting demand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wait(DemandRequest):
-    """The request of a demand that must wait; ``reasons`` say why."""
+    """The request of a demand that must wait; ``reasons`` say why it must."""
 
     waiting: WaitingDemand | None = None
     reasons: tuple[str, ...] = ()
@@ -66,7 +70,7 @@ class Wait(DemandRequest):
 
 
 def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
-    """Return the demands in the order in which they are tried."""
+    """Return the waiting demands in the order in which the generator tries to book them."""
     return sorted(waiting.values(), key=lambda one: one.turn)
 
 
@@ -104,7 +108,7 @@ class _WaitingFile(FrozenModel):
 
 
 def read(text: str, path: str) -> WaitingDemand | None:
-    """Return the demand in a file; ``None`` if the file is not valid, so that it is ignored."""
+    """Return the waiting demand in a file, or ``None`` if the file is not valid."""
     try:
         file = parse_file(_WaitingFile, text, path)
     except InvalidInput:
@@ -117,11 +121,14 @@ def read(text: str, path: str) -> WaitingDemand | None:
 
 
 def read_all(files: Mapping[str, str]) -> WaitingDemands:
-    """Return the waiting demands in these files, path → text."""
+    """Return the waiting demands in ``files``, a map from path to text.
+
+    Files that are not valid are skipped.
+    """
     found = (one for path, text in files.items() if (one := read(text, path)))
     return HashTrieMap({one.demand: one for one in found})
 
 
 def of_requester(waiting: WaitingDemands, requester: str) -> Iterator[WaitingDemand]:
-    """Yield the waiting demands that have only this requester."""
+    """Yield the waiting demands whose only requester is ``requester``."""
     return (one for one in waiting.values() if one.requesters == (requester,))

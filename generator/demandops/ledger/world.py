@@ -11,9 +11,10 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """The configuration and the claims.
+    """The configuration and the ledger.
 
-    ``overrides`` are those that have not ended, in the order in which they apply.
+    ``overrides`` are the overrides of the configuration that have not ended, in the order in which
+    they apply.
     """
 
     config: Config

@@ -1,4 +1,4 @@
-"""Stage 4, what should run: releases derived from claims.
+"""Stage 4, what should run: the releases that the planner derives from claims.
 
-This stage knows the ledger and the configuration, but not Helm, Flux or files.
+This stage uses the ledger and the configuration. It does not use Helm, Flux or files.
 """

@@ -1,4 +1,4 @@
-"""The flow of topics through an application: the topics that services read, and their origin.
+"""The flow of topics through an application: which topics services read, and where they come from.
 
 An instance of a service depends on one demanded topic, on the topics of one source, or only on its
 application. So the flows of a demand do not depend on other demands.
@@ -22,9 +22,9 @@ from demandops.subject import TopicKey
 class PublishedTopic(NamedTuple):
     """A topic that a service reads, and the node that publishes the topic.
 
-    ``root`` is the key of a demanded topic: of ``topic`` itself, if the demand lists it as an
-    input, or of the input from which a service makes ``topic``. It is empty if a service makes
-    ``topic`` from all its inputs together.
+    ``root`` is the key of a demanded topic. If the demand lists ``topic`` as an input, this is
+    ``topic`` itself. Otherwise it is the input from which a service makes ``topic``. ``root`` is
+    empty if a service makes ``topic`` from all its inputs together.
     """
 
     topic: InputTopic
@@ -34,12 +34,13 @@ class PublishedTopic(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """A topic that is made on one node and needed on another.
+    """A topic that is made on one node and needed on another node.
 
     ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
     topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
-    flow is needed. ``delivery`` is the flow's index in the application's ``deliver``, or ``None``
-    if the flow delivers no output. ``type`` is the message type, if the demand names it.
+    flow is needed. ``delivery`` is the index, in the application's ``deliver``, of the delivery
+    that needs the flow. It is ``None`` if a service reads the topic. ``type`` is the message type;
+    it is empty unless the demand names the type.
     """
 
     name: str
@@ -53,15 +54,15 @@ class Flow:
 
     @property
     def is_output(self) -> bool:
-        """Whether a service makes the topic; otherwise the demand lists the topic as an input."""
+        """Whether a service makes the topic. If not, the demand lists the topic as an input."""
         return "." in self.name
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
-    """Return the node on which an application's service runs for the inputs of ``source``.
+    """Return the node where a service of an application runs for inputs from ``source``.
 
-    The result is an empty text in two cases: no node is chosen for the service yet, or the service
-    runs once for each cluster and has no node in the application's cluster.
+    The result is an empty text in two cases. Either no node is chosen for the service yet, or the
+    service runs once for each cluster and has no node in the application's cluster.
     """
     if service.nodes:
         return service.runs_at.get(app.node, "")
@@ -71,7 +72,7 @@ def node_of(app: Application, service: Service, source: str) -> str:
 
 
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
-    """Yield the key of each instance that an application needs of a service."""
+    """Yield the keys of the instances of a service that an application needs."""
     if service.scope == "application":
         yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:
@@ -86,16 +87,19 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
 
 
 def version_of_instance(app: Application, service: Service) -> str:
-    """Return the version that the keys of a service's instances contain.
+    """Return the ``version`` in the keys of a service's instances.
 
-    This is the version of the application if it is a separate instance. It is an empty text for
-    any other application, and for a shared service.
+    If the application is a separate instance, this is the version of the application. It is an
+    empty text for any other application, and for a shared service.
     """
     return "" if service.shared else app.own_version
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
-    """Return the keys of an application's demanded topics for which a service instance runs."""
+    """Return the keys of those topics of an application for which a service instance runs.
+
+    These are topics that demands list as inputs.
+    """
     if service.root is not None:
         found = app.inputs_from(service.root, str(key.source), str(key.topic))
         return [(service.root, one.topic, one.source) for one in found]
@@ -131,7 +135,7 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
-    """Return the flows between nodes that an application needs, sorted by name."""
+    """Return the flows that an application needs between nodes, sorted by ``name``."""
     found: dict[tuple[str, str, str, str], Flow] = {}
     for service in config.services.get(app.appdef, {}).values():
         for node, part in _parts(app, service):
@@ -162,9 +166,9 @@ def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
-    """Yield (node, application) for each instance of a service.
+    """Yield (node of the instance, application) for each instance of a service.
 
-    This application has only the inputs that the instance runs for.
+    The yielded application has only the inputs for which this instance runs.
     """
     if service.root is not None:
         for one in app.inputs.get(service.root, ()):

@@ -1,8 +1,8 @@
 """Implied connections: those that a demand needs, but does not list.
 
 A service that reads a topic of another node needs a connection. The demand claims this connection
-in the same way as a listed one. So the connection is shared with other demands, changes when the
-application moves, and is released with the demand.
+in the same way as a connection that it lists. So the connection is shared with other demands,
+changes when the application moves, and is released with the demand.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 def _input_field(field: str, path: str) -> str:
     """Return the field of the goal that a fault of an implied connection names.
 
-    A fault of a requester keeps its ``path``. Any other fault names ``field``: the input, delivery
-    or node because of which the connection is needed.
+    If the fault is in a requester, this is ``path``. For any other fault, it is ``field``, which is
+    the input, delivery or node because of which the connection is needed.
     """
     return path if path.startswith("requesters") else field
 
@@ -40,8 +40,8 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
     """Return the request with a connection for each flow that no listed connection carries.
 
     If a claimed connection carries the flow, the demand claims this connection too. Otherwise the
-    demand gets a derived connection between the two nodes. An invalid input adds no connection;
-    admission reports the input.
+    demand gets a derived connection between the two nodes. An invalid input adds no connection,
+    because admission reports the input.
     """
     first: dict[_Ends, Demanded] = {}
     routes: dict[_Ends, dict[tuple[str, str], Route]] = {}
@@ -88,16 +88,17 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
 
 
 def _note(needed: Connection, type: str) -> str:
-    """Return a note for the requester if a connection already has another type than ``type``.
+    """Return a note for the requester, or an empty text if there is nothing to note.
 
-    Otherwise return an empty text.
+    There is a note if the connection ``needed`` is claimed already, with another type than
+    ``type``.
     """
     if needed.type is None or type in ("auto", needed.type.word):
         return ""
     topic = needed.topics[0].source
     return (
-        f"carries {topic} already and is {needed.type.name}, so there is no {type.upper()} "
-        "connection for it"
+        f"already carries {topic} and is {needed.type.name}, so this topic gets no "
+        f"{type.upper()} connection"
     )
 
 
@@ -105,7 +106,7 @@ _Ends: TypeAlias = "tuple[str, ...]"
 
 
 def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
-    assert isinstance(one.held, Connection)  # noqa: S101 - the caller knows
+    assert isinstance(one.held, Connection)  # noqa: S101 - callers pass only connections
     return replace(one, held=replace(one.held, topics=tuple(dict.fromkeys(topics))))
 
 
@@ -114,13 +115,14 @@ def without_idle_deliveries(
 ) -> tuple[Ledger, Changes]:
     """Return the ledger and the changes without deliveries of outputs that are no longer made.
 
-    If a node is decommissioned, a demand may lose an input and with it an output of its
+    If a node is decommissioned, a demand may lose an input, and with the input an output of its
     application. The demand may still hold the connection that delivers this output between two
-    other nodes. This function takes the output's topic from the demand's claim on the connection.
+    other nodes. Then this function removes the output's topic from the demand's claim on that
+    connection.
 
     Args:
         before: the ledger before the node is decommissioned.
-        after: the world afterwards.
+        after: the world after the node is decommissioned.
         changes: what the decommissioning changes.
     """
     ledger, keys = after.ledger, [change.key for change in changes.claims]
@@ -147,10 +149,11 @@ def _is_valid(flow: Flow, config: Config) -> bool:
 
 
 def connection_for(flow: Flow, type: str, ledger: Ledger) -> Connection:
-    """Return the connection for a flow, with the flow's topic as its only topic.
+    """Return the connection that carries a flow, with the flow's topic as its only topic.
 
-    If a claimed connection already carries the flow, the result is this connection. Otherwise it is
-    a derived connection of ``type``. If ``type`` is ``auto``, the connection has no type yet.
+    If a claimed connection already carries the flow, the result is that connection. Otherwise the
+    result is a derived connection of ``type``. If ``type`` is ``auto``, this connection has no type
+    yet.
     """
     ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
     for id in ledger.connections_bringing(flow.receiver, flow.target):

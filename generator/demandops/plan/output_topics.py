@@ -1,11 +1,11 @@
 """The topics that services publish, named as the reference names them.
 
-``{instance}`` in a pattern stands for the application or the node that a service runs for. For a
-service with ``each``, it stands for the source of the input. A source has one usual topic for an
-input: the one in its inventory entry, else the first that a demand booked. Any other topic is a
-further topic of the source; names that are made from a further topic contain this topic as well.
-The claims record which topics are further ones, so a name stays the same while anybody demands the
-topic.
+``{instance}`` in an output pattern stands for the application or the node for which a service runs.
+For a service with ``each``, ``{instance}`` stands for the source of the input. A source has one
+usual topic for an input role: the topic in the source's inventory entry or, if there is none, the
+first topic that a demand booked. Any other topic is a further topic of the source. A name that is
+made from a further topic contains the source and this topic. The claims record which topics are
+further topics, so a name stays the same while anybody demands the topic.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from demandops.plan.release import ServiceKey
 def outputs(
     config: Config, service: Service, key: ServiceKey, *, further: bool = False
 ) -> dict[str, str]:
-    """Return output name → topic for each output that a service instance publishes.
+    """Return the topics that a service instance publishes, as a map from output name to topic.
 
-    ``further`` is true if the instance's input is a further topic of its source.
+    ``further`` is true if the instance runs for a further topic of a source.
     """
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
@@ -41,18 +41,18 @@ def outputs(
 
 
 def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
-    """Return the text that replaces ``{instance}`` for the service instance that serves ``topic``.
+    """Return the text that replaces ``{instance}`` for the service instance that reads ``topic``.
 
-    ``version`` is the version of a separate instance, else empty.
+    ``version`` is the version of a separate instance; it is empty for any other application.
     """
     return naming.topic_part(topic.source, distinguishing_text(config, role, topic, version))
 
 
 def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text that distinguishes topic names that are made from the same source.
+    """Return the text by which topic names differ that are made from the same source.
 
-    The text has the topic, if that is a further topic of its source, and the version of a separate
-    instance. It is empty if neither applies.
+    The text contains ``topic`` if ``topic`` is a further topic of its source, and ``version`` if
+    it is not empty. In any other case, the text is empty.
     """
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
@@ -63,20 +63,19 @@ def distinguishing_text(config: Config, role: str, topic: InputTopic, version: s
 def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
     """Return the topic that a service publishes for ``source``.
 
-    ``distinguishing`` is the text from :func:`distinguishing_text`, by which the topic's name
-    differs from other names that are made from the same source. A fusion reads hundreds of such
+    ``distinguishing`` is the result of :func:`distinguishing_text`. A fusion reads hundreds of such
     topics, so the results are cached.
     """
     return InputTopic(topic_name(pattern, naming.topic_part(source, distinguishing)), source)
 
 
 def topic_name(pattern: str, instance: str) -> str:
-    """Return a topic name: the appdef's ``pattern`` with ``{instance}`` replaced."""
+    """Return the topic name that ``pattern``, an output of an appdef, gives for ``instance``."""
     return pattern.replace("{instance}", instance)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
-    """Return the usual topic of a source for an input, or ``None`` if the inventory has none."""
+    """Return the usual topic of a source in ``role``, or ``None`` if the inventory has none."""
     node = config.nodes.get(source)
     return node.topics.get(role) if node else None
 
@@ -85,7 +84,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
     """Return the request with ``further`` set in each input that is a further topic."""
     if not request.adds_claims:
         return request
-    # topics of the put's own demand do not count, because the put may release them
+    # the claims of the put's own demand do not count, because the put may release their topics
     own = request.demand if isinstance(request, Put) else None
     first: dict[tuple[str, str], str] = {}
 
@@ -116,9 +115,10 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return a ledger of an earlier format with ``further`` set in the inputs of its claims.
+    """Return the ledger with ``further`` set in the inputs of its claims.
 
-    The usual topic of a source is the one in the inventory, else the one that was booked first.
+    The claims are of an earlier format without ``further``. The usual topic of a source is the one
+    in the inventory or, if there is none, the one that was booked first.
     """
     first: dict[tuple[str, str], str] = {}
 
@@ -134,7 +134,7 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
 
 
 def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
-    """Yield (role, topic) for each input in a role whose topics each get a service instance."""
+    """Yield (role, topic) for each input in a role with one service instance for each topic."""
     for role in config.roles_with_services:
         for topic in app.inputs.get(role, ()):
             yield role, topic

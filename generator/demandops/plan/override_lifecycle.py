@@ -1,8 +1,8 @@
 """Changes to the ledger when overrides change or end: kept claims, moved services, markers.
 
-A marker is a file of the ledger that says that an override has ended. An override whose end had
-passed when it was merged never applies. When an override in effect reaches its end, the generator
-publishes a commit that ends it.
+A marker is a file of the ledger that records that an override has ended. If an override's end has
+passed when the override is merged, the override never applies. When an override in effect reaches
+its end, the generator publishes a commit that ends the override.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ def update_ledger(
     markers: Mapping[str, str],
     now: datetime,
 ) -> LedgerUpdate:
-    """Return the changes to the ledger that a change of the configuration requires.
+    """Return the ledger that a change of the configuration requires, and the files to write.
 
     Args:
         before, after: the world before and after the change.
         subjects: the subjects whose claims a person changed.
-        markers: path → text of each marker in the ledger.
+        markers: a map from path to text that has each marker in the ledger.
         now: the current time. A new override whose end has passed does not apply.
     """
     known = {one.name: one for one in before.overrides}
@@ -79,13 +79,13 @@ def update_ledger(
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """Return the changes to the ledger that a change of claims requires.
+    """Return the ledger that a change of claims requires, and the files to write.
 
-    The configuration is the same before and after.
+    The configuration does not change.
 
     Args:
         before: the ledger before the change.
-        after: the world after it.
+        after: the world after the change.
         subjects: the subjects whose claims changed.
         now: the booking time of new kept claims.
     """
@@ -98,7 +98,10 @@ def update_claims(
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the changes to the ledger that end an override, among them the record of its end."""
+    """Return the ledger after the end of an override, and the files to write.
+
+    One of the files is the marker, which records that the override has ended.
+    """
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
@@ -114,7 +117,10 @@ def _marker(override: Override) -> dict[str, str]:
 def changed_claim_files(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> dict[str, str | None]:
-    """Return path → new text for each claim at ``keys`` that changed; ``None`` removes a file."""
+    """Return the files of the claims at ``keys`` that changed, as a map from path to new text.
+
+    ``None`` instead of a text means that the file is to be removed.
+    """
     files: dict[str, str | None] = {}
     for key in keys:
         claim = after.get(key)
@@ -124,13 +130,13 @@ def changed_claim_files(
 
 
 def expired_overrides(world: World, now: datetime) -> list[Override]:
-    """Return the overrides in effect whose end has passed, sorted by their end."""
+    """Return the overrides that are in effect although their end has passed, sorted by end."""
     expired = [(one.end, one.name, one) for one in world.overrides if one.end and one.end <= now]
     return [one for _, _, one in sorted(expired, key=lambda item: item[:2])]
 
 
 def changed_override_files(before: World, after: World) -> list[str]:
-    """Return the files of the overrides that took effect, changed or stopped applying."""
+    """Return the paths of the overrides that took effect, changed or no longer apply, sorted."""
     old = {one.name: one for one in before.overrides}
     new = {one.name: one for one in after.overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]

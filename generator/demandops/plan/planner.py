@@ -1,6 +1,6 @@
-"""The planner: :func:`plan` derives from claims the release that a key identifies.
+"""The planner: :func:`plan` returns the release that claims need at a key.
 
-Keys come from :mod:`demandops.plan.release_keys`.
+The keys come from :mod:`demandops.plan.release_keys`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ from demandops.subject import TopicKey
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key`` with the effects of overrides, or ``None`` if it must not run.
+    """Return the release at ``key`` with the effects of overrides.
+
+    Return ``None`` if no claim needs the release, or if an override denies it.
 
     Raises:
         Refused: if claims contradict each other in a parameter, or if the configuration no longer
@@ -47,7 +49,7 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
 
 
 def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
-    """Return a service's release as its demands need it, or ``None`` if no claim needs it.
+    """Return the release of a service as demands need it, or ``None`` if no claim needs it.
 
     The release has neither kept replicas nor the effects of overrides.
 
@@ -60,7 +62,10 @@ def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    """Return the release at ``key`` and the override that denies it; ``None`` if none does."""
+    """Return the release at ``key`` and the override that denies it.
+
+    Return ``None`` if no override denies it, or if no claim needs it.
+    """
     world = without_suspended(world)
     release = _unshaped(world, key)
     by = release_overrides.service_denied_by(release, world) if release else None
@@ -110,14 +115,15 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def _as_claimed(world: World, app: Application) -> Application:
-    """Return an application as its first claim has it: that claim decides appdef and node."""
+    """Return an application as its first claim has it; that claim decides the appdef and nodes."""
     return world.ledger.application(app.id) or app
 
 
 def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
     """Return the requesters of a service instance.
 
-    If the instance runs for certain topics, these are only the requesters that hold such a topic.
+    If the instance runs for certain topics, only the requesters that hold one of these topics are
+    returned.
     """
     if not service.roots:
         return requesters_of(claims)
@@ -132,7 +138,10 @@ def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> t
 def _parts(
     world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
 ) -> Iterator[Application]:
-    """Yield each application with only the inputs that concern one instance of a service."""
+    """Yield each application with only those inputs that the instance at ``key`` depends on.
+
+    Several claims on one application give one application with the inputs of all these claims.
+    """
     by_id: dict[str, list[Application]] = {}
     for app in apps:
         by_id.setdefault(app.id, []).append(app)
@@ -142,7 +151,7 @@ def _parts(
         if shared:
             yield first.with_inputs(shared)
             if len(service.inputs) == 1:
-                return  # one application is enough: the instance reads nothing else
+                return  # one application is enough, because the instance reads only this input
             continue
         roles = service.roots or {role for app in same for role in app.inputs}
         united = {role: {one for app in same for one in app.inputs.get(role, ())} for role in roles}
@@ -161,7 +170,10 @@ def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> In
 def _inputs(
     config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
 ) -> tuple[InputTopic, ...]:
-    """Return the topics that an instance reads in a role, sorted, with their types if known."""
+    """Return the topics that an instance reads in a role, sorted.
+
+    A topic has its message type if a demand names the type.
+    """
     found: set[InputTopic] = set()
     for part in parts:
         origin = _origin(config, key, role, part)
@@ -181,8 +193,8 @@ def demanded_inputs(
 ) -> Iterator[tuple[str, str, TopicKey]]:
     """Yield (role, topic, root) for each topic that a service reads because of an application.
 
-    ``role`` is the service's input that reads the topic. ``root`` is that of
-    :class:`demandops.plan.flows.PublishedTopic`.
+    ``role`` is the input of the service that reads the topic. ``root`` is the key of the demanded
+    topic that it comes from (:class:`demandops.plan.flows.PublishedTopic`).
     """
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
@@ -201,9 +213,9 @@ def demanded_inputs(
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     """Return the release name of a service instance.
 
-    If the instance runs for a topic, the name has the node and the topic's source, as in
-    ``od-edge-vehicle00``. The name also has a slug of the topic, unless the inventory lists the
-    topic as a usual one of the source (``topics``).
+    If the instance runs for a topic, the name contains the node and the topic's source, as in
+    ``od-edge-vehicle00``. The name also contains a slug of the topic, unless the inventory lists
+    the topic as the usual topic of the source (``topics``).
     """
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)
@@ -216,7 +228,10 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
 def _merged_parameters(
     definitions: Mapping[str, Parameter], claims: Iterable[Claim]
 ) -> dict[str, object]:
-    """Return the value of every parameter; the appdef says how several values become one."""
+    """Return the value of every parameter of a service.
+
+    If claims have several values of a parameter, the appdef says how the values are merged.
+    """
     values: dict[str, object] = {}
     claims = [claim for claim in claims if claim.application.parameters]
     for name, parameter in sorted(definitions.items()):
@@ -256,8 +271,8 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             for claim in claims[:3]
         )
         message = (
-            f"demands contradict each other: {shown}; agree, or ask that the application "
-            "definition say how to merge them"
+            f"demands contradict each other: {shown}; demand the same value, or ask that the "
+            "application definition say how to merge the values"
         )
         raise Refused.at(f"parameters.{name}", message, code="conflict")
     return given[0]
@@ -271,15 +286,15 @@ class _ClaimedConnections:
     type: ConnectionType
 
     def at(self, node: str) -> Iterable[str]:
-        """Return the connections that end at a node, sorted."""
+        """Return the ids of the connections that end at a node, sorted."""
         return self.world.ledger.connections_at(self.type, node)
 
     def get(self, id: str) -> Connection | None:
-        """Return a connection, or ``None`` if it is not claimed with this type.
+        """Return the connection with an id, or ``None`` if no claim has it with this type.
 
         Raises:
-            Refused: if a person wrote a claim that the type cannot carry, or removed from the
-                inventory what the connection needs.
+            Refused: if a person wrote a claim that a connection of this type cannot carry, or
+                removed from the inventory what the connection needs.
         """
         first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
         if first is None or first.type is not self.type:
@@ -305,9 +320,10 @@ def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
-    """Return whether the initial deployment already carries a topic between two ends.
+    """Return whether the initial deployment already carries a route between two nodes.
 
-    The initial deployment keeps topic names, so it carries no route that renames the topic.
+    ``bridged`` in the inventory lists what the initial deployment carries. The initial deployment
+    keeps topic names, so it carries no route that renames a topic.
     """
     sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)

@@ -1,4 +1,4 @@
-"""Releases: the plan's result, one for each service instance and communication client."""
+"""Releases: the planner returns one for each service instance and each communication client."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class ServiceKey:
     """The identity of one instance of a service.
 
     ``application`` is set if the service runs once for each application. ``source`` and ``topic``
-    are set if the service runs once for each topic; all applications with this topic share the
-    instance. If neither is set, all applications on the node share the instance. With
-    ``for_cluster``, all applications in the node's cluster share it. ``version`` is set for a
-    separate instance of an application.
+    are set if the service runs once for each topic; then all applications with this topic share the
+    instance. If none of these is set, all applications on the node share the instance or, with
+    ``for_cluster``, all applications in the node's cluster. ``version`` is set if the instance is
+    for a separate instance of an application.
     """
 
     service: str
@@ -41,7 +41,7 @@ class ServiceKey:
 
     @property
     def scope(self) -> Scope:
-        """What this instance is for: a topic, a node, a cluster or an application."""
+        """What the service instance is for: a topic, a node, a cluster or an application."""
         if self.application is not None:
             return "application"
         if self.for_cluster:
@@ -50,7 +50,7 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """This key in the form of the ledger's kept replicas: a tuple of texts."""
+        """The key as a tuple of texts, by which the ledger records kept replicas."""
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
@@ -65,11 +65,11 @@ class ServiceKey:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRelease:
-    """The desired state of one service: one Helm release.
+    """The desired state of one service instance: one Helm release.
 
     ``chart`` is the chart of ``version``, unless an override pins another chart version. ``keeps``
-    is set while the service keeps more replicas than its demands need, and has the time until which
-    it keeps them.
+    is set while the service keeps more replicas than its demands need; it has the time until which
+    the service keeps these replicas.
     """
 
     key: ServiceKey
@@ -99,12 +99,12 @@ class ServiceRelease:
         return self.service.images
 
     def image(self, name: str, config: Config) -> Image:
-        """Return one of the service's images, as its version and overrides pin it."""
+        """Return the image called ``name``, as the service's version and overrides pin it."""
         return self.shaping.image(name, self.version.image(name, config.images[name]))
 
     @property
     def description(self) -> str:
-        """The service's description in commit messages."""
+        """What runs, where and for whom, as commit messages say it."""
         for_whom = self.key.source or self.key.application
         what = f"{self.key.service} {self.key.version}".rstrip()
         return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
@@ -114,7 +114,7 @@ class ServiceRelease:
         return f" until {format_time(self.keeps.until)}" if self.keeps else ""
 
     def facts(self) -> list[str]:
-        """Return the service's properties as lines; commit messages show the changed ones."""
+        """Return the properties of the release as lines; commit messages show changed lines."""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
@@ -129,7 +129,7 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what it decides) for each file entry that shapes the release."""
+        """Yield (file, entry, what the entry decides) for each entry that shapes the release."""
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "its definition"
@@ -152,7 +152,7 @@ Release = ServiceRelease | Client
 
 
 def claims_of(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
-    """Return the claims on the applications or connections that a release is for."""
+    """Return the claims on the applications or connections for which a release runs."""
     if isinstance(release, ServiceRelease):
         return tuple(c for id in release.applications for c in ledger.application_claims(id))
     return tuple(c for id in release.connections for c in ledger.connection_claims(id))

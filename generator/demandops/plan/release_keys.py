@@ -1,7 +1,8 @@
-"""The keys of the releases that claims need, and that a change of claims affects.
+"""The keys of releases: which releases claims need, and which a change of claims affects.
 
-:func:`affected_keys` names the releases that a change of claims may touch, so the cost of a demand
-does not grow with the number of other demands. :mod:`demandops.plan.planner` derives each release.
+Only the releases that :func:`affected_keys` returns are planned again for a demand, so the cost of
+a demand does not grow with the number of other demands. :mod:`demandops.plan.planner` plans the
+release at each key.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ ReleaseKey = ServiceKey | ClientKey
 
 
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that the unsuspended claims on ``subject`` need.
+    """Yield the keys of the releases that the claims on ``subject`` need, without suspended claims.
 
-    If the application's definition is missing, there are no keys. With ``strict``, this raises
-    ``Refused`` instead, because a deleted definition must not stop running services.
+    If the definition of the application is missing, nothing is yielded. With ``strict``, this
+    raises ``Refused`` instead, because a deleted definition must not stop running services.
     """
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
@@ -39,7 +40,7 @@ def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator
 def keys_of_claims(
     world: World, claims: Iterable[Claim], *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that these claims need in ``world``, each once."""
+    """Yield the keys of the releases that ``claims`` need in ``world``, each once."""
     keys = (
         key
         for claim in claims
@@ -102,14 +103,15 @@ def is_needed(world: World, key: ServiceKey) -> bool:
 
 
 def takes(app: Application, service: Service, key: ServiceKey) -> bool:
-    """Return whether an application that has ``service`` needs the instance at ``key``."""
+    """Return whether an application whose appdef has ``service`` needs the instance at ``key``."""
     return not service.roots or bool(roots_of(app, service, key))
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the service of an application that may have the instance ``key``.
+    """Return the service of an application that may have the instance at ``key``.
 
-    Return ``None`` if no service may have it, for example because the application moved.
+    Return ``None`` if no service of the application may have this instance, for example because
+    the application moved to another node.
     """
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}
@@ -126,8 +128,8 @@ def affected_keys(
 ) -> tuple[ReleaseKey, ...]:
     """Return the key of every release that these changes of claims may add, change or remove.
 
-    The cost grows with the number of changed topics. If a change moves or redefines an application
-    or changes its version, the cost grows with the number of all topics of the application.
+    The cost grows with the number of changed topics. If a change moves an application or gives it
+    another appdef or version, the cost grows with the number of all its topics.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.
@@ -147,16 +149,16 @@ def affected_keys(
 def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
     """Return the claim before and the claim after a change, reduced to what differs.
 
-    If only the inputs differ, the inputs that are in both claims are left out of both. Otherwise
-    both claims are whole. Different requesters count only if a service definition or an override
-    depends on the requesters.
+    If the claims differ only in inputs, the inputs that are in both claims are left out of both.
+    Otherwise both claims are returned whole. A difference in requesters counts only if a service
+    definition or an override depends on the requesters.
     """
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
     old, new = before.application, after.application
     same = replace(new, inputs=old.inputs) == old
-    if not same or old.parameters:  # a parameter may have the value of the latest booking
+    if not same or old.parameters:  # a parameter's value may depend on the booking times
         return before, after
     others = (before.requesters, before.partial) != (after.requesters, after.partial)
     if others and _looks_at_requesters(new.appdef, world):
@@ -184,7 +186,7 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
 
 
 def _has_same_place_and_version(before: World, after: World, subject: Subject) -> bool:
-    """Return whether an application has the same node, definition and version in both worlds.
+    """Return whether an application has the same nodes, appdef and version in both worlds.
 
     Return ``True`` for a connection, and for an application that only one world has.
     """

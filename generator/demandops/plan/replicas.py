@@ -1,4 +1,4 @@
-"""The number of replicas of a service, which its definition derives from the demands."""
+"""The number of replicas of a service; the service's definition derives it from the demands."""
 
 from __future__ import annotations
 
@@ -73,23 +73,23 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return how many replicas a service has, and the step that keeps some of them, or ``None``.
+    """Return how many replicas a service has, and the step because of which it keeps some of them.
 
-    A service may keep replicas for a while (``scaling.downAfter``). ``steps`` say how many, and how
-    long (:mod:`demandops.ledger.kept_replicas`). A step that keeps no more replicas than the
-    demands need has no effect.
+    A service may keep replicas for a while (``scaling.downAfter``). ``steps`` say how many replicas
+    the service keeps, and how long (:mod:`demandops.ledger.kept_replicas`). If the service keeps no
+    more replicas than its demands need, ``None`` is returned instead of a step.
     """
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None
-    kept = min(steps[0].replicas, scaling.most)  # the definition may have a lower limit by now
+    kept = min(steps[0].replicas, scaling.most)  # a person may have lowered the limit meanwhile
     return (kept, steps[0]) if kept > needed else (needed, None)
 
 
 def overridden(replicas: int | Autoscaler, by: int) -> int | Autoscaler:
-    """Return the replicas that an override sets; an autoscaler gets ``by`` as both bounds."""
+    """Return the replicas after an override sets ``by``; an autoscaler gets it as both bounds."""
     return Autoscaler(by, by, replicas.targets) if isinstance(replicas, Autoscaler) else by
 
 
 def most_replicas(replicas: int | Autoscaler) -> int:
-    """Return the number of replicas, or the highest that an autoscaler may choose."""
+    """Return the number of replicas, or the highest number that an autoscaler may choose."""
     return replicas.max if isinstance(replicas, Autoscaler) else replicas

@@ -1,9 +1,9 @@
-"""The version of an application that is deployed: the newest that its claims ask for.
+"""The version of an application that is deployed: the newest version that its claims ask for.
 
 A claim on an application asks for a named version, or for the default version. A service that
-several applications share has the newest version of these applications. So the order of the claims
-does not matter. :mod:`demandops.plan.checks.version_difference` decides whether a demand may ask
-for another version than the existing demands.
+several applications share has the newest of the versions of these applications. So the order of
+the claims does not matter. :mod:`demandops.plan.checks.version_difference` decides whether a demand
+may ask for another version than the existing demands.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ def running_version(world: World, application: str) -> ApplicationVersion | None
 def newest_asked(
     ledger: Ledger, application: str, known: Mapping[str, ApplicationVersion]
 ) -> ApplicationVersion:
-    """Return the newest of the ``known`` versions that claims on an application ask for."""
+    """Return the newest of the ``known`` versions that claims on an application ask for.
+
+    If no claim asks for a version, return the default version.
+    """
     asked = ledger.versions_asked(application, known)
     return max((known[word] for word in asked or ("",)), key=lambda version: version.rank)
 
@@ -44,9 +47,9 @@ def same_version(one: ApplicationVersion | None, other: ApplicationVersion | Non
 def version_of_service(
     world: World, service: Service, applications: Iterable[str]
 ) -> ApplicationVersion:
-    """Return the version of a service for the applications that share it.
+    """Return the version in which a service runs for the applications that share it.
 
-    If the applications have several appdefs, the one with the newest chart decides.
+    If the applications have several appdefs, the appdef with the newest chart decides.
 
     Raises:
         Refused: if two appdefs have the same chart version, but different images.
@@ -64,14 +67,14 @@ def version_of_service(
             file = world.config.file_of(CHARTS_FILE, service.chart)
             message = (
                 f"application definitions '{best.appdef}' and '{other.appdef}' share "
-                f"{service.chart} {own[0]}, but pin different images; pin the same, or give each "
-                f"another version of the chart in {file}"
+                f"{service.chart} {own[0]}, but pin different images; pin the same images, or "
+                f"another version of the chart for one of them in {file}"
             )
             raise Refused.at("version", message, code="conflict")
     return best
 
 
 def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
-    """Return what a version fixes for a service: the chart's version and the images' pins."""
+    """Return what a version pins for a service: the version of the chart, and the images."""
     pins = (version.images.get(name) for name in service.images)
     return version.charts[service.chart].version, *pins

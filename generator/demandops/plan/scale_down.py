@@ -2,7 +2,7 @@
 
 If demands need fewer replicas than before, the decision records how many replicas the service
 keeps, and until when (:mod:`demandops.ledger.kept_replicas`). When that time is over, the generator
-publishes a commit that removes the record.
+publishes a commit that removes these replicas from the record.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from demandops.plan.release_keys import ReleaseKey
 def with_kept_replicas(
     before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
 ) -> tuple[Ledger, tuple[Instance, ...]]:
-    """Return the ledger with updated kept replicas, and the instances whose kept replicas changed.
+    """Return the ledger with its kept replicas updated, and the instances for which they changed.
 
     Args:
         before, after: the world before and after the demand.
-        keys: the releases that the demand may change.
+        keys: the keys of the releases that the demand may change.
         now: when the demand was received.
 
     Raises:
@@ -54,7 +54,7 @@ def _steps(before: World, after: World, key: ServiceKey, known: Steps, now: date
         return ()
     try:
         old = without_kept(before, key)
-    except Refused:  # the former release can no longer be planned
+    except Refused:  # the release before the demand can no longer be planned
         old = None
     return extended(known, _number(release), _number(old), now, now + kept_for)
 
@@ -64,7 +64,7 @@ def _number(release: ServiceRelease | None) -> int:
 
 
 def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    """Return the ledger without the ended steps of a service instance's kept replicas."""
+    """Return the ledger without those kept replicas of a service instance whose time has ended."""
     kept = world.ledger.kept
     left = tuple(one for one in kept.steps.get(instance) or () if one.until > now)
     return replace(world.ledger, kept=kept.replace(instance, left))

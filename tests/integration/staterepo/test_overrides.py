@@ -208,7 +208,8 @@ def test_a_denied_requester_is_refused_and_its_claims_suspended_until_the_overri
         (
             "denied",
             "apps[0].object_detection_fusion_app.requester_ids[1]: is denied by "
-            "overrides/closed.yaml: a field test; ask its owner, petra, or leave it out",
+            "overrides/closed.yaml: a field test; ask the override's owner, petra, or demand "
+            "something else",
         )
     ]
     (renewed,) = rig.book(generator, rig.goal(1))

@@ -107,8 +107,8 @@ def warned(files: dict[str, str]) -> list[str]:
 
 SHARED = (
     f"{DOMAINS}: access domains 'city' and 'fleet' share ROS domain 0 on the host's network of "
-    "cluster 'c-its', where each may read and write the other's topics; give each its own "
-    "ros.domainId"
+    "cluster 'c-its', so each may read and write the topics of the others; give each access domain "
+    "its own ros.domainId"
 )
 CLOSED = (
     f"{DOMAINS}: network: namespace of access domain 'fleet' has no effect on pods with the "
@@ -125,7 +125,7 @@ def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     told = policy_warnings.warnings(State.of(config, books.state.ledger))
     assert list(map(str, told)) == [
         f"{DOMAINS}: no rule of access domain 'fleet' has 'city' in its peers; the existing "
-        "connections between them (1) stay, but cannot be demanded again"
+        "connections between the two domains (1) stay, but cannot be demanded again"
     ]
 
 

@@ -150,9 +150,9 @@ def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
         "{{- if .Values.agent }}\napiVersion: apps/v1\nkind: DaemonSet # on each node\n{{- end }}\n"
     )
     assert warned({template: text}) == [
-        f"{template}:3: DaemonSet is not among the kinds of access domain 'perception', "
-        f"whose cluster refuses it if the chart renders it; add it to kinds in {DOMAINS}, or leave "
-        "it out"
+        f"{template}:3: DaemonSet is not among the kinds of access domain 'perception', so the "
+        "cluster refuses such an object if the chart renders one; add DaemonSet to kinds in "
+        f"{DOMAINS}, or remove it from the chart"
     ]
     (told,) = warned({template: text})
     assert told.replace(CHART, "appdefs/agent/charts/agent") in PAGE
@@ -190,10 +190,10 @@ def test_what_cannot_be_known_is_said() -> None:
     }
     assert warned(files) == [
         f"{CHART}/Chart.yaml: dependencies[0]: 'redis' is not unpacked in charts/, so its kinds "
-        "are not known; check yourself that its access domain allows them",
+        "are not known; check yourself that the access domain allows them",
         f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among the kinds of access "
-        "domain 'perception', whose cluster refuses it if the chart renders it; add it to kinds "
-        f"in {DOMAINS}, or leave it out",
+        "domain 'perception', so the cluster refuses such an object if the chart renders one; add "
+        f"CustomResourceDefinition to kinds in {DOMAINS}, or remove it from the chart",
         f"{CHART}/templates/any.yaml:1: kind '{{{{ .Values.kind }}}}' is computed; "
-        "check yourself that its access domain allows it",
+        "check yourself that the access domain allows it",
     ]

@@ -163,7 +163,7 @@ class TestThroughTheWire:
         books = MemoryRepo(state=state(vehicle00={"bridged": {"edge": ["/a"]}}))
         decision = books.send(goal([], [connection("c", topics=["/a", "/b"])]))
         assert decision.warnings == (
-            "connection 'c': /a is bridged between 'vehicle00' and 'edge' already, so no client "
-            "carries it",
+            "connection 'c': the initial deployment already carries /a between 'vehicle00' and "
+            "'edge' (bridged in the inventory), so no client of this connection carries it",
         )
         assert len(decision.releases) == 2

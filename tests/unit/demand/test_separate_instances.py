@@ -148,8 +148,8 @@ def test_one_topic_for_both_is_refused() -> None:
         if name == "a":
             repo.send(made)
     assert repo.faults(made) == [
-        "applications[0].deliver[0].topic: /it of 'vehicle01' is made from "
-        "/edge_a_global_objectlist already; choose another topic"
+        "applications[0].deliver[0].topic: /it on 'vehicle01' already carries "
+        "/edge_a_global_objectlist; choose another topic for this delivery"
     ]
 
 

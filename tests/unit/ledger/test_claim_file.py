@@ -80,7 +80,7 @@ values = st.recursive(
 
 
 def by_place(found: list[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return the topics as a claim has them: each topic of a source once, sorted."""
+    """Return topics in the form of a claim: sorted, and each topic of a source only once."""
     return tuple(sorted({(item.topic, item.source): item for item in found}.values()))
 
 
@@ -127,7 +127,7 @@ claims = st.builds(
 
 @st.composite
 def joined_claims(draw: st.DrawFn) -> Claim:
-    """Return a claim of a `DeploymentRequest`; some of its requesters hold each topic."""
+    """Return a claim of a `DeploymentRequest`; each topic is held by some of its requesters."""
     claim = replace(draw(claims), joined=True)
     some = st.sets(st.sampled_from(claim.requesters), min_size=1)
     holders = {topic: tuple(sorted(draw(some))) for topic in claim.held.topic_keys()}
@@ -142,7 +142,7 @@ def test_every_claim_survives_its_file(claim: Claim) -> None:
     read = claim_file.read(text.encode().decode(), path)
 
     assert read == claim
-    if claim.is_on_application:  # 1, 1.0 and True are equal
+    if claim.is_on_application:  # 1, 1.0 and True are equal in Python, so compare their texts
         parameters = (sorted(held.application.parameters.items()) for held in (read, claim))
         assert len(set(map(repr, parameters))) == 1
     assert claim_file.text_of(read) == text
@@ -186,7 +186,7 @@ def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
 
 
 def written(claim: Claim, *changes: tuple[str, str]) -> Claim:
-    """Return the claim that its file gives after a person has replaced texts in the file."""
+    """Return the claim that is read from a claim's file after a person replaced texts in it."""
     text = claim_file.text_of(claim)
     for old, new in changes:
         assert old in text
@@ -247,5 +247,6 @@ def test_a_topic_names_requesters_of_the_claim_only() -> None:
         (found,) = error.value.faults
         assert found.field == place
         assert found.message == (
-            "x is not among the requesters of the claim; add it there, or remove it here"
+            "x is not among the requesters of the claim; add this name to the claim's requesters, "
+            "or remove the name from this topic"
         )

@@ -1,6 +1,6 @@
-"""Demands are put, renewed, released or expire, in any order and with restarts.
+"""Demands are put, renewed and released, and expire, in any order and with restarts.
 
-Each result must be possible in ``tests/model/leases.py``, a model of the promises that leases make.
+``tests/model/leases.py``, a model of the promises that leases make, must allow each result.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 
 def restart(world: running.World, random: Random) -> None:
-    """Restart the generator with a ledger that is read from the files in random order."""
+    """Restart the generator with the ledger that the files give if read in random order."""
     files = random.sample(sorted(world.files.items()), len(world.files))
     ledger = ledger_in(dict(files))
     assert ledger == world.state.ledger
@@ -46,7 +46,7 @@ def restart(world: running.World, random: Random) -> None:
 
 
 def assert_released(world: running.World, promises: Promises, now: int) -> None:
-    """Release the expired demands; check that this was due, and that no due demand is left."""
+    """Release the expired demands; check that these are all that must go, and only such as may."""
     before = set(claims_of(world.state.ledger))
     demands = world.look()
     assert len(demands) == len(set(demands))
@@ -68,7 +68,7 @@ def assert_outcome(taken: Any, expected: str, promises: Promises) -> None:
 
 
 def assert_recorded(world: running.World, promises: Promises) -> None:
-    """Check that each recorded end is not later than promised, and at most the slack earlier."""
+    """Check that each recorded end is not later than promised, and earlier by the slack at most."""
     for claim in world.state.ledger:
         demand, subject = name_of(claim)
         promised = promises.held[demand][subject].promised
@@ -112,7 +112,7 @@ def leave_all(world: running.World, promises: Promises, now: int) -> None:
     assert_released(world, promises, now + 2 * 3600)
     for claim in list(world.state.ledger):
         if world.state.ledger.get(claim.key) is None:
-            continue  # gone with another claim of its demand
+            continue  # released already, with another claim of the same demand
         release = {"kind": "Demand", "operation": "release", "demand": claim.demand}
         world.take(release | {"requesters": list(claim.requesters)})
     assert replace(world.state.ledger, shutdowns=RecentShutdowns()) == Ledger()

@@ -26,7 +26,7 @@ ROS_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 LONGEST_NAME, LONGEST_TOPIC = 53, 247
 
 Subject = tuple[str, ...]
-"""The subject of a name: a prefix, and the ids from which the name is made."""
+"""What a name is made from: a prefix, and ids or topics."""
 
 close = st.text("ab0-_/.A", min_size=1, max_size=5)
 words = st.sampled_from(["edge", "vehicle00", "vehicle_00", "vehicle/00", "Vehicle00", "a", "b"])
@@ -58,7 +58,7 @@ subjects: st.SearchStrategy[Subject] = st.one_of(
 
 
 def rivals(subject: Subject, name: str) -> Iterator[Subject]:
-    """Yield other subjects whose ids, simply joined, would give ``name`` or a similar name."""
+    """Yield other subjects that get ``name``, or a similar name, if ids are simply joined."""
     prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
     yield ("of", rest)
     yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")
@@ -98,7 +98,7 @@ def test_different_subjects_have_different_names_that_kubernetes_takes(
     drawn: list[Subject],
 ) -> None:
     found = set(drawn)
-    for _ in range(2):  # a second time with the rivals of rivals
+    for _ in range(2):  # the second round adds the rivals of rivals
         found |= {
             rival for subject in list(found) for rival in rivals(subject, kubernetes_name(subject))
         }
@@ -118,7 +118,7 @@ def topic_instance(subject: Subject) -> str:
 
 
 def as_the_reference(id: str) -> str:
-    """Return an id in the form that the reference uses in topics (application_manager/utils.py)."""
+    """Return an id as the reference writes it in topics (application_manager/utils.py)."""
     return id.replace("-", "_").replace("/", "_")
 
 
@@ -207,7 +207,7 @@ def usual_cloud(nodes: list[str], node: str) -> str:
 
 
 def with_nodes(nodes: list[str]) -> MemoryRepo:
-    """Return a new repo whose inventory also has nodes with these ids, be they valid or not."""
+    """Return a new repo whose inventory also has nodes with these ids, even if not valid as ids."""
     repo = MemoryRepo()
     config = repo.state.config
     (domain,) = config.domains.values()
@@ -231,5 +231,5 @@ def with_nodes(nodes: list[str]) -> MemoryRepo:
 
 
 def quoted(text: str) -> str:
-    """Return a text in quotes, as the templates write it."""
+    """Return a text in quotes, in the way in which the templates quote it."""
     return json.dumps(text, ensure_ascii=False)

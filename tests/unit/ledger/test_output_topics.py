@@ -30,7 +30,7 @@ def join(*clouds: Topic, who: str = "vehicle01", id: str = APP, shutdown: bool =
 
 
 def published(repo: MemoryRepo) -> dict[str, str]:
-    """Return the topic of each detection's object list, by the topic of its point cloud."""
+    """Return the topic of the object list of each detection, by the topic of its point cloud."""
     values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
     detections = [one["detection"] for one in values if "detection" in one]
     return {one["pointCloudTopic"]: one["objectListTopic"] for one in detections}
@@ -114,8 +114,9 @@ def test_an_application_whose_topics_another_publishes_is_refused() -> None:
     repo = MemoryRepo()
     repo.send(join(CLOUD, id="edge/fusion-1"))
     assert repo.faults(join(CLOUD, id="edge-fusion/1")) == [
-        "apps[0].header.id: its output fused_objects is /edge_fusion_1_global_objectlist, "
-        "which application 'edge/fusion-1' publishes on 'edge' already; use another application id"
+        "apps[0].header.id: output fused_objects of object-fusion is "
+        "/edge_fusion_1_global_objectlist, which application 'edge/fusion-1' publishes on 'edge' "
+        "already; use another application id"
     ]
     repo.send(goal([application("edge-fusion/1", node="cloud")]))
 
@@ -124,9 +125,10 @@ def test_a_source_whose_topic_another_publishes_is_refused() -> None:
     repo = with_nodes({"id": "robo-1"}, {"id": "robo/1", "selector": {"a": "b"}})
     repo.send(join(("/a", "robo-1")))
     assert repo.faults(join(("/b", "robo/1"), id="edge/other")) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
-        "object_list is /robo_1_local_objectlist, which object-detection for /a of 'robo-1' "
-        "publishes on 'edge' already; give 'robo/1' another id in inventory/nodes.yaml"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
+        "object_list of object-detection is /robo_1_local_objectlist, which object-detection for "
+        "/a of 'robo-1' publishes on 'edge' already; give 'robo/1' another id in "
+        "inventory/nodes.yaml"
     ]
 
 
@@ -138,10 +140,10 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
     repo.state = replace(repo.state, ledger=rebuilt(claims))
     repo.send(goal([application("cloud/x", node="cloud", clouds=[FRONT])]))
     assert repo.faults(goal([application("cloud/y", node="cloud", clouds=[REAR])])) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
-        "object_list is /vehicle01_local_objectlist, which object-detection for /front/points of "
-        "'vehicle01' publishes on 'cloud' already; name the usual one of the two as "
-        "topics.point_cloud of 'vehicle01' in inventory/nodes.yaml"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
+        "object_list of object-detection is /vehicle01_local_objectlist, which object-detection "
+        "for /front/points of 'vehicle01' publishes on 'cloud' already; list the usual topic of "
+        "the two in topics.point_cloud of 'vehicle01' in inventory/nodes.yaml"
     ]
 
 
@@ -158,8 +160,8 @@ def test_an_application_whose_topic_a_connection_brings_is_refused(at_once: bool
     else:
         repo.send(link)
     assert repo.faults(app) == [
-        "apps[0].header.id: its output fused_objects is /edge_1_global_objectlist, which "
-        "connection 'link' brings to 'edge' already; use another application id"
+        "apps[0].header.id: output fused_objects of object-fusion is /edge_1_global_objectlist, "
+        "which connection 'link' brings to 'edge' already; use another application id"
     ]
 
 
@@ -167,9 +169,9 @@ def test_a_source_whose_topic_a_connection_brings_is_refused() -> None:
     repo = MemoryRepo()
     repo.send(bringing(PLAIN))
     assert repo.faults(join(FRONT)) == [
-        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: its output "
-        f"object_list is {PLAIN}, which connection 'link' brings to 'edge' already; let the "
-        "connection give it another name there"
+        "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
+        f"object_list of object-detection is {PLAIN}, which connection 'link' brings to 'edge' "
+        "already; let the connection bring the topic under another name"
     ]
     repo.send(join(REAR, FRONT, shutdown=False) | {"apps": [application(node="cloud")]})
 
@@ -182,7 +184,8 @@ def test_a_connection_that_brings_what_a_service_publishes_is_refused(
     repo.send(join(FRONT, REAR))
     clash = (
         f"connection 'link' brings {topic} to 'edge', where object-detection for {cloud[0]} of "
-        "'vehicle01' publishes it already; use a connection that gives it another name there"
+        "'vehicle01' already publishes this topic; use a connection that brings the topic under "
+        "another name"
     )
     assert repo.faults(bringing(topic)) == [f"connections[0].target_topics[0]: {clash}"]
     repo.send(bringing(topic, ends=("edge", "vehicle00")))
@@ -195,7 +198,7 @@ def test_a_connection_that_brings_what_a_service_publishes_is_refused(
 
 
 def claims_after(*goals: Any) -> list[Claim]:
-    """Return the claims of all goals, each decided in a new repo."""
+    """Return the claims that the goals get, if each goal is decided in a new repo."""
     repos = [MemoryRepo() for _ in goals]
     for repo, one in zip(repos, goals, strict=True):
         repo.send(one)
@@ -223,11 +226,12 @@ def test_a_claim_that_a_person_writes_or_restores_must_not_bring_a_topic_twice()
     refusal = here.take(Restoration("rollback", claims=tuple(both.ledger)))
     assert sorted(str(refusal).splitlines()) == sorted(found)
     assert found == [
-        f"{path_of(app.key)}: id: its output fused_objects is /edge_fusion_1_global_objectlist, "
-        "which application 'edge/fusion-1' publishes on 'edge' already; use another application id",
+        f"{path_of(app.key)}: id: output fused_objects of object-fusion is "
+        "/edge_fusion_1_global_objectlist, which application 'edge/fusion-1' publishes on 'edge' "
+        "already; use another application id",
         f"{path_of(link.key)}: topics[0].target: connection 'link' brings "
         "/edge_fusion_1_global_trajectories to 'edge', where application 'edge/fusion-1' "
-        "publishes it already; use a connection that gives it another name there",
+        "already publishes this topic; use a connection that brings the topic under another name",
     ]
 
 

@@ -1,7 +1,7 @@
-"""Properties of the ledger and of the rendered files after any requests in any order.
+"""Properties that the ledger and the rendered files have after any requests in any order.
 
-The model in ``tests/model`` follows the design and uses no code of the program. Program and model
-take the same requests.
+Program and model take the same requests. The model in ``tests/model`` follows the design and uses
+no code of the program.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ Key = tuple[tuple[str, str], str]
 
 
 def key_of(subject: tuple[str, str], demand: Demand) -> Key:
-    """Return the key of the program's claim that corresponds to a claim of the model."""
+    """Return the key that the program's claim must have for a claim of the model."""
     return subject, demand_id(*demand)
 
 
 def key_in(key: ClaimKey) -> Key:
-    """Return the key of a program's claim in the form that `key_of` gives."""
+    """Return the key of a claim of the program, in the form of `key_of`."""
     return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
 
 
@@ -64,7 +64,7 @@ class Walk:
                 self._assert_counts_once(request)
 
     def assert_rendered_from_the_files(self) -> None:
-        """Check that the claims' files alone render the files that the steps have written."""
+        """Check that the ledger's files alone give the rendered files that the requests gave."""
         fresh = replace(self._repo.state, ledger=ledger_in(self._repo.files))
         assert fresh.ledger == self._repo.state.ledger
         at_once = rendered_files(fresh)
@@ -85,7 +85,7 @@ class Walk:
 
 
 def assert_changes(taken: Decision, expected: Result) -> None:
-    """Check that exactly the touched claims are written, and that each hold not found is named."""
+    """Check that exactly the touched claims are written, and that each missing hold is named."""
     changed = {key_in(change.key) for change in taken.changes.claims}
     assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
@@ -99,7 +99,7 @@ def assert_changes(taken: Decision, expected: Result) -> None:
 
 
 def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
-    """Return whether a text names a subject and a requester, with this topic or with none."""
+    """Return whether a text names a subject and a requester, with the topic or without a topic."""
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
     named = ": " not in text or f": {words} " in text
     return named and f"'{subject}'" in text and text.endswith(f" for {who}")
@@ -215,7 +215,7 @@ def test_the_order_of_independent_demands_does_not_matter(random: Random, count:
     one_order = told([*joins, *leaves, *(maker.join() for _ in range(count))])
     other_order: list[Goal] = []
     waiting = random.sample(one_order, len(one_order))
-    while waiting:  # a leave comes after its join
+    while waiting:  # a shutdown must come after its join
         here = {request["id"] for request in other_order}
         ready = [r for r in waiting if not r["shutdown"] or r["id"] in here]
         other_order.append(ready[0])

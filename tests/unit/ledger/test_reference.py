@@ -40,9 +40,9 @@ def resource(kind: str, *ids: str) -> str:
 
 
 def counted(ledger: Ledger) -> Books:
-    """Return the requesters of each resource, each as often as it has a hold there.
+    """Return the requesters of each resource of the reference, as :meth:`Operators.books` does.
 
-    The form is that of :attr:`Reference.books`.
+    A requester is listed once for each of its holds on the resource.
     """
     books = defaultdict[str, list[str]](list)
     for claim in ledger:
@@ -62,7 +62,8 @@ def counted(ledger: Ledger) -> Books:
 def running(repo: MemoryRepo) -> Books:
     """Return the topics of each service and connection, by the name of the reference's resource.
 
-    The reference has one detection for all clouds of a source, so their topics are together.
+    The reference has one detection for all clouds of a source, so the topics of these clouds are
+    listed together.
     """
     runs, books = defaultdict[str, set[str]](set), repo.bookkeeping()
     for service in books["services"].values():
@@ -78,10 +79,10 @@ def running(repo: MemoryRepo) -> Books:
 
 
 class Recorded:
-    """A table of the recorded run: the books, or what runs.
+    """One table of the recorded run: the books (``books``), or what runs (``runs``).
 
-    ``there`` is the table in the reference after a step, ``here`` the one that DemandOps must have.
-    The record of a step lists only what changed in ``there``, and what differs in ``here``.
+    ``there`` is the table of the reference after a step. ``here`` is the table that DemandOps must
+    have. The record of a step lists only what changed in ``there``, and what differs in ``here``.
     """
 
     def __init__(self, name: str) -> None:
@@ -169,7 +170,7 @@ def test_what_none_of_the_differences_affects_is_counted_as_by_the_operators() -
         random, ledger, operators = Random(seed), Ledger(), Operators()
         now = datetime(2026, 1, 31, tzinfo=timezone.utc)
         for _ in range(60):
-            now += REMEMBERED + timedelta(minutes=2)  # so no join counts as late
+            now += REMEMBERED + timedelta(minutes=2)  # so no shutdown counts as a repeat
             asked = made(random)
             request, faults = deployment_request_goal.parse(asked, appdef)
             assert request is not None

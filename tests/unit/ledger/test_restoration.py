@@ -1,4 +1,4 @@
-"""A rollback to an earlier ledger: what it books, what it releases, and what it refuses."""
+"""A rollback to an earlier ledger: which claims it books and releases, and when it is refused."""
 
 from __future__ import annotations
 
@@ -77,9 +77,7 @@ def test_a_rollback_past_newer_claims_is_refused_and_lists_them() -> None:
         f"would drop the claim of {who} on {newer.subject}, booked "
         f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC (request '{newer.request}')"
     )
-    assert told.value.faults[1].message == (
-        "newer claims stay; use --drop-newer to undo them as well"
-    )
+    assert told.value.faults[1].message == "newer claims are undone only with --drop-newer"
 
 
 def test_a_claim_changed_since_counts_as_newer() -> None:

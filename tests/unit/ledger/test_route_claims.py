@@ -1,4 +1,4 @@
-"""Routes in claims: their form in files, contradictions between claims, and the linked nodes."""
+"""Routes in claims: their form in files, contradictions, and the nodes that connections link."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def refusal(ledger: Ledger, *routes: Route, who: str = "w") -> list[str]:
 
 
 class TestFiles:
-    """In a claim's file, a route without options is one line; any other lists only its options."""
+    """In a claim's file, a route without options is one line. Other routes list their options."""
 
     def test_topics_stay_readable(self) -> None:
         held = claim(Route("/b", "/c", qos=1, rate=0.5), Route("/a", "/b"))
@@ -104,7 +104,8 @@ class TestContradictions:
         ledger = joined(Ledger(), Route("/a", "/b", **{option: value}))
         assert refusal(ledger, Route("/a", "/b")) == [
             f"connections[0].topics[0].{option}: {option} {asked} of '/a' contradicts an existing "
-            f"claim: 'c' is held by v with {option} {stands}; use the same, or a second connection"
+            f"claim: 'c' is held by v with {option} {stands}; use the same {option}, or a second "
+            "connection"
         ]
         assert joined(ledger, Route("/a", "/b", **{option: value}), who="w") != ledger
 
@@ -120,8 +121,9 @@ class TestContradictions:
     def test_a_topic_that_somebody_has_carried_back_to_another(self) -> None:
         ledger = joined(Ledger(), Route("/a", "/x", reverse=True))
         assert refusal(ledger, Route("/b", "/x", reverse=True)) == [
-            "connections[0].topics[0].target: '/x' is carried back to '/a' already: 'c' is held by "
-            "v; one topic goes to one place, so use a second connection"
+            "connections[0].topics[0].target: '/x' is already carried back to '/a': connection 'c' "
+            "is held by v; a connection carries a topic back to only one topic, so use a second "
+            "connection"
         ]
         assert joined(ledger, Route("/b", "/x"), who="w")
 

@@ -1,4 +1,4 @@
-"""A traced plan follows the changes of the ledger and always equals a plan that is made anew."""
+"""A traced plan follows the changes of the ledger, and always equals a plan from scratch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def afresh(world: World) -> dict[ReleaseKey, Release]:
 
 
 class Following:
-    """The releases as somebody knows them who gets only the changes from a traced plan."""
+    """The releases that result from applying the changes that a traced plan returns."""
 
     def __init__(self, config: Config) -> None:
         self._plan = TracedPlan(config)
@@ -46,7 +46,7 @@ class Following:
 @examples(20)
 @given(chances, st.integers(1, 20))
 def test_a_plan_traced_through_changes_equals_a_fresh_plan(random: Random, length: int) -> None:
-    """The traced plan gets the changes one at a time, or several at once."""
+    """The traced plan gets the changes of one request, or of several requests at once."""
     repo = MemoryRepo()
     following = Following(repo.state.config)
     changes: list[ClaimChange] = []

@@ -173,8 +173,8 @@ def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
 ) -> None:
     books = _one(select=[select], deny=True, expires="2090-01-01T00:00:00Z")
     assert books.faults(goal([application()], [connection()])) == [
-        f"{field}: is denied by overrides/tested.yaml until 2090-01-01T00:00:00Z: why; ask its "
-        "owner, petra, or leave it out"
+        f"{field}: is denied by overrides/tested.yaml until 2090-01-01T00:00:00Z: why; ask the "
+        "override's owner, petra, or demand something else"
         for field in fields
     ]
 

@@ -1,4 +1,4 @@
-"""Resource requests are counted from changes alone, and never exceed a node's capacity."""
+"""What services request is counted from changes alone, and never exceeds a node's capacity."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from tests.scenarios.running import configuration
 
 VEHICLES = ("vehicle00", "vehicle01")
 CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
-"""The cpu capacity of some nodes; other nodes have no limit."""
+"""The capacity of some nodes, in cpus; other nodes have no limit."""
 
 
 @cache
 def recorders() -> State:
-    """Return a state in which each replica of a recorder, and each driver, requests 1 cpu."""
+    """Return a state in which a driver requests 1 cpu, and so does each replica of a recorder."""
     nodes = [
         {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
         | ({"capacity": {"cpu": CAPACITY[id]}} if id in CAPACITY else {})
@@ -51,7 +51,7 @@ def recorders() -> State:
 
 
 def recorder(random: Random) -> dict[str, Any]:
-    """Return a random recorder application; it has one replica for every two topics."""
+    """Return a random recorder application with one replica for every two topics."""
     known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
     topics = random.sample(known, random.randint(1, 5))
     where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))
@@ -72,7 +72,7 @@ def goal(random: Random) -> dict[str, Any]:
 
 
 def used(repo: MemoryRepo) -> Counter[str]:
-    """Return the cpu that the services in the bookkeeping request, by node."""
+    """Return how many cpus the services in the bookkeeping request, by node."""
     found: Counter[str] = Counter()
     for entry in repo.books()["services"].values():
         topics = sum(map(len, entry["inputs"].values()))

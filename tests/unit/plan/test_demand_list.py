@@ -1,4 +1,4 @@
-"""The list of demands has the booked and the waiting ones, oldest first."""
+"""The list of demands has the booked demands and the waiting demands, the oldest first."""
 
 from __future__ import annotations
 

@@ -34,12 +34,12 @@ CLUSTER_NODE = "cloud"
 
 
 class Origin(NamedTuple):
-    """An input that a service can read: a role of the application, or a service's output.
+    """What a service can read: the topics of an input role, or the output of a service.
 
-    ``kind`` is ``source`` if the topic is made at the source of another topic, ``topic`` if it is
-    made for each topic at the node of an application, and ``once`` if an application, a node or a
-    cluster has only one. ``roots`` are the roles from which the topic is made; it is empty if
-    ``kind`` is ``once``.
+    ``kind`` says where the topics are made: ``source`` means at their sources, ``topic`` means one
+    for each input topic at the node of an application, and ``once`` means a single topic for an
+    application, a node or a cluster. ``roots`` are the roles from which the topics are made. It is
+    empty if ``kind`` is ``once``.
     """
 
     name: str
@@ -55,7 +55,8 @@ class Graphs:
     ) -> None:
         """Make the definitions; some services get the fields of ``place``.
 
-        Only services for an application get them; with ``each`` also services for each topic.
+        Only services for an application get these fields or, with ``each``, also services for a
+        topic.
         """
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
@@ -93,7 +94,7 @@ class Graphs:
     def _readable(
         self, origins: list[Origin], scope: str, at_source: bool, root: str
     ) -> list[Origin]:
-        """Return the origins that a service may read besides its first one."""
+        """Return the origins that a service may read in addition to its first origin."""
         apart = at_source or scope == "cluster"
         found = [one for one in origins if not (apart and one.kind == "topic")]
         if scope == "topic":
@@ -109,9 +110,9 @@ class Graphs:
         return Origin(f"{name}.out", frozenset(roots if kind != "once" else ()), kind)
 
     def _add(self, type: str, name: str, scope: str, at_source: bool, read: list[Origin]) -> Origin:
-        """Add a service to a type; return its output as an origin.
+        """Add a service to a type of application; return the service's output as an origin.
 
-        A service for each topic has instances for the topics of the first origin that it reads.
+        A service for a topic has one instance for each topic of the first origin that it reads.
         """
         if scope == "topic":
             roots = {self._root(type, read[0])}
@@ -127,7 +128,7 @@ class Graphs:
         return next(iter(self.services[type][name]["roots"])) if "." in origin.name else origin.name
 
     def _each(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
-        """Return a random origin that can be the first one of a service for each topic."""
+        """Return a random origin that can be the first origin of a service for a topic."""
 
         def is_for_each(one: Origin) -> bool:
             service = self.services[type].get(one.name.partition(".")[0])
@@ -205,7 +206,7 @@ class Demands:
         return head | {"applications": self.held[demand]}
 
     def others(self, goal: dict[str, Any]) -> set[str]:
-        """Return the ids of all applications that are held by other demands."""
+        """Return the ids of all applications that demands other than ``goal`` hold."""
         others = (apps for demand, apps in self.held.items() if demand != goal["demand"])
         return {app["id"] for apps in others for app in apps}
 
@@ -219,7 +220,7 @@ class Demands:
         return app | {"deliver": self._deliveries(self.types[id])}
 
     def _deliveries(self, type: str) -> list[dict[str, Any]]:
-        """Return no delivery, or one of an output that no other node makes under the same name."""
+        """Return no delivery, or one whose output no other node makes under the same name."""
         services = self.graphs.services[type].items()
         names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
         chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
@@ -229,9 +230,9 @@ class Demands:
 def instances(
     graphs: Graphs, app: dict[str, Any], moved: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[ServiceKey]:
-    """Yield the services that must run for an application of a demand.
+    """Yield the keys of the services that must run for an application of a demand.
 
-    ``moved`` has the nodes of services that do not run on the application's node.
+    ``moved`` maps each service that does not run on the application's node to its node.
     """
     for name, service in graphs.services[app["type"]].items():
         own = moved.get(name, app["node"])
@@ -253,9 +254,9 @@ def instances(
 def delivered(
     repo: MemoryRepo, demands: Demands, services: list[ServiceRelease]
 ) -> Iterator[tuple[str, str]]:
-    """Yield topic and node of each delivery that the demands hold.
+    """Yield the topic and the receiving node of each delivery that the demands hold.
 
-    A delivery has only outputs that are made from the inputs of its own demand.
+    A demand's delivery has only outputs that are made from the inputs of this demand.
     """
     for app in (app for apps in demands.held.values() for app in apps):
         booked = repo.state.ledger.application(app["id"])
@@ -269,7 +270,7 @@ def delivered(
 
 
 def assert_every_topic_comes_in_one_way(repo: MemoryRepo, demands: Demands) -> None:
-    """Check that each read topic comes in one way, and that connections carry no other topic."""
+    """Check that each topic that is read arrives in one way, and no other topic is carried."""
     releases = [plan(repo.state, key) for key in all_keys(repo.state)]
     services = [one for one in releases if isinstance(one, ServiceRelease)]
     made = {(one.node.id, topic) for one in services for topic in one.outputs.values()}

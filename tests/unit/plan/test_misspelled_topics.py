@@ -1,4 +1,4 @@
-"""Only a topic that is probably a misspelling of a known topic gives a warning."""
+"""A topic gives a warning only if it is probably a misspelling of a known topic."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ USUAL = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 
 
 def told(topic: str, *known: str) -> list[str]:
-    """Return the spelling warnings of a demand for a topic, after demands for ``known`` topics."""
+    """Return the warnings about spelling that a demand for ``topic`` gives.
+
+    Before it, other demands for the topics ``known`` are booked.
+    """
     books = MemoryRepo()
     for number, one in enumerate(known):
         books.send(_demand(f"known-{number}", one))

@@ -1,4 +1,4 @@
-"""When an override moves a service, its inputs and deliveries follow, and return at the end."""
+"""When an override moves a service, its inputs and deliveries follow, and return with it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.unit.plan.test_flows import (
 
 
 def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
-    """Yield random overrides; each moves a service, or all services of an application."""
+    """Yield random overrides, each of which moves a service, or all services of an application."""
     names = sorted({name for services in graphs.services.values() for name in services})
     for number in range(random.randint(0, 2)):
         by_service = Selector(services=(random.choice(names),))
@@ -57,9 +57,9 @@ def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
 def wanted(
     graphs: Graphs, app: dict[str, Any], active: Iterable[Override]
 ) -> dict[str, str | None]:
-    """Return the nodes to which overrides move services of an application, by service.
+    """Return the services of an application that overrides move, as a map to their new nodes.
 
-    ``active`` is in the order of priority, so the last override wins.
+    ``active`` is sorted by priority, and the last override that selects a service wins.
     """
     return {
         name: override.node
@@ -71,7 +71,10 @@ def wanted(
 
 
 def configure(repo: MemoryRepo, config: Config) -> tuple[tuple[str, str], ...]:
-    """Replace the configuration as a generator does; return the services that stay, and why."""
+    """Replace the configuration as a generator does.
+
+    Return (file, reason) for each override that cannot move a service.
+    """
     state = State.of(config, repo.state.ledger)
     moved = following_overrides(state)
     for path, text in changed_claim_files(state.ledger, moved.ledger, moved.keys).items():

@@ -1,4 +1,4 @@
-"""Placed services fit their nodes and stay there, count as capacity, and leave a drained node."""
+"""Placed services fit their nodes, stay on them, count as usage, and leave a drained node."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Naming(Demands):
 
 
 def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
-    """Return the configuration with GPUs and a capacity on some nodes; their order is random."""
+    """Return the configuration with GPUs and a capacity on some nodes, and all nodes shuffled."""
     nodes = [
         node.model_copy(
             update={
@@ -167,14 +167,17 @@ class Extreme(Random):
 
 @pytest.mark.parametrize(("seed", "length"), [(62, 3), (87, 4)])
 def test_a_drain_brings_no_topic_to_a_node_from_two(seed: int, length: int) -> None:
-    """In these cases, services at several sources have outputs with the same name."""
+    """With these seeds, services at several sources have outputs with the same name."""
     test_services_that_are_placed_fit_stay_and_leave_drained_nodes.hypothesis.inner_test(  # type: ignore[attr-defined]
         Extreme(seed), length
     )
 
 
 def repo_with(domains: list[dict[str, Any]], **nodes: dict[str, Any]) -> MemoryRepo:
-    """Return a repo whose fusion needs a GPU, with these access domains and fields of nodes."""
+    """Return a repo whose fusion needs a GPU.
+
+    ``domains`` are the access domains, and ``nodes`` has further fields of some nodes.
+    """
     inventory = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     inventory["nodes"] = [node | nodes.get(node["id"], {}) for node in inventory["nodes"]]
     services = {"services": {"object-fusion": {"place": {"capabilities": ["gpu"]}}}}
@@ -202,7 +205,7 @@ def test_the_node_of_the_application_comes_first_and_the_commit_says_why() -> No
 
     nodes = {"cloud": GPU | at(0), "vehicle00": at(0), "edge": {"capabilities": ["gpu"]} | at(9)}
     decision = repo_with([], **nodes).send(DEMAND)
-    told = f"{WHY}'edge', the node of its application of 2 nodes that fit"
+    told = f"{WHY}'edge', the node of its application among 2 nodes that fit"
     assert decision.placed == (told,)
     assert f" {told[0].upper()}{told[1:]}." in commit_message.of_decision(decision, "o", NOW)
     del nodes["edge"]

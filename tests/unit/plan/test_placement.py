@@ -1,4 +1,4 @@
-"""An application gets a node that fits, and keeps it; every generator chooses the same one."""
+"""An application gets a node that fits and keeps it, and every generator chooses the same node."""
 
 from __future__ import annotations
 
@@ -157,14 +157,14 @@ def test_it_is_a_node_that_fits_the_same_in_any_order_and_stays(random: Random) 
 
 
 def inventory(**more: dict[str, Any]) -> dict[str, str]:
-    """Return the skeleton's file of nodes, with further fields of some nodes."""
+    """Return the skeleton's ``inventory/nodes.yaml``, with further fields of some nodes."""
     data = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     data["nodes"] = [node | more.get(node["id"], {}) for node in data["nodes"]]
     return {"inventory/nodes.yaml": json.dumps(data)}
 
 
 def asking(*items: dict[str, Any], demand: str = "d", **more: Any) -> dict[str, Any]:
-    """Return a demand with an application for each ``place`` in ``items``."""
+    """Return a demand that lists one application for each ``place`` in ``items``."""
     apps = [
         {
             "id": f"{demand}{index}",
@@ -181,11 +181,15 @@ def asking(*items: dict[str, Any], demand: str = "d", **more: Any) -> dict[str, 
     ("place", "more", "says"),
     [
         ({"role": "edge"}, {}, "'edge', the only node that fits"),
-        ({"capabilities": ["gpu"]}, {}, "'edge', the nearest to its sources of 2 nodes that fit"),
+        (
+            {"capabilities": ["gpu"]},
+            {},
+            "'edge', the nearest to its sources among 2 nodes that fit",
+        ),
         (
             {"capabilities": ["gpu"]},
             {"positions": [{"node": "cloud", "x": 3, "y": 4}]},
-            "'cloud', the nearest to its sources of 2 nodes that fit",
+            "'cloud', the nearest to its sources among 2 nodes that fit",
         ),
         ({"role": "vehicle", "labels": ["node_id=vehicle00"]}, {}, "'vehicle00', the only node"),
     ],

@@ -1,4 +1,4 @@
-"""The applications of a drained node move, and their inputs and deliveries move with them."""
+"""The applications on a drained node move, and their inputs and deliveries move with them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Placed(Demands):
 
 
 def with_nodes(config: Config, drained: str | None = None) -> Config:
-    """Return the configuration with a GPU on some nodes, and with one node drained."""
+    """Return the configuration with a GPU on some nodes, and with the node ``drained`` drained."""
     nodes = {
         id: node.model_copy(
             update={"capabilities": ("gpu",) * (id in NODES), "drained": id == drained}

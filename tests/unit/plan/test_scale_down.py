@@ -1,4 +1,4 @@
-"""Replicas are removed after the time in the definition; the ledger alone decides when."""
+"""Replicas are removed after the time in the definition, and the ledger alone decides when."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ SCALING = "{max: 9, per: {topics: 1}, downAfter: 10m}"
 STEPS = st.lists(
     st.tuples(st.integers(0, 400), st.one_of(st.none(), st.integers(0, 9))), max_size=25
 )
-"""Steps: the seconds that pass, and the number of topics that are demanded after them.
+"""Steps: the seconds that pass, and the number of topics that are demanded after these seconds.
 
-With 0 the demand is released; with None only the time passes.
+If the number is 0, the demand is released. If it is None, only the time passes.
 """
 
 
@@ -49,7 +49,7 @@ def test_a_service_has_the_most_that_it_needed_in_the_time(
 ) -> None:
     repo, now = empty().copy(), NOW
     needs: list[tuple[datetime, int]] = []
-    """Since when the service has needed how many replicas, as long as it runs."""
+    """(time, number) of each need: from this time on, the service needed this many replicas."""
     for seconds, topics in [(0, 1), *steps]:
         now += timedelta(seconds=seconds)
         repo.scale_down(now)
@@ -78,8 +78,8 @@ def test_it_goes_up_at_once_and_says_until_when_it_stays_up() -> None:
     fewer = repo.send(demand(topics=2), NOW + timedelta(minutes=1))
     name = release(repo)["metadata"]["name"]
     assert fewer.warnings[-1:] == (
-        f"{name} keeps 4 replicas until 2026-01-31T12:11:00Z (downAfter), then as many as its "
-        "demands need",
+        f"{name} keeps 4 replicas until 2026-01-31T12:11:00Z (downAfter in its definition), "
+        "although its demands need fewer",
     )
     assert fact(repo) == "4 until 2026-01-31T12:11:00Z"
     assert repo.scale_down(NOW + timedelta(minutes=10, seconds=59)) == []

@@ -63,7 +63,7 @@ def release(demand: str) -> dict[str, Any]:
 
 
 def servers(repo: MemoryRepo) -> dict[str, list[str]]:
-    """Return the applications that use the map server of each node."""
+    """Return the applications that use each map server, by the node of the map server."""
     return {
         entry["node"]: entry["applications"]
         for entry in repo.books()["services"].values()

@@ -1,4 +1,4 @@
-"""Waiting demands are booked in the order of the queue, and no demand waits if it fits."""
+"""Waiting demands are booked in the order in which they wait, and no demand waits if it fits."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The operations on the ledger, one module each, and the rules that they share."""
+"""The operations on the ledger, one module for each, and the rules that the operations share."""

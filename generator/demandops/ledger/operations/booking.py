@@ -28,8 +28,7 @@ def book(
         request: the id of the request.
         key: the key of the claim.
         current: the demand's claim on the same subject before the request, or ``None``.
-        now: when the request was received. A claim that is only renewed keeps the time at which
-            it was booked before.
+        now: when the request was received. A claim that is only renewed keeps its booking time.
         joined: whether a join books the claim; a join also keeps what ``current`` holds.
     """
     claim = Claim(

@@ -28,7 +28,13 @@ def _of_application(one: Demanded, app: Application, ledger: Ledger) -> Iterator
         return
     held, known = f"'{app.id}' is held by {', '.join(claim.requesters)}", claim.application
     for name, new, current, holding, remedy in (
-        ("node", app.node, known.node, "on", "request that node, or wait until it is released"),
+        (
+            "node",
+            app.node,
+            known.node,
+            "on",
+            "request the same node, or wait until the application is released",
+        ),
         ("appdef", app.appdef, known.appdef, "as", "use another application id"),
     ):
         if new != current:
@@ -71,8 +77,8 @@ def _of_routes(one: Demanded, demanded: Connection, claim: Claim, held: str) -> 
         elif route.reverse and (other := carried_back.get(route.target)):
             yield one.fault(
                 f"{where}.target",
-                f"'{route.target}' is carried back to '{other.source}' already: {held}; one topic "
-                "goes to one place, so use a second connection",
+                f"'{route.target}' is already carried back to '{other.source}': connection {held}; "
+                "a connection carries a topic back to only one topic, so use a second connection",
                 code="conflict",
             )
 
@@ -83,14 +89,14 @@ def _of_route(
     if current.target != route.target:
         yield one.fault(
             f"{where}.target",
-            f"'{route.source}' goes to '{current.target}' already: {held}; one source topic has "
-            "one target, so use a second connection",
+            f"'{route.source}' already goes to '{current.target}': connection {held}; a connection "
+            "carries a source topic to only one target, so use a second connection",
             code="conflict",
         )
     for name, old, new in routes.contradictions(current, route):
         yield one.fault(
             f"{where}.{name}",
             f"{name} {new} of '{route.source}' contradicts an existing claim: {held} with "
-            f"{name} {old}; use the same, or a second connection",
+            f"{name} {old}; use the same {name}, or a second connection",
             code="conflict",
         )

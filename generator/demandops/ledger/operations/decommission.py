@@ -1,9 +1,9 @@
-"""Decommissioning: a node or a requester leaves for good; its claims are released or reduced.
+"""Decommissioning: a node or a requester leaves for good, so claims are released or reduced.
 
-If a node is decommissioned, its applications, the inputs from it and the connections that end at it
-are released for all requesters. If a requester is decommissioned, all its claims are released. This
-includes the claims that it shares with other requesters: its demands named these requesters, and
-they might never release the claims.
+If a node is decommissioned, the applications on the node, the inputs from the node and the
+connections that end at the node are released for all requesters. If a requester is decommissioned,
+all its claims are released. These include claims that also name other requesters, because the
+others might never release the claims.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
 
 
 def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
-    """Return the claims that need a node, in no order."""
+    """Return the claims on applications and connections that need a node, in no order."""
     subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
     subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
     return [
@@ -67,7 +67,7 @@ def _reduced(claim: Claim, request: Decommission, nodes: Iterable[str]) -> Claim
 
 
 def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:
-    """Return the fault for a name without claims; it suggests a similar name."""
+    """Return the fault for a name without claims; the fault suggests a similar name."""
     names = [ledger.indexed_names("requester")] if "requester" in request.kinds else []
     names += (
         [ledger.indexed_names("node"), ledger.indexed_names("link")]
@@ -76,5 +76,5 @@ def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:
     )
     kinds = " or ".join(sorted(request.kinds))
     close = suggestion(request.id, {name for found in names for name in found})
-    message = f"'{request.id}' holds nothing as a {kinds}{close}"
+    message = f"there is no claim of a {kinds} '{request.id}'{close}"
     return fault("name", message, code="not-held")

@@ -1,4 +1,4 @@
-"""A release gives up everything that a demand with an id holds."""
+"""A release ends a demand that has an id: the demand gives up everything that it holds."""
 
 from __future__ import annotations
 

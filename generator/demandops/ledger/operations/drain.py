@@ -1,6 +1,7 @@
 """A drain moves placed applications, with their connections, off a node that is drained.
 
-The generator requests it. :mod:`demandops.plan.nodes.relocation` works out the claims that change.
+The generator requests the drain. :mod:`demandops.plan.nodes.relocation` determines which claims
+change.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class Drain(DemandRequest):
-    """The generator's request to move applications that it placed off the drained node ``id``.
+    """The generator's request to move the applications that it placed on the drained node ``id``.
 
     ``moves`` are the changes of claims. ``moved`` has a text about each application or service that
-    moves, and ``stays`` has one about each that cannot move.
+    moves. ``stays`` has a text about each application or service that cannot move.
     """
 
     moves: tuple[ClaimChange, ...] = ()

@@ -1,4 +1,4 @@
-"""An expiry releases the claims whose lease has ended. The generator requests it."""
+"""An expiry releases the claims whose lease has ended. The generator requests the expiry."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from demandops.ledger.ledger import Ledger
 
 
 def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without those claims of a demand whose lease has ended, and the changes."""
+    """Return the ledger without the ended claims of a demand, and the changes.
+
+    A claim has ended if its lease has ended. Other claims of the demand stay.
+    """
     held = ledger.claims_of_demand(request.demand)
     ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
     after = ledger.without(ended)

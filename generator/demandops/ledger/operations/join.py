@@ -1,4 +1,4 @@
-"""Joining: a request of the reference's action adds to what its demand already holds."""
+"""A join: a goal of the reference's action adds to what its demand already holds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from demandops.ledger.operations.conflicts import conflicts
 
 
 def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with a request added to what its demand holds, and the changes.
+    """Return the ledger with the request's items added to what its demand holds, and the changes.
 
     Raises:
         Refused: with every conflict with an existing claim.
@@ -33,8 +33,8 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     changes = claim_changes(start, ledger, keys)
     if not changes:
         return start, Changes()
-    # A join that only renews claims keeps the records of recent shutdowns. Without its record, a
-    # repeated shutdown would count as a new one and end another demand.
+    # A join that only renews claims keeps the records of recent shutdowns. If it removed the record
+    # of a shutdown, a repeat of this shutdown would count as a new one and end another demand.
     adds = not all(change.only_renews for change in changes)
     shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
     return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)

@@ -1,4 +1,4 @@
-"""The renewal of a demand's leases."""
+"""The renewal of the leases of a demand."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The owners of a demand that has an id: the requesters of its claims.
 
-A request is refused if it names none of the owners. So if a second requester chooses the same id by
-chance, its requests cannot change the demand of the first.
+A request is refused if it names none of the owners. So if a second requester chooses the same
+demand id by chance, its requests cannot change the demand of the first requester.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
                 for claim in ledger.claims_of_requester(requester)
             }
         )
-        never = "; it has ended, or was never booked: see demandops log"
-        known = f"; demands in this name: {', '.join(demands[:5])}" if demands else never
-        message = f"'{request.demand}' holds nothing{known}"
+        never = "it has ended, or was never booked; demandops log shows which"
+        known = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
+        message = f"'{request.demand}' holds nothing; {known if demands else never}"
         raise Refused([fault("demand", message, code="not-held")])
     refuse_other_owners(held, request)
     return held

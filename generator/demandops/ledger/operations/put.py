@@ -24,7 +24,7 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     held = ledger.claims_of_demand(demand)
     refuse_other_owners(held, request)
     waited = (demand,) * is_waiting(ledger, request)
-    # the demand's own claims are no conflict, because a put may move its applications
+    # the demand's own claims are no contradiction, because a put may move its own applications
     ledger = others = ledger.without(held)
     faults: list[Fault] = []
     keys = [claim.key for claim in held]

@@ -1,8 +1,8 @@
 """A restoration books the claims of an earlier commit again.
 
-It releases newer claims only if the request says so. A restored lease runs for its full term from
-now on, because its old end may have passed. Claims that an override keeps belong to no demand;
-:mod:`demandops.plan.overrides.claim_overrides` updates them after every change.
+A restoration undoes newer claims only if the request says so. A restored lease runs for its full
+term from now on, because its old end may have passed. Claims that an override keeps belong to no
+demand, so :mod:`demandops.plan.overrides.claim_overrides` updates them after every change.
 """
 
 from __future__ import annotations
@@ -28,8 +28,9 @@ _SHOWN = 20
 class Restoration(DemandRequest):
     """A request to restore the ledger of an earlier commit.
 
-    ``to`` is the commit, ``made`` its time and ``claims`` its ledger. ``by`` and ``email`` name the
-    person who requests it.
+    ``to`` is the earlier commit, ``made`` is its time, and ``claims`` are the claims of its ledger.
+    ``drop_newer`` says that newer claims are undone. ``by`` and ``email`` name the person who
+    requests the restoration.
     """
 
     to: str = ""
@@ -66,9 +67,10 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return the changes of claims that restore the earlier commit.
+    """Return the changes of claims that restore the earlier commit, sorted by path.
 
-    A claim that differs only in the term or the end of its lease stays as it is.
+    A claim that differs from the restored one only in the term or the end of its lease stays as it
+    is.
     """
     restored = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
@@ -105,8 +107,8 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
         )
         yield fault("", message, code="newer").within(path_of(claim.key))
     more = len(changes) - _SHOWN
-    others = f"and {more} more; " if more > 0 else ""
-    message = f"{others}newer claims stay; use --drop-newer to undo them as well"
+    others = f"{more} more claims would change; " if more > 0 else ""
+    message = f"{others}newer claims are undone only with --drop-newer"
     yield fault("", message, code="newer")
 
 
@@ -125,7 +127,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
 
 
 def request_for(claim: Claim) -> Put:
-    """Return a request that books this claim; faults of the request name fields of the claim."""
+    """Return a request that books this claim; a fault of the request names a field of the claim."""
     return Put(
         id=claim.request,
         demanded=(Demanded(claim.held, claim.requesters, str),),

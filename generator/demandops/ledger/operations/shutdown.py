@@ -1,8 +1,8 @@
 """A shutdown takes one hold from each requester that it names, on each topic that it lists.
 
-If several claims hold the topic for the requester, the hold is taken from the first of them in this
-order: the claim with the same request id and the same requesters, then other claims with the same
-request id, then all other claims, the oldest first. A shutdown never takes holds from claims of a
+If several claims hold the topic for the requester, the hold is taken from the first claim in this
+order: the claim with the shutdown's request id and requesters, then other claims with this request
+id, then all other claims, the oldest first. A shutdown never takes holds from the claims of a
 demand that has an id.
 """
 
@@ -22,12 +22,12 @@ from demandops.subject import TopicKey
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without the holds that a shutdown names, and the changes.
+    """Return the ledger without the holds that a shutdown lists, and the changes.
 
     A shutdown that repeats one of the last 15 minutes changes nothing.
 
     Raises:
-        Refused: if the requesters have none of these holds.
+        Refused: if the requesters have none of the listed holds.
     """
     record = RecentShutdown.of(request, now)
     repeats = ledger.shutdowns.earlier(record)
@@ -37,7 +37,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
     taken: dict[tuple[ClaimKey, str], set[TopicKey]] = {}
     for one in request.demanded:
         for requester in one.requesters:
-            # look in ``start``, so that a topic that is listed twice is taken once
+            # look in the ledger before the request, so that a topic listed twice is taken once
             claims = _claims_meant(start, request, one, requester)
             for words, claim, held in _holds(one, requester, claims):
                 if claim is None:
@@ -46,7 +46,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
                     taken.setdefault((claim.key, requester), set()).update(held)
     for (key, requester), topics in taken.items():
         left = ledger.get(key)
-        assert left is not None  # noqa: S101 - this requester still holds something
+        assert left is not None  # noqa: S101 - the requester's holds are in the claim until now
         ledger = ledger.replace(key, left.without_holds(requester, topics))
     if not taken:
         raise Refused([_nothing_held(start, request)])
@@ -60,7 +60,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
 
 
 def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: str) -> list[Claim]:
-    """Return the claims that a shutdown may mean for a requester, the likeliest first."""
+    """Return the requester's claims that an item of a shutdown may mean, the likeliest first."""
     own = demand_id(request.id, one.requesters)
     claims = ledger.claims_held_by(requester, one.held.subject)
     return sorted(
@@ -75,8 +75,9 @@ def _holds(
     """Yield (text, claim, keys) for each topic that a shutdown lists.
 
     The text describes the listed topic. The claim is the one from which holds are taken, and the
-    keys are those of its topics that the listed topic means. The claim is ``None`` if the requester
-    holds none of these topics. If no topic is listed, the keys are all those of the first claim.
+    keys are those of the claim's topics that the shutdown means by the listed topic. The claim is
+    ``None`` if the requester holds none of these topics. If no topic is listed, the claim is the
+    first of ``claims``, and the keys are those of all its topics.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]
@@ -96,7 +97,7 @@ def _holds(
 
 
 def _nothing_held(ledger: Ledger, request: Shutdown) -> Fault:
-    """Return the fault for a shutdown that matches no claim; it suggests similar claims."""
+    """Return the fault for a shutdown that matches no claim; the fault lists similar claims."""
     near = [
         f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
         for subject in request.subjects()

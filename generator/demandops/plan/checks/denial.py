@@ -1,8 +1,8 @@
-"""Denials: a demand that an override with ``deny`` selects is refused.
+"""Denials: a demand is refused if an override with ``deny`` selects what it asks for.
 
-The fault has the reason and the owner of the override. A demand that only repeats existing claims
-renews these claims. Such a demand is always allowed, but gets a warning that an override suspends
-the claims.
+The fault names the reason and the owner of the override. A demand that only repeats existing claims
+renews these claims. Such a demand is always allowed, but its requester gets a warning that an
+override suspends the claims.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _denied_field(override: Override, one: Demanded, services: list[Traits], con
 
 
 def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
-    """Return the most specific field of ``one`` that a selector matches."""
+    """Return the field of ``one`` to report: the most specific field that a selector matches."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
@@ -85,15 +85,16 @@ def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
 def _message(override: Override) -> str:
     until = f" until {format_time(override.end)}" if override.end else ""
     return (
-        f"is denied by {override.path}{until}: {override.reason}; ask its owner, {override.owner}, "
-        "or leave it out"
+        f"is denied by {override.path}{until}: {override.reason}; ask the override's owner, "
+        f"{override.owner}, or demand something else"
     )
 
 
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
     """Yield a warning for each suspended claim that concerns a demand.
 
-    These are the demand's own claims and claims of the same requesters on the listed subjects.
+    Such a claim has a requester of the demand. It is a claim of the demand itself, or a claim on an
+    application or connection that the demand lists.
     """
     if not any(override.deny for override in world.overrides):
         return

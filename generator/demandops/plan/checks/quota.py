@@ -16,7 +16,7 @@ from demandops.subject import Subject, SubjectKind
 def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
     """Yield a fault for each quota that the booking exceeds.
 
-    A quota that was exceeded before is a fault only if the booking raises its count further.
+    If a quota was exceeded before, there is a fault only if the booking raises the count further.
     """
     domain_of = after.config.domain_of
     booked = [change.after for change in changes.claims if change.after]
@@ -41,7 +41,7 @@ def _claims(requester: str, before: World, after: World, domain: AccessDomain) -
     most = domain.quotas.claims_per_requester
     if (
         most is None or after.ledger.count_of_requester(requester) <= most
-    ):  # the ledger counts the claims in all domains, so at least as many as in this one
+    ):  # this counts the claims in all domains, so at least as many as those in this domain
         return
     count = _held(requester, after, domain)
     if count > most and count > _held(requester, before, domain):
@@ -79,7 +79,7 @@ def _running(node: str, world: World) -> int:
 def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
     return fault(
         "",
-        f"{usage}, and quotas.{quota} of access domain '{domain.name}' allows {most}; release "
+        f"{usage}, but quotas.{quota} of access domain '{domain.name}' allows {most}; release "
         "something first, or ask for a change of policy/",
         code="quota",
     )

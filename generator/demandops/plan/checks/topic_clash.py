@@ -1,7 +1,7 @@
-"""Topic clashes: a node would have two sources of one topic, so a demand is refused.
+"""Topic clashes: a demand is refused if a node would have two sources of one topic.
 
-Topics are named as the reference names them, so two ids may give one name: ``a/b`` and ``a-b``. A
-connection may also bring a topic to a node where a service publishes the same topic.
+Topics are named as the reference names them, so two ids may give the same name, for example ``a/b``
+and ``a-b``. A connection may also bring a topic to a node where a service publishes the same topic.
 """
 
 from __future__ import annotations
@@ -37,10 +37,12 @@ from demandops.subject import Subject, SubjectKind
 def faults(
     request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new service or route that is a second source of a topic on a node.
+    """Yield a fault for each new service, route or delivery that clashes with another source.
+
+    It clashes if it would be the second source of a topic on a node.
 
     Args:
-        request: the demand; a request that adds no claims has no faults.
+        request: the demand. If it adds no claims, there are no faults.
         before, after: the world before and after the demand.
         keys: the keys of the releases that the demand may change.
     """
@@ -75,7 +77,8 @@ def _of_service(
     for name, topic, clash, remedy in islice(clashes, 1):
         yield fault(
             _field(request, key, service),
-            f"its output {name} is {topic}, which {clash} '{key.node}' already; {remedy}",
+            f"output {name} of {key.service} is {topic}, which {clash} '{key.node}' already; "
+            f"{remedy}",
             code="conflict",
         )
 
@@ -93,7 +96,7 @@ def _clashes(
 def _of_connection(
     one: Demanded, connection: Connection, before: World, after: World
 ) -> Iterator[Fault]:
-    """Yield a fault for each new route to a topic that a service publishes on the same node.
+    """Yield a fault for each new route that brings a topic to a node where a service publishes it.
 
     Only a service that runs both before and after the demand counts. So if an application moves, a
     connection may bring the application's output back to the old node.
@@ -108,8 +111,8 @@ def _of_connection(
             yield one.fault(
                 f"topics[{index}].{'source' if route.reverse else 'target'}",
                 f"connection '{connection.id}' brings {topic} to '{node}', where "
-                f"{_words(other)} publishes it already; use a connection that gives it another "
-                "name there",
+                f"{_words(other)} already publishes this topic; use a connection that brings the "
+                "topic under another name",
                 code="conflict",
             )
 
@@ -117,7 +120,7 @@ def _of_connection(
 def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
     """Yield a fault for each output that the receiving node already gets from another source.
 
-    A topic that the demand lists as an input is never a fault: the demand names its source.
+    A topic that the demand lists as an input is never a fault, because the demand names the source.
     """
     apart = app.deliver or app.services or app.moved
     for flow in flows(after.config, app) if apart else ():
@@ -128,17 +131,17 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
             if flow.delivery is None:
                 if elsewhere:
                     message = (
-                        f"{flow.target} comes to '{flow.receiver}' by connection '{id}' already, "
-                        f"and would come from '{flow.sender}' too; choose another node for the "
-                        "service that reads it"
+                        f"{flow.target} already comes to '{flow.receiver}' by connection '{id}', "
+                        f"and would also come from '{flow.sender}'; choose another node for the "
+                        "service that reads this topic"
                     )
                     yield one.fault("id", message, code="conflict")
                 continue
             if elsewhere:
                 yield one.fault(
                     f"deliver[{flow.delivery}].output",
-                    f"{flow.target} comes to '{flow.receiver}' by connection '{id}' already; leave "
-                    "it out",
+                    f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'; leave "
+                    "this delivery out",
                     code="conflict",
                 )
                 continue
@@ -149,8 +152,8 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
             for topic in sorted(read - {flow.topic})[:1]:
                 yield one.fault(
                     f"deliver[{flow.delivery}].topic",
-                    f"{flow.target} of '{flow.receiver}' is made from {topic} already; choose "
-                    "another topic",
+                    f"{flow.target} on '{flow.receiver}' already carries {topic}; choose another "
+                    "topic for this delivery",
                     code="conflict",
                 )
 
@@ -173,8 +176,8 @@ def _publishers(
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the service instances on a node that publish ``topic``, except ``but``.
 
-    The output patterns of the appdefs tell which instances would publish the topic. Of these, only
-    instances that the ledger needs are yielded.
+    The output patterns of the appdefs tell which instances would publish the topic. Only those of
+    them that claims need are yielded.
     """
     for services in world.config.services.values():
         for name, service in services.items():
@@ -195,10 +198,10 @@ def _publishers(
 def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances on a node that have ``instance`` in topic names.
+    """Yield the keys of the instances of a service on a node that have ``instance`` in topic names.
 
-    The ledger may not need all of them. ``but`` is the instance whose clashes are looked for; its
-    own topic does not count as the usual topic of its source.
+    Not all of these instances need to run. ``but`` is the key of the instance for which clashes
+    are looked for. The topic of that instance does not count as the usual topic of its source.
     """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
@@ -220,7 +223,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances on a node; the ledger may not need all of them."""
+    """Yield the keys of the instances of a service on a node; not all of them need to run."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)
@@ -243,17 +246,18 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
     if key.application is not None:
         return "use another application id"
     if other is None:
-        return "let the connection give it another name there"
+        return "let the connection bring the topic under another name"
     if {"node", "cluster"} & {key.scope, other.scope}:
         return f"change this output in {service.file}"
     file = config.file_of(NODES_FILE, str(key.source))
     if key.source == other.source:
-        return f"name the usual one of the two as topics.{service.root} of '{key.source}' in {file}"
+        where = f"topics.{service.root} of '{key.source}' in {file}"
+        return f"list the usual topic of the two in {where}"
     return f"give '{key.source}' another id in {file}"
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return the request's field because of which a service is needed, or an empty text."""
+    """Return the field of the request because of which a service runs, or an empty text."""
     for one in request.demanded:
         if not isinstance(one.held, Application):
             continue

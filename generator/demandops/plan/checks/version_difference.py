@@ -1,7 +1,7 @@
 """Version differences: demands that share an application or a service ask for different versions.
 
 ``versions`` of the application definition decides what happens. Either the demand is refused, or
-the newest version is deployed; in some cases a person must approve this version first.
+the newest version is deployed. In some cases a person must approve the newest version first.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ With ``separate`` each version is an application of its own, so only shared serv
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A difference between the versions of one application or service that demands share.
+    """A difference: demands ask for different versions of one application or service.
 
-    ``what`` describes this application or service. ``demanded`` is the version of the new demand,
-    ``others`` is the newest version that the other demands ask for.
+    ``what`` describes this application or service. ``demanded`` is the version that the new demand
+    asks for. ``others`` is the newest version that the other demands ask for.
     """
 
     what: str
@@ -58,8 +58,8 @@ class Difference:
     def matters_to(self, asked: str) -> bool:
         """Return whether the difference concerns a demand that asks for version ``asked``.
 
-        If ``asked`` is empty, the demand names no version. Such a demand accepts the newer version
-        of other demands, except if the policy refuses the difference.
+        If ``asked`` is empty, the demand names no version. Then the difference does not concern the
+        demand if other demands ask for the newer version, unless the policy refuses the difference.
         """
         return bool(asked) or self.newer or self.is_refused
 
@@ -69,7 +69,7 @@ class Difference:
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
-        """Return why the difference needs a person's approval, or an empty text."""
+        """Return why a person must approve the difference; empty if no approval is needed."""
         same = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
         if self.policy == "upgrade" or same:
             return ""
@@ -81,7 +81,7 @@ class Difference:
         return f"application definition '{self.appdef}', for {change}"
 
     def warning(self) -> str:
-        """Return a warning that a newer version is deployed than the demanded one.
+        """Return a warning that the deployed version is newer than the demanded version.
 
         The result is an empty text if the demanded version is the newer one.
         """
@@ -102,7 +102,7 @@ def differences(
         request: the demand.
         before, after: the world before and after the demand.
         changes: the claims that the demand changes.
-        plans: the releases that the demand may change, as they are afterwards.
+        plans: the releases that the demand may change, as they are after the demand.
     """
     if not request.adds_claims:
         return
@@ -158,10 +158,10 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim with ``version``, and the claim's word for it.
+    """Return the requesters of the first claim that asks for ``version``, and the claim's word.
 
-    The word is the version or channel in the claim. It is empty if the claim takes the default
-    version.
+    The word is the version or channel that the claim names. It is empty if the claim asks for the
+    default version.
     """
     for claim in ledger.claims_on(subject):
         word = claim.application.version
@@ -181,11 +181,11 @@ def _of_service(
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield the differences in version between the applications that share a service.
+    """Yield the version differences between the applications that share a service.
 
-    The version for each application of the demand is compared with the version for the other
-    applications of the release. ``mine`` maps the id of each application of the demand to the
-    listed application and the version that it asks for.
+    For each application of the demand, the version of the service that this application needs is
+    compared with the version that the other applications of the release need. ``mine`` maps the id
+    of each application of the demand to the listed application and the version that it asks for.
     """
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}

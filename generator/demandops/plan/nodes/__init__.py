@@ -1,1 +1,1 @@
-"""Nodes of applications and services: their choice, their capacity, and moves to others."""
+"""Nodes of applications and services: how nodes are chosen, their capacity, and moves off them."""

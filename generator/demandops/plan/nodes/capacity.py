@@ -1,8 +1,9 @@
 """Capacity: how much the running services request of each node, and how much the node has.
 
-Each replica of a service requests what the definition says, on the node where it runs. A shared
-service counts once. To update :class:`Usage`, only the releases that a demand affects are planned
-again, so the cost of a demand depends on what it changes. Communication clients request nothing.
+Each replica of a service requests, on the node where it runs, what the service's definition says. A
+shared service counts once. Communication clients request nothing. To update :class:`Usage`, only
+the releases that a demand affects are planned again, so the cost of a demand depends on what the
+demand changes.
 """
 
 from __future__ import annotations
@@ -26,22 +27,22 @@ from demandops.plan.replicas import most_replicas
 from demandops.subject import Subject, SubjectKind
 
 Need = tuple[str, str]
-"""A node and a resource."""
+"""The ids of a node and of a resource, as in ``("edge", "cpu")``."""
 Plans = Mapping[ReleaseKey, Release | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """How much of each resource services request on each node, in thousandths of a unit."""
+    """What services request on each node, for each resource, in thousandths of a unit."""
 
     amounts: HashTrieMap[Need, int] = field(default_factory=HashTrieMap)
 
     def of(self, node: str, resource: str) -> int:
-        """Return how much services request of a node's resource, in thousandths of a unit."""
+        """Return what services request of a resource on a node, in thousandths of a unit."""
         return self.amounts.get((node, resource)) or 0
 
     def plus(self, more: Mapping[Need, int]) -> Usage:
-        """Return the usage with these amounts added; a negative amount lowers the usage."""
+        """Return the usage with the amounts of ``more`` added; a negative amount lowers it."""
         amounts = self.amounts
         for need, amount in more.items():
             total = (amounts.get(need) or 0) + amount
@@ -50,7 +51,7 @@ class Usage:
 
 
 def whole_usage(world: World) -> Usage:
-    """Return how much all services request on each node; empty if no node has a capacity."""
+    """Return what all services request on each node; empty if no node declares a capacity."""
     if not world.config.limits_capacity:
         return Usage()
     keys: dict[ReleaseKey, None] = {}
@@ -61,16 +62,16 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return (node, resource) → by how much the requests grow, where they differ."""
+    """Return a map from (node, resource) to the growth of requests; equal requests are left out."""
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return (node, resource) → by how much the requests of services grow after claims change.
+    """Return how requests grow when claims change, as a map from (node, resource) to the growth.
 
-    A release that cannot be planned requests nothing. The result is empty if no node has a
+    A release that cannot be planned requests nothing. The map is empty if no node declares a
     capacity.
 
     Raises:
@@ -94,9 +95,9 @@ def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
 
 
 def _requests(plans: Plans, config: Config) -> Counter[Need]:
-    """Return (node, resource) → how much releases request of it.
+    """Return what releases request, as a map from (node, resource) to the amount.
 
-    If a node is in several access domains, the amounts in all of them are added up.
+    If a node is in several access domains, the amounts in all these domains are added up.
     """
     total: Counter[Need] = Counter()
     for release in plans.values():
@@ -110,11 +111,11 @@ def _requests(plans: Plans, config: Config) -> Counter[Need]:
 def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
     """Yield (node, reason) for each resource of which a node has too little for the growth.
 
-    A node whose requests do not grow is left out, even if it is above its capacity.
+    A resource whose requests do not grow is left out, even if they exceed the capacity already.
 
     Args:
-        usage: what is requested before the growth.
-        grown: (node, resource) → by how much the requests grow.
+        usage: what services request before the growth.
+        grown: a map from (node, resource) to the growth of the requests.
         config: the configuration, which has the capacities of the nodes.
     """
     for (id, resource), amount in sorted(grown.items()):
@@ -129,7 +130,7 @@ def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterato
 
 
 def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[Fault]:
-    """Yield a fault for each capacity that would be exceeded; see :func:`excesses`."""
+    """Yield a fault for each capacity that the growth would exceed (:func:`excesses`)."""
     for node, excess in excesses(usage, grown, config):
         message = (
             f"'{node}' {excess}; choose another node, release something first, or ask "
@@ -139,31 +140,32 @@ def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[
 
 
 class Room:
-    """The room that nodes have left while applications are placed one by one.
+    """The room that nodes have left while the applications of a demand are placed one by one.
 
-    The claims in ``given_back`` count as released, so their room is free.
+    The claims in ``given_back`` count as released, so the room that they took is free.
     """
 
     def __init__(self, world: World, usage: Usage, given_back: Iterable[Claim]) -> None:
         self._world, self._usage = world, usage
         self._own: dict[tuple[Subject, str], dict[str, int]] = {}
         self.newly_placed: Counter[str] = Counter()
-        """How many applications were placed on each node."""
+        """How many applications and services were placed on each node so far."""
         self._change((one for one in given_back if one.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
-        """Book a claim on an application at its node, and count it in :attr:`newly_placed`."""
+        """Book a claim on an application, and count the application in :attr:`newly_placed`."""
         self.newly_placed[claim.application.node] += 1
         self.book([claim])
 
     def book(self, claims: Iterable[Claim]) -> None:
-        """Book claims on applications at their nodes."""
+        """Subtract what these claims on applications need from the room of their nodes."""
         self._change(claims)
 
     def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
-        """Return, in words, each resource that a node lacks for an application with these claims.
+        """Return, in words, each resource of which a node has too little for an application.
 
-        If ``service`` is not empty, only the service of this name is placed on the node.
+        ``claims`` are the claims to book for the application. If ``service`` is not empty, only the
+        service of this name is placed on the node.
         """
         known = self._world.config.nodes.get(node)
         if known is None or known.capacity is None:
@@ -178,7 +180,7 @@ class Room:
         return [excess for id, excess in found if id == host]
 
     def is_full(self, node: Node, least: Mapping[str, int]) -> bool:
-        """Return whether a node has too little room for ``least``, a result of :meth:`least`."""
+        """Return whether a node has too little room for ``least``, which :meth:`least` returns."""
         host = self._world.config.host_of(node.id)
         return any(
             most is not None and self._usage.of(host, resource) + amount > most
@@ -187,11 +189,12 @@ class Room:
         )
 
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
-        """Return resource → how much an application's own services request, on any node.
+        """Return the least that an application requests on any node, as resource → amount.
 
-        With these amounts a caller can rule out a full node before it plans all services there. If
-        ``service`` is not empty, only the service of this name counts. The result is empty if
-        there are overrides because of which the amounts may differ from node to node.
+        Only the application's own services count, not services that it shares. With these amounts a
+        caller can rule out a full node before it plans all services on that node. If ``service`` is
+        not empty, only the service of this name counts. The result is empty if there are overrides
+        because of which the amounts may differ from node to node.
         """
         subject, world = claims[0].subject, self._world
         if any(one.node or one.deny or one.replicas is not None for one in world.overrides):
@@ -231,9 +234,9 @@ class Room:
     def _after(
         self, claims: Iterable[Claim], *, give_back: bool = False
     ) -> tuple[World, Mapping[Need, int]]:
-        """Return the world with these claims booked, and by how much the requests grow.
+        """Return the world with these claims booked, and the growth of the requests.
 
-        With ``give_back``, the claims are released instead.
+        With ``give_back``, the claims are released instead of booked.
         """
         after, changes = self._booked(claims, give_back=give_back)
         try:
@@ -243,7 +246,7 @@ class Room:
 
 
 def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
-    """Yield (node, amounts in words) for each resource that services request beyond capacity."""
+    """Yield (node, excess in words) for each resource of which services request too much."""
     for (id, resource), used in sorted(usage.amounts.items()):
         node = world.config.nodes.get(id)
         most = node.most(resource) if node else None

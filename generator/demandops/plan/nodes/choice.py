@@ -1,7 +1,7 @@
 """The choice of one node: for an application, or for one of its services.
 
-A service whose definition has ``place`` gets a node of its own: the application's node if that
-fits, else the first other node that fits.
+A service whose definition has ``place`` gets a node of its own. This is the application's node if
+that node fits. Otherwise it is the first other node that fits.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ _MOST_SHOWN = 5
 MOST_TRIED = 20
 """The highest number of nodes on which a booking is tried, because each trial takes time."""
 NO_ROOM = "no-room"
-"""The code of a fault: there are suitable nodes for an application, but none has room."""
+"""The code of the fault that there are suitable nodes for an application, but none has room."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A chosen node, and the reason of the choice, for people."""
+    """A chosen node, and the reason for the choice in words."""
 
     node: str
     why: str
 
 
 Positions = Mapping[str, Position]
-"""Node → position, for nodes whose inventory entry has no position."""
+"""Node → the position that a demand gives; the inventory has precedence."""
 
 
 def requirement_of(service: Service) -> Requirement:
-    """Return what the definition of a placed service requires of the service's node."""
+    """Return what the definition of a service requires of the node of the service (``place``)."""
     place = service.place or Place()
     return Requirement(
         place.role,
@@ -62,7 +62,7 @@ def requirement_of(service: Service) -> Requirement:
 
 
 def on_node(app: Application, node: str, service: Service | None, world: World) -> Application:
-    """Return an application moved to a node, or with only ``service`` moved to the node."""
+    """Return an application moved to ``node``; if ``service`` is given, only this service moves."""
     if service is None:
         app = replace(app, node=node)
     else:
@@ -78,8 +78,9 @@ def with_overridden_nodes(app: Application, world: World) -> Application:
 def shares(service: Service, one: Application, other: Application) -> bool:
     """Return whether two applications share the instances of a service that runs for each topic.
 
-    They do if they have the same appdef and node; a separate instance shares only with those of
-    its version. The generator then tries to place the service on one node for both applications.
+    They do if they have the same appdef and node. A separate instance shares only with separate
+    instances of the same version. If two applications share instances, the generator tries to place
+    the service on one node for both.
     """
     of = ((app.appdef, app.node, app.own_version) for app in (one, other))
     return service.scope == "topic" and len({*of}) == 1
@@ -87,10 +88,10 @@ def shares(service: Service, one: Application, other: Application) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The choice of the node of one application, or of one of its services.
+    """The choice of a node for one application, or for one of its services.
 
-    ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims to
-    book for the application, on any node.
+    ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims that
+    the application would get; the chosen node replaces the node in them.
     """
 
     one: Demanded
@@ -117,7 +118,7 @@ class Choice:
         return self.one.held
 
     def fits(self, node: str) -> bool:
-        """Return whether a node meets the requirement and may get new services of this demand."""
+        """Return whether a node meets the requirement, accepts services and permits this demand."""
         known = self.config.nodes.get(node)
         if known is None or any(lacks(known, self.requirement)):
             return False
@@ -135,11 +136,11 @@ class Choice:
             if node.capacity is not None and least is None:
                 least = self.room.least(self._claims_on(node), self._name)
             if node.capacity is not None and self.room.is_full(node, least or {}):
-                skipped["that has room"] = None
+                skipped["that have room"] = None
             elif not self._is_permitted(node):
                 skipped["that its requesters may use"] = None
             elif self._shortage(node):
-                skipped["that has room"] = None
+                skipped["that have room"] = None
             elif self.suits and not self.suits(
                 on_node(self.app, node.id, self.service, self.world)
             ):
@@ -149,8 +150,8 @@ class Choice:
                     return
             else:
                 merit = self._merit(node, centre, positions)
-                which = " ".join(filter(None, (merit, " and ".join(skipped))))
-                why = f"{which} of {len(fitting)} nodes that fit"
+                only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
+                why = f"{merit} among {len(fitting)} nodes that fit{only}"
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
 
     def chosen(self, node: str, why: str) -> Chosen | None:
@@ -161,7 +162,7 @@ class Choice:
         return Chosen(node, why)
 
     def nodes(self) -> list[str]:
-        """Return the nodes that fit and that the requesters may use, even if they are full."""
+        """Return the ids of the nodes that fit and that the requesters may use, even full ones."""
         return [node.id for node in self._fitting() if self._is_permitted(node)]
 
     def _fitting(self) -> list[Node]:
@@ -175,7 +176,7 @@ class Choice:
         ]
 
     def _shortage(self, node: Node) -> list[str]:
-        """Return, in words, each resource that a node lacks; empty if the node has room."""
+        """Return, in words, each resource of which a node has too little; empty if it has room."""
         if node.capacity is None:
             return []
         return self.room.lacks(self._claims_on(node), node.id, self._name)
@@ -191,22 +192,22 @@ class Choice:
         ]
 
     def _merit(self, node: Node, centre: Position | None, positions: Positions) -> str:
-        """Return why a node is the first choice, in words: ``the nearest to its sources``."""
+        """Return, in words, why a node comes first, for example ``the nearest to its sources``."""
         if self._is_home(node):
             return "the node of its application"
         choose = self.config.repo_settings.placement
         if choose == "nearest" and self._distance(node, centre, positions) < inf:
             return "the nearest to its sources"
-        return f"with the {'most' if choose == 'pack' else 'fewest'} applications"
+        return f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
 
     def _is_home(self, node: Node) -> bool:
-        """Return whether a node for a service is sought, and ``node`` is the application's."""
+        """Return whether the choice is for a service and ``node`` is the application's node."""
         return self.service is not None and node.id == self.app.node
 
     def _rank(
         self, node: Node, centre: Position | None, positions: Positions
     ) -> tuple[bool, float, float, str]:
-        """Return a node's sort key; the lowest key is that of the best node.
+        """Return the key by which nodes are sorted; the best node has the lowest key.
 
         ``placement`` of the settings decides whether the distance or the number of applications
         counts first.
@@ -223,14 +224,14 @@ class Choice:
         return away, distance, booked, node.id
 
     def _distance(self, node: Node, centre: Position | None, positions: Positions) -> float:
-        """Return a node's squared distance from ``centre``; infinity if either is unknown."""
+        """Return a node's squared distance from ``centre``; infinity if a position is unknown."""
         position = self._position(node.id, positions)
         if centre is None or position is None:
             return inf
         return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
 
     def _centre(self, positions: Positions) -> Position | None:
-        """Return the middle of the sources whose position is known."""
+        """Return the middle of the sources whose position is known; ``None`` if none is known."""
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})
         known = [found for source in sources if (found := self._position(source, positions))]
         if not known:
@@ -239,7 +240,7 @@ class Choice:
         return Position(x=x, y=y)
 
     def _position(self, node: str, positions: Positions) -> Position | None:
-        """Return where a node is, by the inventory, else by the demand."""
+        """Return a node's position from the inventory or, if it has none there, from the demand."""
         listed = self.config.nodes.get(node)
         return (listed.position if listed else None) or positions.get(node)
 
@@ -253,9 +254,10 @@ class Choice:
         return permission.may_place(self.one, self.app.appdef, node.id, self.config)
 
     def none_fits(self, positions: Positions) -> Fault:
-        """Return the fault for an application that gets no node.
+        """Return the fault for an application or a service that gets no node.
 
-        The fault lists some nodes, those that lack the least first, and what each node lacks.
+        The fault lists some nodes and what each of them lacks. The nodes that lack the least come
+        first.
         """
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
@@ -271,7 +273,7 @@ class Choice:
             elif not reasons and (shortage := self._shortage(node)):
                 reasons, code = shortage, NO_ROOM
             elif not reasons:
-                reasons.append("fits, but the demand would be refused there")
+                reasons.append("fits, but the demand would be refused on this node")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))
@@ -291,8 +293,8 @@ class Choice:
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
     """Yield a message for each part of a requirement that no node of the inventory can meet.
 
-    Such a part names a role or property that no node has, or compares a property with a value of a
-    wrong type.
+    Such a part names a role or property that no node has, or compares a property with a value of
+    another type than the property has.
     """
     role, roles = requirement.role, config.nodes_by_role.keys() - {""}
     if role and role not in roles:

@@ -1,8 +1,9 @@
-"""Moved connections: when an application moves, its demands' connections follow it.
+"""Moved connections: when an application moves, the connections of its demands follow.
 
 The connections then carry the same topics to or from the new node, with the same type and options.
 If a demand holds no connection for what the application reads or delivers, the move adds none. A
-goal of the reference's action lists its connections itself, so a move does not change them.
+goal of the reference's action lists its connections itself, so a move does not change these
+connections.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from demandops.plan.implied_connections import connection_for
 from demandops.subject import Subject, SubjectKind
 
 Move = Callable[[Application], Application]
-"""A function that returns an application on its new nodes."""
+"""A function that returns the given application on its new nodes."""
 
 
 def with_moved(
     world: World, claims: Iterable[Claim], move: Move
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with the claimed applications moved, and the changes of claims.
+    """Return the world with the applications of ``claims`` moved, and the changes of claims.
 
-    The connections of the claims' demands follow their applications.
+    The connections of the demands that hold these claims follow the applications.
     """
     ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
     for claim in claims:
@@ -46,9 +47,10 @@ def with_moved(
 
 
 def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which a demand's connections follow a move of its application.
+    """Return the ledger in which the connections of a demand follow its application.
 
-    The second value has the keys of the changed claims.
+    ``claim`` is the demand's claim on the application before the move. The second value has the
+    keys of the changed claims.
     """
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application
@@ -80,16 +82,16 @@ def _path(flow: Flow) -> tuple[str, str, str, str]:
 
 
 def _flows_of_others(world: World, claim: Claim) -> Iterator[Flow]:
-    """Yield the flows of the other applications of a demand."""
+    """Yield the flows of the other applications that the demand of ``claim`` holds."""
     for other in world.ledger.claims_of_demand(claim.demand):
         if other.is_on_application and other.subject != claim.subject:
             yield from flows(world.config, other.application)
 
 
 def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
-    """Yield (flow, route) for each input whose topic a demand's connection renames.
+    """Yield (flow, route) for each input whose topic is renamed by a connection of the demand.
 
-    The flow is that of the input, and the route is the one that renames the topic.
+    The flow brings the input to the application, and the route renames the topic on the way.
     """
     for flow in flows(world.config, claim.application):
         for _, route in _carrying(world.ledger, claim.demand, flow):
@@ -98,11 +100,15 @@ def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
 
 
 def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    """Yield (claim, route) for each of a demand's connections that carries a flow."""
+    """Yield (claim, route) for each connection of a demand that carries a flow.
+
+    The claim is the demand's claim on the connection, and the route is the one with the flow's
+    topic.
+    """
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
         for route in claim.connection.topics if claim else ():
-            assert claim is not None  # noqa: S101 - it has the route
+            assert claim is not None  # noqa: S101 - ``route`` comes from the claim
             ends = route.sender_and_receiver(*claim.connection.nodes)
             if (*ends, route.written_topic) == (flow.sender, flow.receiver, flow.target):
                 yield claim, route
@@ -111,8 +117,8 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 def _carried_by(flow: Flow, known: Connection | None, claim: Claim, world: World) -> Claim:
     """Return a demand's claim on the connection that carries a flow from now on.
 
-    ``known`` is the connection that carried the topic before, or ``None``. The claim has the type
-    and options of this connection.
+    ``known`` is the connection that carried the topic before the move, or ``None``. The new
+    connection has the type and options of ``known``.
     """
     route = known.topics[0] if known else None
     flow = replace(flow, topic=route.read_topic) if route else flow

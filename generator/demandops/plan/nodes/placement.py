@@ -1,8 +1,8 @@
-"""Placement: nodes for a demand's applications and services that the demand does not place.
+"""Placement: nodes for those applications and services for which a demand names no node.
 
-The nodes are chosen before the booking, from nothing but the configuration and the claims at one
-commit. A claim has chosen nodes in the same fields as named nodes, so later stages treat both
-alike.
+The nodes are chosen before the booking, and only from the configuration and the claims at one
+commit. A claim has chosen nodes in the same fields as nodes that the demand names, so later stages
+treat both alike.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from demandops.plan.nodes.choice import (
 from demandops.quoting import quoted
 
 _LAST = datetime.max.replace(tzinfo=timezone.utc)
-"""The booking time of a claim that is not booked yet: later than all others."""
+"""The booking time of a claim that is not booked yet; it is later than any other booking time."""
 
 
 Trial = Callable[[DemandRequest], bool]
 """A function that returns whether a request can be booked.
 
-The request has no applications that are still without a node.
+The request contains only applications that have a node already.
 """
 
 
@@ -50,18 +50,18 @@ def with_chosen_nodes(
     """Return the request with a node for each application and service that is to be placed.
 
     A booked application or service stays on its node if the node has what is required. Any other
-    gets the first node that fits and has room; ``placement`` in the settings decides the order of
-    the nodes. Finally, services move to the nodes that overrides name.
+    application or service gets the first node that fits and has room. ``placement`` in the settings
+    decides the order of the nodes. Finally, services move to the nodes that overrides name.
 
     Args:
         request: the request.
-        world: the claims and the configuration before it.
-        usage: how much services request on each node in ``world``.
-        trial: if given, a node is skipped if ``trial`` returns ``False`` for the request with this
-            node.
+        world: the claims and the configuration before the request.
+        usage: what services request on each node in ``world``.
+        trial: if given, a node is chosen only if ``trial`` returns ``True`` for the request with
+            this node.
 
     Returns:
-        The request, and a fault for each application that gets no node.
+        The request, and a fault for each application or service that gets no node.
     """
     if not request.adds_claims:
         return request, []
@@ -80,8 +80,8 @@ def with_chosen_nodes(
 def needs_placement(request: DemandRequest, world: World) -> bool:
     """Return whether nodes must be chosen or checked for a request.
 
-    This is so if the request leaves a node to the generator, or if a service of one of its
-    applications has a node of its own in the request or in the ledger.
+    This is so if the request leaves the choice of a node to the generator. It is also so if a
+    service of a requested application has a node of its own, in the request or in the ledger.
     """
     apps = (one.held for one in request.demanded if isinstance(one.held, Application))
     return any(
@@ -102,8 +102,8 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
 def _overridden(app: Application, world: World) -> Application:
     """Return an application with its services moved to the nodes that overrides name.
 
-    If the application is booked on the same nodes already, its moved services stay as booked: only
-    a change of an override or a definition moves them again.
+    If the application is booked on the same nodes already, its moved services stay where they are
+    booked, because only a change of an override or a definition moves services again.
     """
     booked = world.ledger.application(app.id)
     if booked is not None and replace(app, moved=booked.moved).has_same_definition_and_nodes(
@@ -116,9 +116,9 @@ def _overridden(app: Application, world: World) -> Application:
 def _placed(
     request: AnyRequest, world: World, usage: Usage, trial: Trial | None
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with its nodes chosen, and the faults.
+    """Return the request with chosen nodes, and a fault for each choice that failed.
 
-    The applications get their nodes first, then the services do.
+    The applications get their nodes first, and then the services get theirs.
     """
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
@@ -153,9 +153,9 @@ def _placed(
 def _so_far(
     request: DemandRequest, demanded: list[Demanded], index: int, app: Application
 ) -> DemandRequest:
-    """Return a request without the applications that have no node yet.
+    """Return a request with the applications that have a node already, and all connections.
 
-    ``app`` replaces the application at ``index``; the connections stay in the request.
+    ``demanded`` are the items of the request, and ``app`` replaces the application at ``index``.
     """
     listed = [*demanded[:index], replace(demanded[index], held=app), *demanded[index + 1 :]]
     placed = (one for one in listed if not isinstance(one.held, Application) or one.held.node)
@@ -163,7 +163,7 @@ def _so_far(
 
 
 def _without_services(one: Demanded, world: World) -> Demanded:
-    """Return an application without the nodes of services that the demand does not name."""
+    """Return an application with only those nodes of services that the demand names."""
     if not isinstance(one.held, Application):
         return one
     services = {service.name: "" for service in _services_to_place(one.held, world)}
@@ -174,8 +174,9 @@ def _without_services(one: Demanded, world: World) -> Demanded:
 def may_wait(request: DemandRequest, world: World) -> bool:
     """Return whether a demand that lacks room may wait.
 
-    Each application and service to place must fit a node of a domain that lets demands wait, and
-    must need no approval there: a person approves only what can be booked now.
+    Each application and service to place must fit a node of an access domain that lets demands
+    wait. On this node it must need no approval, because a person approves only what can be booked
+    at once.
     """
     return all(
         any(_waits_for(node, request, choice) for node in choice.nodes())
@@ -195,9 +196,9 @@ def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
 
 
 def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Choice]:
-    """Yield the :class:`Choice` for an application and for each of its services that is placed.
+    """Yield a :class:`Choice` for an application and for each of its services to be placed.
 
-    No node counts as used, so the choices show which nodes could ever fit.
+    All nodes count as empty, so the choices show which nodes could ever fit.
     """
     if not isinstance(one.held, Application):
         return
@@ -209,7 +210,7 @@ def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Ch
 
 
 def _claim(request: DemandRequest, one: Demanded) -> Claim:
-    """Return a claim on a demanded application; its booking time is later than all others."""
+    """Return the claim that a demanded application would get, with the latest booking time."""
     demand = request.demand or demand_id(request.id, one.requesters)
     return Claim(one.held.booked(), demand, request.id, one.requesters, _LAST)
 
@@ -230,10 +231,10 @@ def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demande
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
-    """Return the node of a service instance that runs for another application and can be shared.
+    """Return the node of a service instance that another application has and ``app`` can share.
 
-    Return an empty text if there is no such instance. A second instance on another node would bring
-    the same outputs to the application's node once more.
+    Return an empty text if there is no such instance. If a second instance ran on another node, the
+    application's node would get the same outputs twice.
     """
     role = service.root or ""
     for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
@@ -247,27 +248,27 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
 
 
 def _named_services(one: Demanded, app: Application, world: World) -> Iterator[Fault]:
-    """Yield a fault for each service whose named node lacks what its definition asks for."""
+    """Yield a fault for each service if the named node lacks what the definition requires."""
     for name in app.named:
         service = world.config.services.get(app.appdef, {}).get(name)
         node = world.config.nodes.get(app.services[name])
         if service and node and (lacking := list(lacks(node, requirement_of(service)))):
             message = (
-                f"{quoted(node.id)} lacks {joined(lacking)}, which place in {service.file} asks "
-                "for; name another node, or leave it out"
+                f"{quoted(node.id)} lacks {joined(lacking)}, which {service.file} requires in "
+                "place; name another node, or name none for this service"
             )
             yield one.fault(f"services.{name}", message, code="no-node")
 
 
 def _contradictions(one: Demanded, app: Application, claim: Claim) -> Iterator[Fault]:
-    """Yield a fault for each service that is booked on another node than the demand names."""
+    """Yield a fault for each service that is booked on a node other than the demand names."""
     for name in app.named:
         current = claim.application.chosen_node(name)
         if current != app.services[name]:
             message = (
                 f"{quoted(app.services[name])} contradicts an existing claim: '{app.id}' is held "
-                f"by {', '.join(claim.requesters)} with {name} on '{current}'; name that node, or "
-                "use another application id"
+                f"by {', '.join(claim.requesters)} with {name} on '{current}'; name '{current}', "
+                "or use another application id"
             )
             yield one.fault(f"services.{name}", message, code="conflict")
 
@@ -291,10 +292,10 @@ def _named(choice: Choice) -> Fault | None:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node on which an application is booked already.
+    """Return the node on which an application is booked already and stays.
 
-    Return ``None`` if the generator may choose another node. Return a fault if another demand
-    holds the application on a node that lacks what is required.
+    Return ``None`` if the generator may choose a node. Return a fault if another demand holds the
+    application on a node that lacks what this demand requires.
     """
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
@@ -310,13 +311,16 @@ def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
         return stays
     message = (
         f"'{app.id}' is held by {', '.join(other.requesters)} on '{id}', which "
-        f"lacks {joined(lacking)}; ask for what that node has, or use another application id"
+        f"lacks {joined(lacking)}; ask only for what '{id}' has, or use another application id"
     )
     return choice.one.fault("place", message, code="conflict")
 
 
 def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
-    """Return the first claim of another demand, or ``None``; kept claims belong to no demand."""
+    """Return the first claim that belongs to another demand, or ``None``.
+
+    Claims that overrides keep belong to no demand.
+    """
     return next((c for c in claims if c.demand != demand and not c.keeping_override), None)
 
 
@@ -327,13 +331,13 @@ def _with_services(
     room: Room,
     suits: Callable[[Application], bool] | None,
 ) -> tuple[Demanded, list[Fault]]:
-    """Return a demanded application with its services on nodes of their own, and the faults.
+    """Return a demanded application with its services on chosen nodes, and the faults.
 
-    If other demands hold the application too, or if the request is a join, the services stay on
-    the nodes on which they are booked.
+    If another demand holds the application too, or if the request is a goal of the reference's
+    action, services stay on the nodes on which they are booked.
     """
     app = one.held
-    assert isinstance(app, Application)  # noqa: S101 - the caller knows
+    assert isinstance(app, Application)  # noqa: S101 - callers pass only applications
     claims, faults = world.ledger.claims_on(app.subject), list[Fault]()
     first = claims[0].application if claims and claims[0].application.appdef == app.appdef else None
     fixed = first if request.is_reference or _of_another(claims, request.demand) else None

@@ -1,8 +1,8 @@
-"""Relocation: applications and services leave a drained node; overrides move services.
+"""Relocation: applications and services leave a drained node, and overrides move services.
 
-An application leaves a drained node only if the generator placed it there. If a demand names the
-node, the application stays. Claims and definitions contain what is required of a node, so the
-original demands are not needed. The connections follow
+An application leaves a drained node only if the generator placed it on this node. If a demand names
+the node, the application stays. Claims and definitions contain what is required of a node, so the
+original demands are not needed. The connections of a moved application follow
 (:mod:`demandops.plan.nodes.moved_connections`).
 """
 
@@ -44,12 +44,12 @@ _ANY = Requirement()
 
 
 def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
-    """Return the request with the moves of all applications and services that can leave the node.
+    """Return the drain with the moves of all applications and services that can leave the node.
 
     Args:
         request: the drain; its ``id`` is the node.
         world: the claims and the configuration.
-        usage: how much services request on each node in ``world``.
+        usage: what services request on each node in ``world``.
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
     room = Room(world, usage, ())
@@ -67,7 +67,7 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
                 stays.append(f"{what[0]} stays, because {found}")
                 continue
             world, chosen, touched = found
-            # ``world`` has the application on its new node; ``room`` must count it there too
+            # ``world`` has the application on its new node, so ``room`` must count it on this node
             for each in ids:
                 room.book(world.ledger.application_claims(each))
             keys += touched
@@ -80,10 +80,9 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the parts of an application that are placed on a node.
+    """Return which services of an application are placed on a node on their own.
 
-    ``None`` stands for the application itself; the other parts are services with a node of their
-    own.
+    ``None`` in the result stands for the application itself, if it is placed on the node.
     """
     app = world.ledger.application(id)
     if app is None:
@@ -98,8 +97,8 @@ def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
     """Return the ids of the applications that must move together with ``id``, including ``id``.
 
-    These are the applications that share the instances of ``service`` on the node. If nothing is
-    shared, the result has only ``id``.
+    These are the applications that share the instances of ``service`` on the node. If the instances
+    are not shared, the result has only ``id``.
     """
     app = world.ledger.application(id)
     if service is None or service.scope != "topic" or app is None:
@@ -126,7 +125,7 @@ def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
 
 
 def applications_of(ledger: Ledger, node: str) -> list[str]:
-    """Return the applications that run on a node, or have a service placed there, sorted."""
+    """Return the ids of the applications on a node, or with a service placed on it, sorted."""
     if not ledger.applications_on.get(node):
         return []
     apps = ((id, ledger.application(id)) for id in ledger.applications_at(node))
@@ -136,10 +135,10 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 def _moved(
     world: World, claims: tuple[Claim, ...], room: Room, service: Service | None
 ) -> _Moved | str:
-    """Move an application, or only ``service``, to the best other node.
+    """Return the world with an application, or only its ``service``, moved to the best other node.
 
-    Return the world afterwards, the chosen node and the keys of the changed claims. If no move is
-    possible, return the reason as text.
+    The result also has the chosen node and the keys of the changed claims. If no move is possible,
+    the result is the reason as a text.
     """
     required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
     required = requirement_of(service) if service else required
@@ -177,15 +176,16 @@ class LedgerAfterMoves:
     ledger: Ledger
     keys: tuple[ClaimKey, ...]
     stays: tuple[tuple[str, str], ...]
-    """(file of an override, message) for each service that cannot be moved as the override asks."""
+    """(file, message) for each override that cannot move a service, by application."""
 
 
 def following_overrides(
     world: World, subjects: Iterable[Subject] | None = None
 ) -> LedgerAfterMoves:
-    """Return the ledger with services moved to the nodes that overrides name.
+    """Return the ledger after services have moved to the nodes that overrides name.
 
-    The connections follow the services.
+    The connections follow the services. A service also moves back when no override moves it any
+    longer.
 
     Args:
         world: the claims and the configuration.
@@ -223,7 +223,7 @@ def following_overrides(
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a restoration whose claims have services on the nodes that overrides now name."""
+    """Return a restoration that has services on the nodes that overrides name now."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims
@@ -238,7 +238,7 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
 def _all_moved(
     world: World, applications: Iterable[str], move: Move
 ) -> tuple[World, dict[str, tuple[ClaimChange, ...]]]:
-    """Return the world with these applications moved, and application → changes of claims."""
+    """Return the world with these applications moved, and the changes of claims by application."""
     changes: dict[str, tuple[ClaimChange, ...]] = {}
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
@@ -274,7 +274,7 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
         yield from conflicts(wanted.demanded[0], others)
         override = suspended_by(claim, after)
         if override and change.before and not suspended_by(change.before, before):
-            yield Fault("denied", "", f"it is denied there by {override.path}")
+            yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
     yield from quota.faults(before, after, Changes(changes))
     for change in changes:
         if change.after:
@@ -285,8 +285,8 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
     """Yield a fault for each output that the claimed connection brings to a node a second time.
 
-    The first time, another connection brings the output from another node. A topic that a demand
-    lists as an input is never a fault: the demand names its source.
+    This is so if another connection brings an output of the same name from another node. A topic
+    that a demand lists as an input is never a fault, because the demand names the source.
     """
     if claim.is_on_application:
         return

@@ -1,1 +1,1 @@
-"""Overrides: which claims and releases they select, and what they do to them."""
+"""Overrides: which claims and releases an override selects, and how it changes them."""

@@ -1,11 +1,12 @@
 """The effects of overrides on claims: ``deny`` suspends claims, ``keep`` books further claims.
 
-A suspended claim stays booked but is not planned. The planner reads a view of the ledger. The view
-checks each claim when it is read, so there is no second ledger to keep up to date.
+A suspended claim stays booked, but nothing runs for it. The planner reads the ledger through a view
+that leaves out suspended claims. The view checks each claim when the claim is read, so there is no
+second ledger to keep up to date.
 
 When the last claim on a subject is released, ``keep`` books a claim with the same content for the
-override's owner. A later demand for the subject replaces this kept claim. Bookkeeping and history
-show a kept claim like any other claim.
+owner of the override. A later demand for the subject replaces this kept claim. Bookkeeping and
+history show a kept claim like any other claim.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from demandops.subject import Subject, SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """The values that a selector is compared with.
+    """The values of a claim, demand or release that a selector is compared with.
 
-    ``service`` is set only for a service's release. If ``requesters`` is ``None``, the selector's
-    requesters are not compared.
+    ``service`` is set only for the release of a service. If ``requesters`` is ``None``, the
+    requesters of the selector are not compared.
     """
 
     nodes: tuple[str, ...]
@@ -43,7 +44,7 @@ class Traits:
 
 
 def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
-    """Return service → new node for each service of an application that an override moves."""
+    """Return the services of an application that overrides move, as a map to their new nodes."""
     moving = [one for one in world.overrides if one.node]
     found: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
@@ -64,7 +65,7 @@ def traits_of(one: Claim | Demanded) -> Traits:
 
 
 def fits(selector: Selector, traits: Traits, config: Config) -> bool:
-    """Return whether a selector matches: each of its fields must match ``traits``."""
+    """Return whether a selector matches ``traits``, so each field of the selector matches."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
@@ -89,13 +90,13 @@ def has_labels(selector: Selector, node: str, config: Config) -> bool:
 
 
 def selects(override: Override, traits: Traits, config: Config) -> bool:
-    """Return whether one of an override's selectors matches."""
+    """Return whether one of an override's selectors matches ``traits``."""
     return any(fits(selector, traits, config) for selector in override.select)
 
 
 @dataclass(frozen=True, slots=True)
 class UnsuspendedClaims(Ledger):
-    """A read-only view of a ledger without suspended claims."""
+    """A read-only view of a ledger, in which suspended claims are missing."""
 
     world: World | None = field(default=None, compare=False)
 
@@ -157,15 +158,18 @@ def without_suspended(world: World) -> World:
 
 
 def suspended_by(claim: Claim, world: World) -> Override | None:
-    """Return the override that suspends a claim, or ``None``; of several, the highest in rank."""
+    """Return the override that suspends a claim, or ``None``.
+
+    If several overrides do, return the one with the highest rank.
+    """
     return denied_by(traits_of(claim), world) if world.overrides else None
 
 
 def denied_by(traits: Traits, world: World) -> Override | None:
     """Return the override that denies a claim, demand or release with these traits, or ``None``.
 
-    If several do, return the one with the highest rank. A selector that names services denies the
-    releases of these services, never a claim or demand.
+    If several overrides do, return the one with the highest rank. A selector that names services
+    denies the releases of these services, but never a claim or a demand.
     """
     for override in reversed(world.overrides):
         if override.deny and any(
@@ -196,9 +200,9 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 def with_kept_claims(
     before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
-    """Return the ledger and the changes of a booking, with the kept claims updated.
+    """Return the ledger after a booking, and the changes, both with kept claims updated.
 
-    This concerns kept claims on ``subjects`` and on the subjects that the booking changed.
+    The kept claims on ``subjects`` and on the subjects that the booking changed are updated.
     """
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
@@ -209,13 +213,13 @@ def with_kept_claims(
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger whose kept claims on ``subjects`` are exactly those that overrides want.
+    """Return the ledger with exactly those kept claims on ``subjects`` that overrides want.
 
     The second value has the keys of all kept claims on ``subjects``, before and after the update.
 
     Args:
         before: the ledger before a change.
-        after: the world after it.
+        after: the world after the change.
         subjects: the subjects that changed.
         now: the booking time of new kept claims.
     """
@@ -241,7 +245,7 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _needed(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the kept claim for a subject that no demand holds, or ``None`` if nothing keeps it.
+    """Return the kept claim on a subject that no demand holds, or ``None`` if no override keeps it.
 
     Args:
         existing: the kept claims on the subject.
@@ -275,8 +279,8 @@ def _needed(
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     """Return the overrides that keep the subject of a claim, the highest in rank first.
 
-    For a kept claim, ``requesters`` of a selector is not compared: the claim names the override's
-    owner as its requester, and the original claim with the original requesters matched already.
+    For a kept claim, ``requesters`` of a selector is not compared. A kept claim names the owner of
+    the override as its requester, and the original claim already matched with its own requesters.
     """
     traits = traits_of(claim)
     if claim.keeping_override is not None:

@@ -1,6 +1,6 @@
 """The effects of overrides on a planned release: version, node, replicas, images, or denial.
 
-Patches of Helm values are applied later, after a template has made the values.
+Patches of Helm values are applied later, after a template has rendered the values.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from demandops.plan.replicas import overridden
 
 
 def apply_overrides(release: Release, world: World) -> Release | None:
-    """Return a release changed by all overrides that select it, or ``None`` if one denies it.
+    """Return a release after all overrides that select it, or ``None`` if one of them denies it.
 
     Raises:
-        Refused: if an override moves the release to a node that is gone.
+        Refused: if an override moves the release to a node that the inventory no longer has.
     """
     if not world.overrides:
         return release
@@ -43,7 +43,7 @@ def apply_overrides(release: Release, world: World) -> Release | None:
 
 
 def service_denied_by(release: Release, world: World) -> Override | None:
-    """Return the override that denies a service, or ``None``."""
+    """Return the override that denies the release of a service, or ``None``."""
     if not isinstance(release, ServiceRelease) or not any(one.deny for one in world.overrides):
         return None
     return denied_by(_traits(release, claims_of(release, world.ledger)), world)
@@ -52,9 +52,9 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release changed by the effects of overrides; the last override wins.
+    """Return a release after the effects of overrides; the last override wins.
 
-    ``by`` has pairs of an override and the names of its effects on this release.
+    ``by`` has pairs of an override and the names of its effects on the release.
     """
     by = tuple(by)
     if not by:

@@ -1,1 +1,1 @@
-"""Views for people: who requests what, why a release runs, what an override does."""
+"""Views for people: who requests what, why a release runs, and what an override does."""

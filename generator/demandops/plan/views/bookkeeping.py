@@ -1,6 +1,7 @@
 """Bookkeeping: who requests each service, connection and topic, and what each demand holds.
 
-This is Table III, column 4, of the paper. It is derived from claims and stored nowhere.
+This is Table III, column 4, of the paper. It is derived from the claims whenever it is shown, and
+is stored nowhere.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ _Requesters: TypeAlias = dict[str, list[str]]
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """One service, its requesters and those of its inputs (role → topic → requesters).
+    """One running service and its requesters.
 
-    ``version`` is the version of the service's chart. ``application_version`` is the version of
-    the application in ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version
-    that claims name to the requesters of these claims.
+    ``inputs`` maps each input role to its topics, and each topic to its requesters. ``version`` is
+    the version of the service's chart. ``application_version`` is the version of the application in
+    ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version that claims name
+    to the requesters of these claims.
     """
 
     applications: list[str]
@@ -83,7 +85,7 @@ class WaitingEntry:
 
 @dataclass(frozen=True, slots=True)
 class ResourceEntry:
-    """How much services request of a node's resource, and its capacity, as quantities."""
+    """What services request of a resource on a node, and its capacity, as Kubernetes quantities."""
 
     requested: str
     capacity: str
@@ -91,7 +93,7 @@ class ResourceEntry:
 
 @dataclass(frozen=True, slots=True)
 class DemandEntry:
-    """One demand that holds claims. ``action`` is the ROS action that this demand came by."""
+    """One demand that holds claims. ``action`` is the ROS action whose goal made the demand."""
 
     action: Literal["Demand", "DeploymentRequest"]
     request: str
@@ -102,7 +104,7 @@ class DemandEntry:
 class Bookkeeping:
     """The whole view: services by release name, connections and demands by id, all sorted.
 
-    ``suspended`` are the claims that an override suspends; they are in no service or connection.
+    ``suspended`` are the claims that overrides suspend; no service or connection counts them.
     ``nodes`` are the nodes that declare a capacity, each with its resources. ``waiting`` are the
     demands that wait for room, in the order in which the generator tries to book them.
     """
@@ -177,7 +179,7 @@ def _time(moment: datetime) -> str:
 
 
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
-    """Return node → resource → amounts for the nodes that declare a capacity, sorted by node."""
+    """Return the resources of the nodes that declare a capacity: node → resource → amounts."""
     usage = whole_usage(world)
     found: dict[str, dict[str, ResourceEntry]] = {}
     machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
@@ -194,9 +196,9 @@ def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
 
 
 def _demands(world: World) -> dict[str, DemandEntry]:
-    """Return demand id → entry for each demand that holds claims.
+    """Return an entry for each demand that holds claims, by demand id.
 
-    Claims that overrides keep belong to no demand.
+    Claims that overrides keep belong to no demand, so they are left out.
     """
     found: dict[str, list[Claim]] = {}
     for kind in SubjectKind:
@@ -226,7 +228,7 @@ def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _
     found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
     for claim in claims_of(release, active.ledger):
         for role, topic, key in demanded_inputs(active, release, claim.application):
-            if topic in found[role]:  # in a claim that a person wrote, the topic may differ
+            if topic in found[role]:  # a claim that a person wrote may name another topic
                 found[role][topic].update(claim.holders(key))
     return {role: _sorted(topics) for role, topics in found.items()}
 
@@ -248,8 +250,9 @@ def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
 class EntryChange:
     """One service or connection that was added, changed or removed.
 
-    ``requesters`` are the requesters after the change, or those before it if the entry was removed.
-    ``lost`` has the facts that a changed entry no longer has, ``gained`` its new facts.
+    ``requesters`` are the requesters after the change. If the entry was removed, they are those
+    before the change. ``lost`` has the facts about a changed entry that no longer hold, and
+    ``gained`` has the new facts.
     """
 
     kind: Literal["service", "connection"]
@@ -261,7 +264,7 @@ class EntryChange:
 
 
 def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    """Return every entry that differs: services, then connections, each sorted by name."""
+    """Return each service and then each connection that differs, both sorted by name."""
     return (
         *_changes("service", dict(old.services), dict(new.services)),
         *_changes("connection", dict(old.connections), dict(new.connections)),
@@ -287,10 +290,10 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield the facts of an entry, as text.
+    """Yield the facts about an entry, as texts.
 
-    ``other`` is the same entry before or after a change. A fact that only one of the two entries
-    has is part of the change.
+    ``other`` is the same entry on the other side of a change. A fact that holds for only one of the
+    two entries is part of the change.
     """
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
@@ -308,7 +311,7 @@ def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
     topics, known = _topics(entry), _topics(other)
     for what, who in sorted(topics.items()):
         yield what
-        # a requester that ``other`` lacks is a fact of its own above
+        # a requester that ``other`` lacks is not repeated here, because it is a fact above
         yield from (f"{what} for {one}" for one in who if what in known and one in other.requesters)
 
 

@@ -1,4 +1,4 @@
-"""The demands that hold something, as a list for people."""
+"""The demands that hold something or wait for room, as a list for people."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
 """The state of a claim or of a demand.
 
 A claim is held by its demand, kept by an override, or suspended by an override. A demand has the
-state of its claims; it is partly suspended if they differ, and waiting if it has no claims yet.
+state of its claims. If the states of its claims differ, the demand is partly suspended. If it waits
+for room, it is waiting and has no claims.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class HeldDemand:
-    """A demand and what it holds. ``lease`` is the first of its leases to end."""
+    """A demand and what it holds. Of the demand's leases, ``lease`` is the first that ends."""
 
     name: str
     state: State
@@ -78,7 +79,7 @@ def demands(world: World) -> list[HeldDemand]:
 
 
 def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
-    """Return the list's entry for the demand that has these claims."""
+    """Return the entry in the list for the demand that holds ``claims``, and no other claims."""
     states = {state_of(claim, world) for claim in claims}
     (state,) = states if len(states) == 1 else ("partly suspended",)
     suspending = filter(None, (suspended_by(claim, world) for claim in claims))
@@ -100,7 +101,7 @@ def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
 
 
 def waiting_demand(one: WaitingDemand) -> HeldDemand:
-    """Return the list's entry for a waiting demand, which holds nothing yet."""
+    """Return the entry in the list for a waiting demand, which holds nothing yet."""
     return HeldDemand(
         name=one.demand,
         state="waiting",
@@ -117,5 +118,5 @@ def waiting_demand(one: WaitingDemand) -> HeldDemand:
 
 
 def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
-    """Yield the ids of the claimed subjects of a kind, sorted."""
+    """Yield the ids of the claimed applications, or of the claimed connections, sorted."""
     yield from sorted(claim.subject.id for claim in claims if claim.subject.kind is kind)

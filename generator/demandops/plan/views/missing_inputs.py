@@ -1,8 +1,8 @@
 """Missing inputs: topics that applications need, but that no longer arrive.
 
-A demand that needs a connection gets the connection, or a warning. Later an override may suspend
-the connection, its demands may release it, or people may take a node or an output out of the
-configuration.
+A demand that needs a connection gets the connection, or its requester gets a warning. Later an
+override may suspend the connection, its demands may release it, or people may remove a node or an
+output from the configuration. Then a topic no longer arrives.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from demandops.plan.overrides.claim_overrides import without_suspended
 
 @dataclass(frozen=True, slots=True)
 class MissingInput:
-    """A topic that does not arrive: the application, the claim that needs it, and why."""
+    """A topic that does not arrive: the application, the file of its claim, and the reason."""
 
     application: str
     file: str
@@ -34,7 +34,7 @@ class MissingInput:
 
 
 def missing_inputs(world: World) -> list[MissingInput]:
-    """Return the topics that do not arrive, sorted; suspended claims are skipped."""
+    """Return the topics that do not arrive, sorted; suspended claims need no topics."""
     active = without_suspended(world)
     found = {
         MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)

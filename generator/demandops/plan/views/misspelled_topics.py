@@ -1,7 +1,7 @@
 """Warnings about misspelled topics: those that differ by a letter from a known topic of the node.
 
-Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ by a
-digit, or by a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two different topics.
+Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ in a
+digit, or in a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two correct topics.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SHORT = 4
 
 
 def notes(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each misspelled topic that a request lists."""
+    """Yield a warning for each misspelled topic in a request."""
     if request.adds_claims:
         known = _KnownTopics(world)
         for one in request.demanded:
@@ -30,7 +30,7 @@ def notes(request: DemandRequest, world: World) -> Iterator[str]:
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield a warning for each misspelled topic of a claim."""
+    """Yield a warning for each misspelled topic in the claims of a world."""
     known = _KnownTopics(world)
     for claim in sorted(world.ledger, key=lambda one: claim_file.path_of(one.key)):
         for note in known.notes_on(claim.held):
@@ -47,7 +47,7 @@ class _KnownTopics:
         self._told: set[tuple[str, str]] = set()
 
     def notes_on(self, held: Application | Connection) -> Iterator[str]:
-        """Yield a warning for each misspelled topic; each topic of a node gets only one warning."""
+        """Yield a warning for each misspelled topic, but only one for each topic of a node."""
         if isinstance(held, Application):
             for role, one in held.all_inputs():
                 known = self._of(one.source) | self._usual(role, one.source)
@@ -85,8 +85,8 @@ class _KnownTopics:
 def _is_misspelling(one: str, other: str) -> bool:
     """Return whether ``one`` may be a misspelling of ``other``.
 
-    In a word of at least four letters, ``one`` has one wrong, missing or additional letter, or two
-    letters that changed places.
+    It is one if both differ only in a word of at least four letters. In this word, ``one`` must
+    have one wrong, missing or additional letter, or two letters in the wrong order.
     """
     start = _common(one, other)
     end = _common(one[start:][::-1], other[start:][::-1])
@@ -100,5 +100,5 @@ def _is_misspelling(one: str, other: str) -> bool:
 
 
 def _common(one: str, other: str) -> int:
-    """Return how many characters two texts have in common at their start."""
+    """Return how many characters are the same at the start of two texts."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))

@@ -1,4 +1,4 @@
-"""The nodes and what they are used for, as a list for people."""
+"""The nodes, and what uses each of them, as a list for people."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from demandops.subject import SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class UsedNode:
-    """A node of the inventory, or one that claims still name, and what it is used for.
+    """A node that the inventory has or that claims name, and what uses the node.
 
     ``releases`` are the releases that run on the node. ``applications``, ``connections`` and
-    ``requesters`` come from the claims that need the node. A claim that only reads an input from
-    the node is among them.
+    ``requesters`` come from the claims that need the node. These include claims that only read an
+    input from the node.
     """
 
     name: str
@@ -39,7 +39,10 @@ class UsedNode:
 
 
 def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
-    """Return every node, sorted by id; ``releases`` are all releases that run."""
+    """Return every node, sorted by id.
+
+    ``releases`` are all releases that run.
+    """
     running: defaultdict[str, list[str]] = defaultdict(list)
     for release in releases:
         running[release.node.id].append(release.name)

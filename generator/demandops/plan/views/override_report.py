@@ -1,4 +1,4 @@
-"""The override report: what each override does now, for ``get overrides`` and ``check``."""
+"""The override report, for ``get overrides`` and ``check``: the effect of each override now."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of_claims
 
 State = Literal["in force", "held back", "expired", "matches nothing", "not rendered yet"]
-"""What an override does now.
+"""The state of an override.
 
 ``held back``: another override with ``hold`` keeps every file that this override would change.
 ``not rendered yet``: a generator has not written the changed files yet
@@ -28,7 +28,7 @@ State = Literal["in force", "held back", "expired", "matches nothing", "not rend
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An override, and the releases and claims that it applies to now."""
+    """An override, and the releases and claims to which it applies now."""
 
     override: Override
     state: State
@@ -70,7 +70,10 @@ def _name(release: Release) -> str:
 
 
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Yield (file, warning) for each override that does nothing, or makes topics appear twice."""
+    """Yield (file, warning) for each override that has no effect or doubles messages.
+
+    Messages are doubled if several replicas publish the same outputs.
+    """
     for entry in entries:
         override = entry.override
         if entry.state == "expired" and override.end:
@@ -80,19 +83,19 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
                 "or write a later time",
             )
         elif entry.state == "matches nothing":
-            yield override.path, "matches nothing now; if it should, correct select"
+            yield override.path, "matches nothing now; if it should match something, correct select"
         elif entry.state == "held back":
             yield (
                 override.path,
                 "changes nothing while an override with hold keeps the same files; remove one of "
-                "the two, or give this one a higher priority",
+                "the two overrides, or give this one a higher priority",
             )
         elif doubled := sorted({*_doubled(entry)}):
             yield (
                 override.path,
                 f"runs {override.replicas} replicas of {' and '.join(doubled)}, each of which "
-                "publishes every output; keep one, or say dividesWork: true in the application "
-                "definition if the program divides its work",
+                "publishes every output; run only one, or set dividesWork: true in the application "
+                "definition if the program divides its work among replicas",
             )
 
 
@@ -103,9 +106,9 @@ def _is_held(release: Release, override: Override) -> bool:
 
 
 def _doubled(entry: Entry) -> Iterator[str]:
-    """Yield each service that publishes every message several times because of an override.
+    """Yield each service whose messages are published several times because of an override.
 
-    The override runs several replicas of the service, and each of them publishes every output.
+    The override runs several replicas of the service, and each replica publishes every output.
     """
     for release in entry.releases if (entry.override.replicas or 0) > 1 else ():
         if isinstance(release, ServiceRelease):
@@ -115,7 +118,7 @@ def _doubled(entry: Entry) -> Iterator[str]:
 
 
 def _releases(world: World) -> dict[str, list[Release]]:
-    """Return override → the releases that it changes or denies."""
+    """Return a map from override to the releases that it changes or denies."""
     found = defaultdict[str, list[Release]](list)
     for key in all_keys(world):
         release = plan(world, key)
@@ -130,7 +133,7 @@ def _releases(world: World) -> dict[str, list[Release]]:
 
 
 def _claims(world: World) -> dict[str, list[Claim]]:
-    """Return override → the claims that it suspends or would keep."""
+    """Return a map from override to the claims that it suspends or whose subjects it keeps."""
     found = defaultdict[str, list[Claim]](list)
     for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
         by = [suspended_by(claim, world), *claim_overrides.keeping_overrides(claim, world)]

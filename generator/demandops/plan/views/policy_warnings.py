@@ -1,8 +1,9 @@
-"""Warnings about access domains, nodes and places, which ``demandops check`` shows.
+"""Warnings about access domains, nodes and requirements on nodes, which ``demandops check`` shows.
 
-Some report what the cluster will refuse or what demands cannot get, others an access that the
-cluster cannot prevent. They are not faults. For example, a chart may render a refused kind only
-with certain values, and only Helm can find that out.
+Some warnings report what the cluster will refuse or what demands cannot get. Others report an
+access that the cluster cannot prevent. None is a fault, because the check may not know enough. For
+example, a chart may render a refused kind only with certain values, and only Helm can find that
+out.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _CRDS = re.compile(r"(.*/)?crds/.*")
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield every warning of this module, each located in the file that causes it."""
+    """Yield each warning, located in the file that causes it."""
     config = world.config
     yield from _charts(config)
     yield from _open_by_host_network(config)
@@ -46,7 +47,7 @@ def warnings(world: World) -> Iterator[Fault]:
 
 
 def _drained(world: World) -> Iterator[Fault]:
-    """Yield a warning for each drained node: which applications will move, and which stay."""
+    """Yield a warning for each application or service on a drained node: it moves, or why not."""
     for node in world.config.drained_nodes:
         if world.ledger.applications_on.get(node):
             drain = with_moves(Drain(node), world, whole_usage(world))
@@ -56,7 +57,7 @@ def _drained(world: World) -> Iterator[Fault]:
 
 
 def _unfit_places(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each service whose requirements no node meets."""
+    """Yield a warning for each requirement of a service that no node meets."""
     services = {
         (service.file, service.name): service
         for of in config.services.values()
@@ -70,7 +71,7 @@ def _unfit_places(config: Config) -> Iterator[Fault]:
         if not problems and all(any(lacks(node, asked)) for node in config.nodes.values()):
             problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
         for problem in problems:
-            message = f"{problem}; demands that need '{name}' are refused"
+            message = f"{problem}, so demands that need '{name}' are refused"
             yield fault(field, message).within(file)
 
 
@@ -78,8 +79,8 @@ def _above_capacity(world: World) -> Iterator[Fault]:
     """Yield a warning for each node on which services request more than its capacity."""
     for node, excess in overcommitted(world, whole_usage(world)):
         message = (
-            f"{excess}; running services stay, but nothing more is booked there; raise the "
-            "capacity, or move something"
+            f"{excess}; running services stay, but nothing more is booked on this node; raise the "
+            "capacity, or move something to another node"
         )
         file = world.config.file_of(NODES_FILE, node.id)
         yield fault("", f"'{node.id}': {message}").within(file)
@@ -100,15 +101,15 @@ def _connections_of_before(world: World) -> Iterator[Fault]:
     for (name, other), count in sorted(counts.items()):
         message = (
             f"no rule of access domain '{name}' has '{other}' in its peers; the existing "
-            f"connections between them ({count}) stay, but cannot be demanded again"
+            f"connections between the two domains ({count}) stay, but cannot be demanded again"
         )
         yield fault("", message).within(world.config.file_of(DOMAINS_FILE, name))
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each access domain whose network is not separate from other domains.
+    """Yield a warning for each access domain whose network is open to other domains.
 
-    The cause is that pods of the domain use the host's network.
+    The network is open because pods of the domain use the network of the host.
     """
     nodes = [
         (config.domain_of[node.id].name, node)
@@ -133,8 +134,8 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
             listed = " and ".join(f"'{one}'" for one in names)
             message = (
                 f"access domains {listed} share ROS domain {number} on the host's network of "
-                f"cluster '{cluster}', where each may read and write the other's topics; give "
-                "each its own ros.domainId"
+                f"cluster '{cluster}', so each may read and write the topics of the others; give "
+                "each access domain its own ros.domainId"
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
 
@@ -147,7 +148,7 @@ def _listed(ids: list[str]) -> str:
 def _charts(config: Config) -> Iterator[Fault]:
     """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
 
-    A kind that cannot be read from the chart's files gets a warning, too.
+    There is also a warning for each kind that cannot be read from the chart's files.
     """
     for folder, domains in sorted(_domains_of_charts(config).items()):
         yield from _dependencies(folder, config.files)
@@ -161,7 +162,10 @@ def _charts(config: Config) -> Iterator[Fault]:
 
 
 def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return chart folder → the access domains whose rules allow applications with the chart."""
+    """Return the access domains in which each chart may run, as chart folder → access domains.
+
+    In these domains, a rule allows an application that uses the chart.
+    """
     found: dict[str, list[AccessDomain]] = {}
     for appdef, services in config.services.items():
         domains = [
@@ -186,7 +190,7 @@ def _template(path: str, text: str, domains: list[AccessDomain], config: Config)
             yield from _refused(path, line, plain[1], domains, config)
         else:
             message = (
-                f"kind {quoted(value)} is computed; check yourself that its access domain allows it"
+                f"kind {quoted(value)} is computed; check yourself that the access domain allows it"
             )
             yield fault("", message, line=line).within(path)
 
@@ -198,8 +202,9 @@ def _refused(
         if kind not in {allowed.kind for allowed in domain.allowed_kinds}:
             file = config.file_of(DOMAINS_FILE, domain.name)
             message = (
-                f"{kind} is not among the kinds of access domain '{domain.name}', whose cluster "
-                f"refuses it if the chart renders it; add it to kinds in {file}, or leave it out"
+                f"{kind} is not among the kinds of access domain '{domain.name}', so the cluster "
+                f"refuses such an object if the chart renders one; add {kind} to kinds in {file}, "
+                "or remove it from the chart"
             )
             yield fault("", message, line=line).within(path)
 
@@ -210,6 +215,6 @@ def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
         if one.folder is None and f"{folder}/charts/{one.name}/Chart.yaml" not in files:
             message = (
                 f"{quoted(one.name)} is not unpacked in charts/, so its kinds are not known; "
-                "check yourself that its access domain allows them"
+                "check yourself that the access domain allows them"
             )
             yield fault(f"dependencies[{one.index}]", message).within(f"{folder}/Chart.yaml")

@@ -1,4 +1,4 @@
-"""The explanation of a release: the claims that need it, and people's files that shape it."""
+"""Why a release runs as it does: the claims that need it, and the files of people that shape it."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from demandops.subject import Subject
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run; with a ``subject``, only those that claims on it need."""
+    """Yield the releases that run; with ``subject``, only those that claims on ``subject`` need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
 
 def release_named(world: World, name: str) -> Release | None:
-    """Return the release with a name, or ``None`` if none runs."""
+    """Return the running release that is called ``name``, or ``None`` if there is none."""
     return next((one for one in releases(world) if one.name == name), None)
 
 
@@ -38,19 +38,22 @@ def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
 
 
 def by_booking(claims: Iterable[Claim]) -> list[Claim]:
-    """Return claims sorted by their booking time."""
+    """Return the claims sorted by their booking time."""
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
 def needs(claim: Claim, release: Release) -> bool:
-    """Return whether a claim on a release's application or connection needs the release."""
+    """Return whether a claim needs a release.
+
+    The claim must be on an application or connection of the release.
+    """
     if not isinstance(release, ServiceRelease):
         return True
     return takes(claim.application, release.service, release.key)
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return version → requesters for each version that claims on a service's applications name."""
+    """Return the versions that claims on a service's applications name, as version → requesters."""
     found: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:
@@ -59,7 +62,7 @@ def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[st
 
 
 def how_to_release(claim: Claim) -> str:
-    """Return, in words, how the requesters release a claim."""
+    """Return, in words, how the holders of a claim release it."""
     if claim.keeping_override is not None:
         return f"remove keep from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
@@ -68,7 +71,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
-    """Return (file, entry, what the entry decides) for each entry that shapes a release."""
+    """Return (file, entry, what the entry decides) for each file entry that shapes a release."""
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}
@@ -86,6 +89,9 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
 
 
 def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
-    """Return the denied release with a name and the override that denies it, or ``None``."""
+    """Return the denied release that is called ``name``, and the override that denies it.
+
+    Return ``None`` if no denied release has this name.
+    """
     denied = (denied_release(world, key) for key in all_keys(world))
     return next((found for found in denied if found and found[0].name == name), None)

@@ -1,9 +1,9 @@
 """A plan that follows a sequence of ledgers, to verify commits.
 
 Planning is a function of ledger and configuration. The plan records which parts of the ledger were
-read for each release. If none of these parts changes, the release stays the same. Only the other
-releases are planned again. The generator predicts which releases a claim affects
-(:func:`demandops.plan.release_keys.affected_keys`). A proof must not rely on that prediction.
+read for each release. As long as none of these parts changes, the release stays the same, so only
+the other releases are planned again. The generator instead predicts which releases a claim affects
+(:func:`demandops.plan.release_keys.affected_keys`), but a proof must not rely on that prediction.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _Unit: TypeAlias = "Subject | ReleaseKey"
 _Read: TypeAlias = "Subject | tuple[str, ...]"
 
 _ALL: _Read = ("all",)
-"""The record of a read of the whole ledger."""
+"""The entry that records a read of the whole ledger."""
 
 
 class TracedPlan:
@@ -44,7 +44,7 @@ class TracedPlan:
     def advance(
         self, ledger: Ledger, changes: Iterable[ClaimChange], kept: Iterable[Instance] = ()
     ) -> dict[ReleaseKey, Release | None]:
-        """Plan again the releases that the changes may affect; at the first call, all releases.
+        """Plan the releases that the changes may affect; the first call plans all releases.
 
         Args:
             ledger: the ledger after the changes.
@@ -52,11 +52,12 @@ class TracedPlan:
             kept: every service instance whose kept replicas changed.
 
         Returns:
-            The releases that were planned again; ``None`` for one that does not run.
+            A map from the key of each planned release to the release, or to ``None`` if the release
+            does not run.
 
         Raises:
-            Refused: for the same reasons as :func:`demandops.plan.planner.plan`. This object is
-                then out of date and of no further use.
+            Refused: for the same reasons as :func:`demandops.plan.planner.plan`. Then this object
+                is out of date and must not be used again.
         """
         stale = {
             unit for read in (*_changed(changes), *kept) for unit in self._readers.pop(read, ())
@@ -102,13 +103,13 @@ def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
 
 @dataclass(frozen=True)
 class _RecordingKept:
-    """Kept replicas that record reads; planning reads only their :attr:`steps`."""
+    """Stands for the ledger's kept replicas; planning reads only their :attr:`steps`."""
 
     steps: _Recording
 
 
 class _Recording:
-    """A map of the ledger that records which keys are read."""
+    """Wraps one of the ledger's mappings, and records which keys are read."""
 
     def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
         self._map, self._reads = map, reads

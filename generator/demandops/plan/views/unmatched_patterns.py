@@ -1,4 +1,4 @@
-"""Warnings about misspelled or outdated patterns of the policy: they match nothing."""
+"""Warnings about patterns of the policy that match nothing: they are misspelled or outdated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from demandops.quoting import quoted
 def warnings(config: Config) -> Iterator[Fault]:
     """Yield a warning for each pattern of an access domain that matches nothing.
 
-    Patterns of requesters are not checked, because the repo has no list of requesters.
+    Patterns of requesters are not checked, because the state repo has no list of requesters.
     """
     for name, domain in sorted(config.domains.items()):
         file = config.file_of(DOMAINS_FILE, name)
@@ -29,7 +29,7 @@ def _patterns(
 ) -> Iterator[tuple[str, str, str, tuple[str, ...]]]:
     """Yield (field, pattern, kind, names) for each pattern of an access domain.
 
-    ``kind`` says in words what the pattern may match; ``names`` are all names of this kind.
+    ``kind`` says in words what the pattern may match. ``names`` are all names that it may match.
     """
     own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == domain.name))
     others = tuple(sorted(config.domains.keys() - {domain.name}))
