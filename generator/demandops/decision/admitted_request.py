@@ -51,7 +51,9 @@ def admitted(
     except Refused as refused:
         if any(found.code != NO_ROOM for found in refused.faults):
             raise
-        assert isinstance(goal, dict)  # noqa: S101 - a goal of another form has other faults
+        # the reference's action names no demand that could wait
+        if not isinstance(goal, dict) or not demand_goal.is_demand_goal(goal):
+            raise
         parsed = separate_instance.with_separate_instances(demand_goal.parse(goal)[0], state.config)
         known = state.ledger.waiting.get(parsed.demand)
         mine = known is None or {*known.requesters} & {*parsed.requesters()}

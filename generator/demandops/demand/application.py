@@ -317,6 +317,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
                 yield ("further", topic.part_in(self.own_version))
             if not topic.further:
                 yield ("usual", topic.source, role)
+                yield ("usual", topic.source, role, topic.topic)
         if self.version:
             yield ("version", self.id, self.version)
         for one in self.deliver:

@@ -144,7 +144,7 @@ class Ledger:
         The topic ``but`` is left out.
         """
         keys = self.index.get(("usual", source, role)) or ()
-        if len(keys) == len(self.index.get(("takes", source, but)) or ()):
+        if len(keys) == len(self.index.get(("usual", source, role, but)) or ()):
             return  # all these claims have the topic ``but``
         found = (claim for key in keys if (claim := self.get(key)))
         topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))

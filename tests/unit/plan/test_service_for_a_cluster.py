@@ -142,12 +142,12 @@ def test_its_node_counts_it_and_its_rules_hold() -> None:
         (
             "nodes: {c-its: cloud}\n",
             "",
-            "scope 'cluster' needs 'nodes', the node of each cluster",
+            "scope 'cluster' needs 'nodes' (the service's node in each cluster)",
         ),
         (
             "scope: cluster",
             "scope: node",
-            "scope 'cluster' needs 'nodes', the node of each cluster",
+            "scope 'cluster' needs 'nodes' (the service's node in each cluster)",
         ),
         (
             "nodes: {c-its: cloud}",
