@@ -130,7 +130,12 @@ def held(bare: Path) -> set[tuple[str, ...]]:
     [
         ("control-room", 10, "edge/d1", "no rule of access domain 'perception' is for 'control-ro"),
         ("user1", 2, "edge/d1", "'user1' would hold 3 claims"),
-        ("user1\u2060", 10, "edge/d1", "has the invisible character U+2060; choose an id without it"),
+        (
+            "user1\u2060",
+            10,
+            "edge/d1",
+            "has the invisible character U+2060; choose an id without it",
+        ),
         ("user1", 10, "edge-d1", "which application 'edge/d1' publishes on 'edge' already; use an"),
     ],
 )
