@@ -84,7 +84,7 @@ def test_a_vehicle_that_falls_silent_leaves_after_the_time_out() -> None:
 
 
 def test_a_leave_by_timeout_is_dated_at_the_last_pose_of_the_vehicle() -> None:
-    """The last pose is the cause of the leave, which comes later by the rules' timeout."""
+    """The last pose is the cause of the leave. The leave follows after the timeout of the rules."""
     silent = routes.vanishing(routes.one(0, GAP_S), "vehicle00")
     enters, vanishes = causes(drive(silent, 60), NEAR, 60)
     assert enters == pytest.approx(GAP_S, abs=0.11)

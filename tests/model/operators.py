@@ -46,9 +46,9 @@ class Operators:
         }
 
     def take(self, goal: Goal) -> set[str]:
-        """Count a goal; return why the operators' counts differ from what the goal says.
+        """Count a goal as the reference's operators do; return why ours may count it otherwise.
 
-        A reason is the name of a row in docs/reference.md.
+        Each reason is the name of a row in docs/reference.md.
         """
         leaves = goal.get("shutdown", False)
         found = set[str]()

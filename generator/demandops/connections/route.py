@@ -24,10 +24,12 @@ class Route:
 
     ``source`` is the topic's name on the source node, and ``target`` its name on the target node.
     With ``reverse``, messages go from the target to the source. ``type`` is the ROS message type
-    (``std_msgs/msg/String``), empty if not given. The options are ``qos`` (MQTT, 0 to 2),
-    ``retained`` and ``primitive`` (MQTT), ``reliability``, ``durability`` and ``queue`` (of the ROS
-    endpoints), and ``rate`` (the highest rate in Hz; 0 for all messages). An option that has its
-    default leaves the client's own behavior unchanged.
+    (``std_msgs/msg/String``), empty if not given. An option that has its default leaves the
+    client's own behavior unchanged.
+
+    The options of MQTT are ``qos`` (0 to 2), ``retained`` and ``primitive`` (the payload is plain
+    text or a number, not a ROS message). Those of the ROS endpoints are ``reliability``,
+    ``durability`` and ``queue``. ``rate`` is the highest rate in Hz, 0 for all messages.
     """
 
     source: str

@@ -73,9 +73,9 @@ class Ticket:
 
     ``base`` is the tip that was known when the demand arrived. ``maybe_published`` is true if the
     remote may have accepted a push of the demand although no answer arrived. ``has_released`` is
-    true if the demand released another demand that awaited approval, so that there may be no claims
-    to release. ``joined`` are tickets of the same operation id that arrived later. They get the
-    same answer.
+    true if the demand is a release and ended a demand that awaited approval. It then succeeds even
+    if it ends no claim. ``joined`` are tickets of the same operation id that arrived later. They
+    get the same answer.
     """
 
     operation: str

@@ -17,7 +17,7 @@ _REFRESH = "argocd.argoproj.io/refresh"
 
 
 class Domain(Namespace):
-    """The domain's namespace on one cluster; the Application `name` applies the folder."""
+    """The domain's namespace on one cluster; the Application `name` applies the domain's folder."""
 
     GITOPS = "argocd"
     RELEASE = "Application"

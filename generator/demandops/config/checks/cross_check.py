@@ -286,8 +286,8 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 f"appdefs/{appdef}/appdef.yaml",
                 f"uses.{name}.{service.each}",
-                f"is '{origin}', but with versions: separate each version has its own "
-                f"'{producer.name}', and the shared service '{name}' runs once for all versions; "
+                f"is '{origin}', and each version runs its own '{producer.name}' (versions: "
+                f"separate), but the shared service '{name}' runs once for all versions; "
                 f"define '{name}' in this appdef, or make '{producer.name}' a shared service too",
             )
 

@@ -64,7 +64,7 @@ def _refuse_distances(start: float, stop: float) -> None:
 
 
 class Near(_InArea):
-    """Starts when an entity is within ``start`` metres of an area; stops beyond ``stop`` metres."""
+    """A condition that starts within ``start`` metres of an area and stops beyond ``stop``."""
 
     start: Metres
     stop: Metres
@@ -76,7 +76,9 @@ class Near(_InArea):
 
 
 class Together(CamelModel):
-    """Starts when two entities are at most ``start`` metres apart; stops beyond ``stop`` metres.
+    """A condition that starts if two entities are at most ``start`` metres apart.
+
+    It stops if they are more than ``stop`` metres apart.
 
     Both entities are of ``source``, unless ``other`` names the source of the second one.
     """
@@ -93,7 +95,7 @@ class Together(CamelModel):
 
 
 class Count(_InArea):
-    """Starts with ``start`` or more entities within ``radius``; stops with ``stop`` or fewer.
+    """A condition that starts with ``start`` or more entities and stops with ``stop`` or fewer.
 
     ``radius`` is the largest distance to the area, in metres, at which an entity is counted.
     """
@@ -112,7 +114,7 @@ class Count(_InArea):
 
 
 class Threshold(CamelModel):
-    """Starts when a number is above or below a limit; stops when the number is back at ``stop``."""
+    """A condition that starts if a number passes a limit and stops if it is back at ``stop``."""
 
     source: DnsLabel
     field: FieldPath
@@ -149,7 +151,7 @@ def _zone(text: str) -> ZoneInfo:
 
 
 class Hours(CamelModel):
-    """Holds from one time of day to another, on certain days of the week."""
+    """A condition that holds from one time of day to another, on certain days of the week."""
 
     days: Annotated[
         tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],

@@ -68,9 +68,10 @@ def _number_for_text(text: str) -> str:
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
-    """Yield a fault for each id that is missing, changes, or is the same for two entities.
+    """Yield a fault for each id that is missing, that may change, or that two entities would share.
 
-    ``needed`` has the names in braces that each id must contain.
+    ``needed`` has the names in braces that the demand's id must contain. In a
+    ``DeploymentRequest``, the requesters of each item together must contain them.
     """
     data = template.data
     if template.action == "demand":

@@ -257,7 +257,10 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return the field of the request because of which a service runs, or an empty text."""
+    """Return the request's field that makes a service run: an application's id or a topic.
+
+    It is empty if no field of the request does.
+    """
     for one in request.demanded:
         if not isinstance(one.held, Application):
             continue

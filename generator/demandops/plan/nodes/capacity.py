@@ -62,7 +62,10 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return a map from (node, resource) to the growth of requests; equal requests are left out."""
+    """Return a map from (node, resource) to how much more is requested after than before.
+
+    A number is negative if less is requested. What stays the same is left out.
+    """
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}

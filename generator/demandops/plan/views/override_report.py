@@ -70,9 +70,9 @@ def _name(release: Release) -> str:
 
 
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Yield (file, warning) for each override that has no effect or doubles messages.
+    """Yield (file, warning) for each override that has no effect.
 
-    Messages are doubled if several replicas publish the same outputs.
+    An override by which several replicas publish the same outputs is warned of too.
     """
     for entry in entries:
         override = entry.override

@@ -63,9 +63,9 @@ class PollTimer:
         return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
-        """Return whether a fetch is due, which the caller then starts.
+        """Return whether a fetch is due; the caller then fetches.
 
-        A request after this call causes another fetch.
+        The fetch serves every earlier :meth:`request`. A later one makes another fetch due.
         """
         due = self.seconds_until_due() == 0.0
         if due:

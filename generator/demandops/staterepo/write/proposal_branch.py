@@ -66,7 +66,7 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        """Return the current commits of main and of the branches, or raise RemoteAway."""
+        """Return the commits of main and of the proposals' branches, or raise RemoteAway."""
         if self._remote is None:
             repo = Repository(self._repository.objects.path)
             names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
