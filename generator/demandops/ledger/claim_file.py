@@ -126,7 +126,7 @@ class _Route(RouteOptions):
 
 
 def _plain_route(value: object) -> object:
-    """Return the data of a route as a mapping; a plain text (``/b`` in ``/a: /b``) is its target."""
+    """Return the data of a route as a mapping; a text (``/b`` in ``/a: /b``) is the target."""
     return {"target": value} if isinstance(value, str) else value
 
 

@@ -20,7 +20,8 @@ from rpds import HashTrieMap
 
 from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel, parse_file
-from demandops.demand.demand_request import DemandRequest
+from demandops.demand import demand_goal
+from demandops.demand.demand_request import DemandRequest, Put
 from demandops.errors import InvalidInput
 from demandops.ledger.claim_file import (
     LEDGER_ROOT,
@@ -108,10 +109,18 @@ class _WaitingFile(FrozenModel):
 
 
 def read(text: str, path: str) -> WaitingDemand | None:
-    """Return the waiting demand in a file, or ``None`` if the file is not valid."""
+    """Return the waiting demand in a file, or ``None`` if the file is not valid.
+
+    A goal of the reference's action, or of another demand, makes a file not valid.
+    """
     try:
         file = parse_file(_WaitingFile, text, path)
     except InvalidInput:
+        return None
+    if not demand_goal.is_demand_goal(file.goal):
+        return None
+    put, _ = demand_goal.parse(file.goal)  # its faults are told when it is booked
+    if not isinstance(put, Put) or put.demand != file.demand:
         return None
     since = parse_timestamp(file.since)
     found = WaitingDemand(

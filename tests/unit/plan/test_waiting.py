@@ -135,7 +135,17 @@ def test_a_demand_that_holds_something_does_not_wait_for_more() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"kind": "Other"}, {"since": "soon"}, {"requesters": []}, {"demand": "x"}, {"x": 1}]
+    "change",
+    [
+        {"kind": "Other"},
+        {"since": "soon"},
+        {"requesters": []},
+        {"demand": "x"},
+        {"x": 1},
+        {"goal": {"id": "a", "apps": []}},
+        {"goal": {"kind": "Demand", "demand": "b", "requesters": ["v"]}},
+        {"goal": {"kind": "Demand", "operation": "release", "demand": "a", "requesters": ["v"]}},
+    ],
 )
 def test_a_file_that_a_person_broke_holds_nothing(change: dict[str, Any]) -> None:
     repo = full_repo()
