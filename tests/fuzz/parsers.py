@@ -107,9 +107,8 @@ def goal_as_yaml(data: bytes) -> None:
 
 def goal_as_data(data: Any) -> None:
     found = outcome(data)
-    of_reference = (
-        not isinstance(data, dict) or not {"kind", "apiVersion", "applications"} & data.keys()
-    )
+    ours = ("kind", "apiVersion", "applications")
+    of_reference = not isinstance(data, dict) or not any(str(key).startswith(ours) for key in data)
     if isinstance(found, tuple) and of_reference:
         assert_told(found)
 
