@@ -79,7 +79,7 @@ def parsed(data: dict[str, Any]) -> ContextsFile:
 
 
 def write(content: ContextsFile) -> None:
-    """Replace the file with the contexts; only its owner may read it."""
+    """Write the contexts to the file, which only its owner may read."""
     file = path()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)

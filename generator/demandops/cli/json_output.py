@@ -138,7 +138,7 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return as JSON data what a release is, and its cluster, access domain and node."""
+    """Return a release's description, cluster, access domain, namespace and node as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,

@@ -104,7 +104,8 @@ class Table:
     def _least(self, rows: list[list[list[str]]], at: int) -> int:
         """Return the smallest width that the column with index ``at`` may get.
 
-        This width cuts no word. A column that wraps gets ``_COMFORT`` if its text is that long.
+        This width cuts no word. A column that wraps gets at least ``_COMFORT``, unless its
+        text is shorter.
         """
         natural = self._natural(rows, at)
         if not self.columns[at].wraps:

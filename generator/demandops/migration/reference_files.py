@@ -144,7 +144,7 @@ class ObjectDetection(_Part):
 
     @property
     def topic(self) -> str:
-        """The topic of the point cloud that the command names; empty if the command names none."""
+        """The point cloud's topic in ``commandOverride``; empty if the command names no topic."""
         found = _CLOUD.search(" ".join(self.command))
         return found[1] if found else ""
 

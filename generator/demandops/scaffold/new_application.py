@@ -101,9 +101,9 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with a map from its input names to what the service reads there.
+    """Yield each service with a map from its input names to what these inputs read.
 
-    This is an input of the application, or an output of the service before.
+    An input reads an input of the application, or an output of the service before.
     """
     inputs = {role: role for role in plan.inputs}
     for service in plan.services:

@@ -77,8 +77,8 @@ class Demands:
             limit: how many demands may wait.
             requester_limit: how many demands of one requester may wait; None is no limit.
             runtime: provides the time and the threads.
-            bases: for the demands that earlier processes carried out: maps the operation id of each
-                to a commit that is older than the demand's own commit.
+            bases: a map from the operation id of each demand that main records to a commit that
+                is older than the demand's own commit.
         """
         self._journal = journal
         self._limit, self._requester_limit = limit, requester_limit

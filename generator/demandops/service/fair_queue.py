@@ -64,7 +64,7 @@ class FairQueue:
             self._barriers.append(queued)
 
     def put_back(self, tickets: Sequence[Ticket]) -> None:
-        """Put demands that left the queue back to its front, in the order in which they left."""
+        """Put demands back at the front of the queue, in the order in which they left it."""
         first = min((one.number for one in self._queued.values()), default=1) - len(tickets)
         again = {
             ticket: _Queued(number, ticket, subjects_of(ticket.goal))

@@ -162,7 +162,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """The error of each thread or task that has failed and not recovered yet, by its name.
+        """A map from thread or task to its error, for those that failed and have not recovered.
 
         Any thread may read this.
         """

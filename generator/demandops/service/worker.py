@@ -135,7 +135,7 @@ class Worker:
         """Answer a batch with an error; if the batch is empty, stop fetching for a while.
 
         Raises:
-            Unsound: if ``error`` is this error; the process must end, and the journal is kept.
+            Unsound: if ``error`` is one; then the process must end, and the journal is kept.
         """
         if isinstance(error, Unsound):
             self._demands.end(error)
@@ -296,10 +296,11 @@ class Worker:
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
-        """Publish a commit batch and answer its demands; return False if another writer was first.
+        """Publish a commit batch and answer its demands; False if another writer published first.
 
-        If the remote rejects the push for another reason, this error is the answer to all demands
-        except the first ``certain`` ones.
+        If another writer published first, no demand is answered. If the remote denies the push, the
+        demands after the first ``certain`` results get this error as their answer, unless they are
+        withdrawn.
 
         Args:
             commits: the commits of the demands.
@@ -365,7 +366,7 @@ class Worker:
             self._own_work.postpone()
 
     def _check_proposals(self) -> None:
-        """If a check is due, check against the newest main the demands that await approval."""
+        """Check the proposals, with the newest main, if a check is due."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:
@@ -388,7 +389,7 @@ class Worker:
     def _carry_out_changes(self) -> bool:
         """Publish the effects of people's changes; return whether this published a commit.
 
-        The changes are fetched already. Fetch again only if another writer was first.
+        The changes are fetched already. Fetch again only if another writer published first.
         """
         for _ in range(_TRIES):
             commits = self._new_commit_batch()

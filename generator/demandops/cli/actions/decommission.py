@@ -126,7 +126,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
-    """Return whether a node of the inventory holds nothing, and ``error`` has no other fault."""
+    """Return whether the goal names a node, and ``error`` says only that nothing is held."""
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 

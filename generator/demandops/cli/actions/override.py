@@ -101,9 +101,9 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
     """Create an override.
 
     The command commits the override to main in your own name, as git knows it. With --propose, it
-    commits to a branch instead. --application to --requester select what the override applies to:
-    all of these options that you give must match. Of a repeated option, one value must match
-    (docs/overrides.md).
+    commits to a branch instead. The options from --application to --requester select what the
+    override applies to. If you give several of them, all must match. If you repeat one, one of its
+    values must match (docs/overrides.md).
 
     \b
     Examples:

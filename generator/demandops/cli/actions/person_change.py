@@ -62,7 +62,7 @@ propose_option = click.option(
 
 
 def is_asked(yes: bool, output: str) -> bool:
-    """Return whether to ask for confirmation: only at a terminal, for text, without ``yes``."""
+    """Return whether to ask for confirmation: at a terminal, with text output, without ``yes``."""
     return not yes and output == "text" and sys.stdin.isatty()
 
 

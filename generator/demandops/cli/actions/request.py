@@ -49,7 +49,7 @@ class Document:
 
     @property
     def request_id(self) -> str:
-        """Return the id of the request or demand in the goal; empty without a valid one."""
+        """Return the id of the goal's request or demand; empty if the goal has no valid id."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
@@ -179,7 +179,10 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
 
 
 def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
-    """Return a row with a refusal for each document, because at least one does not parse."""
+    """Return one row of the output for each document, because at least one does not parse.
+
+    Each row is a refusal. A document that parses is refused because of the others.
+    """
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
     rows = []

@@ -127,8 +127,8 @@ def _roll_back(
     """Roll back with a generator; return the outcome as JSON data.
 
     ``base`` is the commit for which the caller has computed the consequences. The result contains
-    consequences only if those of the caller do not apply, because the rollback was refused, changed
-    nothing, or is based on a newer commit.
+    consequences only if the caller's are wrong: if the rollback was refused, changed nothing, or is
+    based on a newer commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:

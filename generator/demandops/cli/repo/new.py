@@ -387,7 +387,7 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 
 
 def _example_node(config: Config) -> str:
-    """Return the id of a node for the example demand: of an edge server if there is one."""
+    """Return the id of a node for the example demand; an edge server comes before other nodes."""
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not nodes:
         raise StateRepoError(

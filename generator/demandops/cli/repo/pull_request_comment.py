@@ -157,7 +157,7 @@ def _folded(summary: str, body: str) -> str:
 
 
 def _plain(path: str) -> str:
-    """Return a path as HTML, because a summary does not render Markdown."""
+    """Return a path as HTML for a ``<summary>``, in which Markdown is not rendered."""
     safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", one_line(path))
     return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
 
@@ -176,9 +176,9 @@ def _bounded(parts: list[str], longest: int) -> str:
         else:
             left += 1
     if left:
-        many = "One part" if left == 1 else f"{left} parts"
+        many = "One part of this report is" if left == 1 else f"{left} parts of this report are"
         taken.append(
-            f"\n{many} of this report left out because a comment has a limited length; "
+            f"\n{many} left out because a comment has a limited length; "
             "`demandops check` shows all.\n"
         )
     return "".join(taken)

@@ -30,8 +30,8 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     """Render commits again from their ledger and compare the bytes.
 
     Once the state repo has policy/allowed-signers, each further commit of the generator must have a
-    good signature by a key that the file lists in the commit before (docs/audit.md). REV, A and B
-    are commits or times.
+    good signature. The version of this file in the commit before must list the key (docs/audit.md).
+    REV, A and B are commits or times.
 
     \b
     Examples:

@@ -163,7 +163,7 @@ def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator
 
 
 def _demand_from(start: str, world: World) -> str | None:
-    """Return the id of the demand that begins with ``start``; None if there is none.
+    """Return the demand id that begins with ``start``; None if there is none.
 
     Raises:
         StateRepoError: if several demands have such an id.

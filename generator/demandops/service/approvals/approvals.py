@@ -57,7 +57,7 @@ from demandops.staterepo.write.proposal_branch import (
 log = logging.getLogger("demandops")
 
 _LONGEST_CHECK_S = 0.5
-"""How many seconds a check, which may push many branches, goes on while a demand waits."""
+"""After how many seconds a check, which may push many branches, pauses if a demand waits."""
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -158,8 +158,8 @@ class Approvals:
             return
         if proposal is None and (full := self._requester_over_limit(request)):
             message = (
-                f"{PROPOSAL_LIMIT} demands of {quoted(full)} await approval already; release some, "
-                "or ask a person to decide about them"
+                f"{PROPOSAL_LIMIT} proposals of {quoted(full)} await approval already; release "
+                "some of their demands, or ask a person to approve or reject some proposals"
             )
             self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
             return
@@ -416,7 +416,7 @@ class Approvals:
         self._demands.wake()
 
     def suspend(self) -> None:
-        """Answer all demands that await approval with an error, and keep them in the journal.
+        """Answer with an error all demands that await approval, and keep them in the journal.
 
         The next start resumes them.
         """

@@ -1,6 +1,6 @@
 """The delay until the next attempt to publish, and how many demands to publish at once.
 
-There are two kinds of delays: after another writer was first, and while the remote cannot be
+There are two kinds of delays: after another writer published first, and while the remote cannot be
 reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not flood a
 remote that comes back.
 """
@@ -13,7 +13,7 @@ FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
 """The longest delay while the remote cannot be reached."""
 LONGEST_TURN_S = 0.4
-"""The longest delay after another writer was first.
+"""The longest delay after another writer published first.
 
 A writer with a longer delay would lose again to writers that wait less.
 """
@@ -48,7 +48,7 @@ class Backoff:
         self._turn = self._away = FIRST_PAUSE_S
 
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
-        """Return the seconds to wait after another writer was first, and adjust ``max_demands``.
+        """Return the seconds to wait if another writer published first; adjust ``max_demands``.
 
         Args:
             size: how many demands the attempt tried to publish.

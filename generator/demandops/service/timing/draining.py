@@ -56,7 +56,7 @@ class Draining:
         return bool(self._due(world, self._runtime.now()))
 
     def _due(self, world: World, now: datetime) -> list[str]:
-        """Return the drained nodes with applications, except those that were just tried."""
+        """Return the drained nodes with applications, except nodes that were tried just now."""
         found = []
         for node in world.config.drained_nodes:
             config, at = self._tried.get(node, (None, now))

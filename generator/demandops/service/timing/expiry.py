@@ -47,9 +47,9 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        A demand gets no new ticket in the minute after its last ticket, if this was answered. The
-        tickets are correct only at the time of the call, because later a requester may have renewed
-        a lease, or a person may have set the clock.
+        Once a ticket is answered, its demand gets no new ticket until a minute after the old one
+        was made. The tickets are correct only at the time of the call, because later a requester
+        may have renewed a lease, or a person may have set the clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)

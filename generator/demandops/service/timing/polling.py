@@ -73,7 +73,7 @@ class PollTimer:
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Plan the next fetch at the end of a fetch, or of a push, which also finds new commits.
+        """Plan the next fetch, because a fetch or a push has ended; a push also finds new commits.
 
         ``reached`` says whether the remote could be reached. If it could not, the interval grows.
         """

@@ -1,4 +1,4 @@
-"""The pause after an error in which the worker does not fetch, but still publishes demands."""
+"""A pause after an error: the worker does not fetch, but still publishes demands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause after an error; each further error without a success doubles its length."""
+    """A pause after an error; it doubles with each further error until a success."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -20,7 +20,7 @@ class Rest:
 
     @property
     def follows_success(self) -> bool:
-        """Whether the last attempt succeeded, so no rest has begun since."""
+        """Whether no rest has begun since the last success, or since the start."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
