@@ -24,7 +24,7 @@ from demandops.subject import TopicKey
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger without the holds that a shutdown lists, and the changes.
 
-    If the same shutdown was carried out in the last 15 minutes, nothing changes.
+    If the ledger records the same shutdown in the last 15 minutes, nothing changes.
 
     Raises:
         Refused: if the requesters have none of the listed holds.
