@@ -94,7 +94,7 @@ def try_configuration(state: State) -> None:
     """Render trial demands, so that every appdef and every override in effect is tried once.
 
     Raises:
-        Refused, InvalidInput: if a template, its values or an override does not work. The faults
-            name the one that does not work.
+        Refused, InvalidInput: if a template, its values or an override does not work. Each fault
+            names what does not work.
     """
     trial_render.render_trial_demands(state, state.engine)

@@ -33,7 +33,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only newer generators write; they are for records of the nodes of services."""
+"""Folders that only newer generators write, for records of which node each service has."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
@@ -126,7 +126,7 @@ class _Route(RouteOptions):
 
 
 def _plain_route(value: object) -> object:
-    """Return the data of a route as a mapping; a text (``/b`` in ``/a: /b``) is the target."""
+    """Return a route's data as a mapping; if it is a text (``/a: /b``), the text is the target."""
     return {"target": value} if isinstance(value, str) else value
 
 

@@ -152,7 +152,7 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for each input in ``role`` that has ``part`` in topic names.
+        """Yield (input, version) for inputs in ``role`` that ``part`` stands for in topic names.
 
         ``part`` is the text that replaces ``{instance}`` in output patterns. Only further topics
         and the inputs of separate instances are yielded. ``version`` is the version of the separate
@@ -183,7 +183,7 @@ class Ledger:
         return self._ids("moved")
 
     def is_only_kept(self, subject: Subject) -> bool:
-        """Return whether no demand holds ``subject``, so that only overrides may keep it."""
+        """Return whether ``subject`` has no claims except those that overrides keep."""
         return len(self.claims.get(subject) or ()) == len(self.kept_claims(subject))
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:

@@ -96,10 +96,7 @@ def version_of_instance(app: Application, service: Service) -> str:
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
-    """Return the keys of those topics of an application for which a service instance runs.
-
-    These are topics that demands list as inputs.
-    """
+    """Return the keys of an application's inputs for which the service instance at ``key`` runs."""
     if service.root is not None:
         found = app.inputs_from(service.root, str(key.source), str(key.topic))
         return [(service.root, one.topic, one.source) for one in found]

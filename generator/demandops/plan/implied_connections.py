@@ -28,10 +28,10 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
-    """Return the field of the goal that a fault of an implied connection names.
+    """Return the field of the goal to name in a fault at ``path`` of an implied connection.
 
-    If the fault is in a requester, this is ``path``. For any other fault, it is ``field``, which is
-    the input, delivery or node because of which the connection is needed.
+    A fault in a requester names ``path``. Any other fault names ``field``, the input, delivery or
+    node because of which the connection is needed.
     """
     return path if path.startswith("requesters") else field
 

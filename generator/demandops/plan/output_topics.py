@@ -49,7 +49,7 @@ def instance_of(config: Config, role: str, topic: InputTopic, version: str = "")
 
 
 def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text by which topic names differ that are made from the same source.
+    """Return the text that makes topic names differ although their source is the same.
 
     The text contains ``topic`` if ``topic`` is a further topic of its source, and ``version`` if
     it is not empty. In any other case, the text is empty.
@@ -115,7 +115,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return the ledger with ``further`` set in the inputs of its claims.
+    """Return the ledger with ``further`` set in each input that is a further topic.
 
     The claims are of an earlier format without ``further``. The usual topic of a source is the one
     in the inventory or, if there is none, the one that was booked first.
@@ -134,7 +134,7 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
 
 
 def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
-    """Yield (role, topic) for each input in a role with one service instance for each topic."""
+    """Yield (role, topic) for each input that may have a service instance of its own."""
     for role in config.roles_with_services:
         for topic in app.inputs.get(role, ()):
             yield role, topic

@@ -48,7 +48,7 @@ def update_ledger(
     Args:
         before, after: the world before and after the change.
         subjects: the subjects whose claims a person changed.
-        markers: a map from path to text that has each marker in the ledger.
+        markers: all markers in the ledger, as a map from path to text.
         now: the current time. A new override whose end has passed does not apply.
     """
     known = {one.name: one for one in before.overrides}

@@ -293,7 +293,7 @@ class _ClaimedConnections:
         """Return the connection with an id, or ``None`` if no claim has it with this type.
 
         Raises:
-            Refused: if a person wrote a claim that a connection of this type cannot carry, or
+            Refused: if a person wrote a claim with a route that this type cannot carry, or
                 removed from the inventory what the connection needs.
         """
         first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)

@@ -31,7 +31,7 @@ def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator
     """Yield the keys of the releases that the claims on ``subject`` need, without suspended claims.
 
     If the definition of the application is missing, nothing is yielded. With ``strict``, this
-    raises ``Refused`` instead, because a deleted definition must not stop running services.
+    raises ``Refused`` instead, so that no service ends because its definition was deleted.
     """
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)

@@ -48,7 +48,7 @@ def replicas_of(
     requesters.
 
     Raises:
-        Refused: if the parameter that names a size has a value that is not a size.
+        Refused: if the parameter that chooses one of ``scaling.sizes`` has any other value.
     """
     if scaling.autoscaler:
         return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
@@ -86,7 +86,7 @@ def with_kept(
 
 
 def overridden(replicas: int | Autoscaler, by: int) -> int | Autoscaler:
-    """Return the replicas after an override sets ``by``; an autoscaler gets it as both bounds."""
+    """Return the replicas after an override sets ``by``; ``by`` is both bounds of an autoscaler."""
     return Autoscaler(by, by, replicas.targets) if isinstance(replicas, Autoscaler) else by
 
 

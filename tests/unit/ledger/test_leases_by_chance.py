@@ -46,7 +46,10 @@ def restart(world: running.World, random: Random) -> None:
 
 
 def assert_released(world: running.World, promises: Promises, now: int) -> None:
-    """Release the expired demands; check that these are all that must go, and only such as may."""
+    """Release the expired demands.
+
+    Check that every claim that must end is released, and only claims that may end.
+    """
     before = set(claims_of(world.state.ledger))
     demands = world.look()
     assert len(demands) == len(set(demands))

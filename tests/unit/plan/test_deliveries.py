@@ -1,4 +1,4 @@
-"""A delivery ends with the inputs of its output, also if the node of an input is decommissioned."""
+"""A delivery ends when the inputs of its output end, also if their node is decommissioned."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ class Origin(NamedTuple):
 
     ``kind`` says where the topics are made: ``source`` means at their sources, ``topic`` means one
     for each input topic at the node of an application, and ``once`` means a single topic for an
-    application, a node or a cluster. ``roots`` are the roles from which the topics are made. It is
-    empty if ``kind`` is ``once``.
+    application, a node or a cluster. ``roots`` are the roles from which the topics are made;
+    ``roots`` is empty if ``kind`` is ``once``.
     """
 
     name: str
@@ -55,8 +55,8 @@ class Graphs:
     ) -> None:
         """Make the definitions; some services get the fields of ``place``.
 
-        Only services for an application get these fields or, with ``each``, also services for a
-        topic.
+        These are services that run once for an application. With ``each``, services that run once
+        for each topic may get these fields too.
         """
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}

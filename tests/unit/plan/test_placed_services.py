@@ -226,7 +226,7 @@ def test_its_access_domain_must_permit_and_approve_it() -> None:
     rule = {"name": "others", "requesters": ["w"]}
     refused = repo_with(domains(rules=[rule]), cloud=GPU).take(DEMAND)
     assert isinstance(refused, Refused)
-    assert "'cloud' is in access domain 'cloud', which does not permit it" in str(refused)
+    assert "'cloud' is in access domain 'cloud', which does not permit this demand" in str(refused)
     alone = DEMAND | {"applications": [APP | {"connect": "none"}]}
     decision = repo_with(domains(approval="required"), cloud=GPU).send(alone)
     assert decision.approval == ("access domain 'cloud'",)

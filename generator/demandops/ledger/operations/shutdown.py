@@ -24,7 +24,7 @@ from demandops.subject import TopicKey
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger without the holds that a shutdown lists, and the changes.
 
-    A shutdown that repeats one of the last 15 minutes changes nothing.
+    If the ledger records the same shutdown in the last 15 minutes, nothing changes.
 
     Raises:
         Refused: if the requesters have none of the listed holds.

@@ -66,7 +66,7 @@ def _denied_field(override: Override, one: Demanded, services: list[Traits], con
 
 
 def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
-    """Return the field of ``one`` to report: the most specific field that a selector matches."""
+    """Return the most specific field of ``one`` that a selector matches; the fault names it."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
@@ -93,8 +93,8 @@ def _message(override: Override) -> str:
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
     """Yield a warning for each suspended claim that concerns a demand.
 
-    Such a claim has a requester of the demand. It is a claim of the demand itself, or a claim on an
-    application or connection that the demand lists.
+    A claim concerns the demand if it is the demand's own claim, or if it is on an application or
+    connection that the demand lists. The claim must also have a requester of the demand.
     """
     if not any(override.deny for override in world.overrides):
         return

@@ -198,10 +198,11 @@ def _publishers(
 def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of the instances of a service on a node that have ``instance`` in topic names.
+    """Yield the keys of a service's instances that ``instance`` stands for in topic names.
 
-    Not all of these instances need to run. ``but`` is the key of the instance for which clashes
-    are looked for. The topic of that instance does not count as the usual topic of its source.
+    The instances are on ``node``, and not all of them need to run. ``but`` is the key of the
+    instance for which clashes are looked for. The topic of that instance does not count as the
+    usual topic of its source.
     """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
@@ -252,7 +253,7 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
     file = config.file_of(NODES_FILE, str(key.source))
     if key.source == other.source:
         where = f"topics.{service.root} of '{key.source}' in {file}"
-        return f"list the usual topic of the two in {where}"
+        return f"choose one of the two topics as the usual one, and list it in {where}"
     return f"give '{key.source}' another id in {file}"
 
 

@@ -58,8 +58,8 @@ class Difference:
     def matters_to(self, asked: str) -> bool:
         """Return whether the difference concerns a demand that asks for version ``asked``.
 
-        If ``asked`` is empty, the demand names no version. Then the difference does not concern the
-        demand if other demands ask for the newer version, unless the policy refuses the difference.
+        It does if the demand names a version, if the demanded version is the newer one, or if the
+        policy refuses the difference. ``asked`` is empty if the demand names no version.
         """
         return bool(asked) or self.newer or self.is_refused
 
@@ -184,8 +184,8 @@ def _of_service(
     """Yield the version differences between the applications that share a service.
 
     For each application of the demand, the version of the service that this application needs is
-    compared with the version that the other applications of the release need. ``mine`` maps the id
-    of each application of the demand to the listed application and the version that it asks for.
+    compared with the version that the other applications need. ``mine`` maps the id of each
+    application of the demand to the listed application and the version that it asks for.
     """
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}

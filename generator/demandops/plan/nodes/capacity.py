@@ -1,9 +1,9 @@
 """Capacity: how much the running services request of each node, and how much the node has.
 
-Each replica of a service requests, on the node where it runs, what the service's definition says. A
-shared service counts once. Communication clients request nothing. To update :class:`Usage`, only
-the releases that a demand affects are planned again, so the cost of a demand depends on what the
-demand changes.
+Each replica of a service requests resources of the node where the replica runs. The service's
+definition says how much. A shared service counts once. Communication clients request nothing. An
+update of :class:`Usage` plans only the releases that a demand affects, so the cost of a demand
+depends on what the demand changes.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return a map from (node, resource) to how much more is requested after than before.
+    """Return a map from (node, resource) to how much more ``after`` requests than ``before``.
 
-    A number is negative if less is requested. What stays the same is left out.
+    A number is negative if ``after`` requests less. What stays the same is left out.
     """
     change = _requests(after, config)
     change.subtract(_requests(before, config))
@@ -161,7 +161,7 @@ class Room:
         self.book([claim])
 
     def book(self, claims: Iterable[Claim]) -> None:
-        """Subtract what these claims on applications need from the room of their nodes."""
+        """Reduce the room of the nodes by what these claims on applications need."""
         self._change(claims)
 
     def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:

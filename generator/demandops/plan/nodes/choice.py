@@ -35,7 +35,7 @@ _MOST_SHOWN = 5
 MOST_TRIED = 20
 """The highest number of nodes on which a booking is tried, because each trial takes time."""
 NO_ROOM = "no-room"
-"""The code of the fault that there are suitable nodes for an application, but none has room."""
+"""The code of the fault for an application that fits some nodes, of which none has room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +47,11 @@ class Chosen:
 
 
 Positions = Mapping[str, Position]
-"""Node → the position that a demand gives; the inventory has precedence."""
+"""A map from node to its position in a demand; a position in the inventory has precedence."""
 
 
 def requirement_of(service: Service) -> Requirement:
-    """Return what the definition of a service requires of the node of the service (``place``)."""
+    """Return what ``place`` in a service's definition requires of the node for the service."""
     place = service.place or Place()
     return Requirement(
         place.role,
@@ -269,7 +269,7 @@ class Choice:
             reasons += filter(None, [self._closed(node)])
             if not reasons and not self._is_permitted(node):
                 domain = self.config.domain_of[node.id].name
-                reasons.append(f"is in access domain '{domain}', which does not permit it")
+                reasons.append(f"is in access domain '{domain}', which does not permit this demand")
             elif not reasons and (shortage := self._shortage(node)):
                 reasons, code = shortage, NO_ROOM
             elif not reasons:
@@ -278,7 +278,7 @@ class Choice:
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
-        more = [f"{len(misses) - len(shown)} more do not"] if len(misses) > len(shown) else []
+        more = [f"{len(misses) - len(shown)} more do not fit"] if len(misses) > len(shown) else []
         message = f"no node fits: {'; '.join([*shown, *more]) or 'there is none'}"
         less = f"change place in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {self.config.place_of(NODES_FILE)}"

@@ -1,8 +1,8 @@
 """Placement: nodes for those applications and services for which a demand names no node.
 
 The nodes are chosen before the booking, and only from the configuration and the claims at one
-commit. A claim has chosen nodes in the same fields as nodes that the demand names, so later stages
-treat both alike.
+commit. A claim records a chosen node in the same field as a node that the demand names, so later
+stages treat both alike.
 """
 
 from __future__ import annotations
@@ -175,8 +175,7 @@ def may_wait(request: DemandRequest, world: World) -> bool:
     """Return whether a demand that lacks room may wait.
 
     Each application and service to place must fit a node of an access domain that lets demands
-    wait. On this node it must need no approval, because a person approves only what can be booked
-    at once.
+    wait, and must need no approval on that node. A person approves only what can be booked at once.
     """
     return all(
         any(_waits_for(node, request, choice) for node in choice.nodes())
@@ -210,7 +209,7 @@ def _choices(request: DemandRequest, one: Demanded, world: World) -> Iterator[Ch
 
 
 def _claim(request: DemandRequest, one: Demanded) -> Claim:
-    """Return the claim that a demanded application would get, with the latest booking time."""
+    """Return the claim that a demanded application would get if it were booked last of all."""
     demand = request.demand or demand_id(request.id, one.requesters)
     return Claim(one.held.booked(), demand, request.id, one.requesters, _LAST)
 
@@ -248,20 +247,20 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
 
 
 def _named_services(one: Demanded, app: Application, world: World) -> Iterator[Fault]:
-    """Yield a fault for each service if the named node lacks what the definition requires."""
+    """Yield a fault for each service whose named node lacks what the service requires."""
     for name in app.named:
         service = world.config.services.get(app.appdef, {}).get(name)
         node = world.config.nodes.get(app.services[name])
         if service and node and (lacking := list(lacks(node, requirement_of(service)))):
             message = (
-                f"{quoted(node.id)} lacks {joined(lacking)}, which {service.file} requires in "
-                "place; name another node, or name none for this service"
+                f"{quoted(node.id)} lacks {joined(lacking)}, which the service requires (place in "
+                f"{service.file}); name another node, or name none for this service"
             )
             yield one.fault(f"services.{name}", message, code="no-node")
 
 
 def _contradictions(one: Demanded, app: Application, claim: Claim) -> Iterator[Fault]:
-    """Yield a fault for each service that is booked on a node other than the demand names."""
+    """Yield a fault for each service that is booked on another node than the demand names."""
     for name in app.named:
         current = claim.application.chosen_node(name)
         if current != app.services[name]:
@@ -285,8 +284,8 @@ def _named(choice: Choice) -> Fault | None:
     if not lacking:
         return None
     message = (
-        f"{quoted(choice.app.node)} lacks {joined(lacking)}; name another node, or leave out node "
-        "or place"
+        f"{quoted(choice.app.node)} lacks {joined(lacking)}; name another node, or leave out one "
+        "of the fields node and place"
     )
     return choice.one.fault("place", message, code="no-node")
 

@@ -223,7 +223,7 @@ def following_overrides(
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a restoration that has services on the nodes that overrides name now."""
+    """Return a restoration whose services are on the nodes that overrides name now."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims

@@ -65,7 +65,7 @@ def traits_of(one: Claim | Demanded) -> Traits:
 
 
 def fits(selector: Selector, traits: Traits, config: Config) -> bool:
-    """Return whether a selector matches ``traits``, so each field of the selector matches."""
+    """Return whether each field that a selector has matches ``traits``."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
@@ -245,7 +245,9 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _needed(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the kept claim on a subject that no demand holds, or ``None`` if no override keeps it.
+    """Return the kept claim on a subject, or ``None`` if no override keeps the subject.
+
+    Callers ask only for a subject that no demand holds.
 
     Args:
         existing: the kept claims on the subject.

@@ -72,7 +72,7 @@ def _name(release: Release) -> str:
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
     """Yield (file, warning) for each override that has no effect.
 
-    An override by which several replicas publish the same outputs is warned of too.
+    There is also a warning if several replicas publish the same outputs because of an override.
     """
     for entry in entries:
         override = entry.override

@@ -47,7 +47,10 @@ def warnings(world: World) -> Iterator[Fault]:
 
 
 def _drained(world: World) -> Iterator[Fault]:
-    """Yield a warning for each application or service on a drained node: it moves, or why not."""
+    """Yield a warning for each application or service that is placed on a drained node.
+
+    The warning says where the application or service moves, or why it stays.
+    """
     for node in world.config.drained_nodes:
         if world.ledger.applications_on.get(node):
             drain = with_moves(Drain(node), world, whole_usage(world))
@@ -121,7 +124,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
         if config.domains[name].network == "namespace":
             ids = [node.id for _, node in group]
             message = (
-                f"network: namespace of access domain '{name}' has no effect on pods with the "
+                f"'network: namespace' of access domain '{name}' has no effect on pods with the "
                 f"host's network, as on {_listed(ids)}; set hostNetwork: false for these nodes, or "
                 "separate their network yourself"
             )
@@ -146,7 +149,7 @@ def _listed(ids: list[str]) -> str:
 
 
 def _charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
+    """Yield a warning for each Kubernetes kind that an access domain does not allow in a chart.
 
     There is also a warning for each kind that cannot be read from the chart's files.
     """
