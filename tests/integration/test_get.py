@@ -392,7 +392,7 @@ class TestStatus:
     def test_a_cluster_with_an_old_bootstrap_file_is_named(
         self, demandops: Run, fleet: GitRepo, tmp_path: Path
     ) -> None:
-        """A bootstrap file counts as old if the Kustomization lacks the file's annotation."""
+        """A cluster's file counts as old if its Kustomization lacks the current file's digest."""
         bootstrap = fleet.files()["bootstrap/c-its.yaml"]
         applied = next(
             one for one in yaml.safe_load_all(bootstrap) if one["kind"] == "Kustomization"

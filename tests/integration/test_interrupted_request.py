@@ -1,4 +1,4 @@
-"""After Ctrl-C or SIGTERM, a command that books ends at once and lists the answered demands."""
+"""`demandops request` ends at once after Ctrl-C or SIGTERM, and says which demands are answered."""
 
 from __future__ import annotations
 

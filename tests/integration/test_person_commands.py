@@ -1,4 +1,4 @@
-"""Commands with which a person makes overrides, suspends and approves demands in their own name."""
+"""Commands that a person runs in their own name, such as `override`, `suspend` and `approve`."""
 
 from __future__ import annotations
 

@@ -96,9 +96,9 @@ def _wait_until_it_listens(process: subprocess.Popen[bytes], port: int, log: Pat
 
 
 class Pod:
-    """The pod of a connection's end, without a cluster.
+    """The pod of one end of a connection, without a cluster.
 
-    Folders are its volumes, and its init containers run as processes.
+    Its volumes are folders, and its init containers run as processes.
     """
 
     def __init__(self, manifest: str, secrets: dict[str, dict[str, str]], folder: Path) -> None:

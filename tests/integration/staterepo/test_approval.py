@@ -675,7 +675,7 @@ def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petr
 
 
 def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Person) -> None:
-    """After a merge, the latched bookkeeping and the clusters' trigger depend on `on_publish`."""
+    """A listener of `on_publish`, like the ROS topic of the bookkeeping, is also told of merges."""
     heard = threading.Event()
     with rig.running(bare) as generator:
         proposed = Proposed(generator, goal(1))

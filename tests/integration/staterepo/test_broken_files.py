@@ -1,7 +1,7 @@
-"""While a file is not valid, the other files that people merge take effect.
+"""While a file is not valid, what people merge in other commits takes effect.
 
-A broken file holds back the other files of its commit, but no file of another commit. After a
-restart the same files are in effect, and every commit verifies by its trailers.
+A broken file holds back only the other files of its own commit. After a restart the same files are
+in effect, and every commit verifies by its trailers.
 """
 
 from __future__ import annotations

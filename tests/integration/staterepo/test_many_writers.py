@@ -35,7 +35,10 @@ PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
 
 def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
-    """Return one generator's demands by lane; of every three joins, one is followed by a leave."""
+    """Return one generator's demands: a list for each of its :data:`LANES` requesters.
+
+    Of every three joins, one is followed by a leave.
+    """
     lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(LANES)]
     left = DEMANDS // GENERATORS
     turn = 0

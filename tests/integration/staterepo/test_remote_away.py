@@ -161,7 +161,7 @@ def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_it
 def test_a_remote_that_cannot_take_the_push_is_told_or_warned_of(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The remote refuses the push without a hook, as it may do when its disk is full."""
+    """The remote itself, not a hook, refuses the push, as it may do when its disk is full."""
     with rig.running(url) as generator:
         rig.git(bare, "config", "receive.maxInputSize", "1")
         ticket = generator.submit(goal(1))

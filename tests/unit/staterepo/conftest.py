@@ -1,4 +1,4 @@
-"""Fixtures: a repo in memory that decides on goals, and an empty Git repository."""
+"""Fixtures: a state repo in memory, to which a test sends goals, and an empty Git repository."""
 
 from __future__ import annotations
 

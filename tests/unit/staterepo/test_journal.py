@@ -116,7 +116,7 @@ def test_a_damaged_journal_is_refused_with_the_line_and_the_remedy(path: Path, t
         Journal(path)
     assert str(error.value) == (
         f"{path}: line 1 is not what the generator wrote there; run `demandops journal --set-aside`"
-        " for this state repo, which moves the file away and lists its demands, then send again "
+        " for this state repo to move the file away and list its demands, then send again "
         "what is still needed"
     )
     assert path.read_bytes() != text, "the damaged file must stay as it is"

@@ -76,9 +76,9 @@ class _Proof:
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         self._held: dict[ReleaseKey, Release] = {}
-        """The releases whose files an override holds.
+        """The releases with an override that sets ``hold``.
 
-        The text of such a file depends on the parent commit.
+        The text of such a release's file depends on the parent commit.
         """
         base_files = manifests.base_files(state.config, state.engine)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
@@ -121,9 +121,10 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Plan and render the affected releases, and each release whose file an override holds.
+        """Plan and render the affected releases, and those with an override that sets ``hold``.
 
-        The affected releases are those of the claims in ``changes`` and of the instances ``kept``.
+        The affected releases are those of the claims in ``changes``, and those of the service
+        instances in ``kept``, whose kept replicas changed.
         """
         for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
             self._planned.pop(key, None)

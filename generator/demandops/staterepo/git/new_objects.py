@@ -68,7 +68,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository. Its writer keeps it open, because this reference to it is weak."""
+        """The repository. The writer must keep it open, because this object does not."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - its writer has a strong reference
         return repo

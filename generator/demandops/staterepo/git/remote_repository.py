@@ -111,7 +111,10 @@ HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
 HAS_TOKEN = re.compile(
     r"^https?://(gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-zA-Z]*\d)[a-zA-Z0-9]{32,}@)", re.I
 )
-"""Matches a URL whose user name is a token. Others are allowed, because some forges need one."""
+"""Matches a URL whose user name is a token.
+
+Other user names are allowed, because some forges need a user name.
+"""
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")

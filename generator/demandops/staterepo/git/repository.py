@@ -78,7 +78,7 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
     if number in _NOT_ALLOWED:
         return PushDenied(
             f"{address} cannot be written: {what}; let the generator's user write "
-            "all of its files and folders"
+            "all files and folders there"
         )
     if number in _BROKEN:
         return Unsound(f"{address} cannot be written: {what}; check its disk, then start again")

@@ -87,7 +87,7 @@ def _key_fault(key: Path, output: str) -> str:
     if "agent" in output or "No private key found" in output:
         return (
             f"signing key {key} is public, and no agent signs for it ({last.strip()}); run "
-            "`ssh-add` with the private key, and set SSH_AUTH_SOCK here too"
+            "`ssh-add` with the private key, and set SSH_AUTH_SOCK for this program too"
         )
     return f"signing key {key} cannot sign: {last.strip()}; name a private SSH key"
 

@@ -168,7 +168,8 @@ def is_readme(path: str) -> bool:
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
     """Write a changed tree, and return the new tree's id.
 
-    The new tree is ``base`` with the texts of ``files`` instead of its own; None removes a file.
+    The new tree is ``base``, but each path in ``files`` has the text that ``files`` maps it to, or
+    no file if the text is None.
     Only the folders above a changed file are written again. A folder that becomes empty is
     removed, because Git has no empty folders.
     """

@@ -1,8 +1,8 @@
 """Authors: who made the commits by people, and who runs this program.
 
-By a follow commit, the generator renders what people committed. The trailers of the follow commit
-name people's commits, and its author names these people. A commit is by a person if no generator on
-any machine made it (:mod:`.commit_log`).
+A follow commit is made by the generator, and renders what people committed. Its trailers name
+people's commits, and its author names these people. A commit is by a person if no generator on any
+machine made it (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _NO_ADDRESS = "@demandops.invalid"
 
 
 class Person(NamedTuple):
-    """Name and e-mail address of a person; as text ``name <email>``, as git shows it."""
+    """The name and e-mail address of a person; ``str`` gives ``name <email>``, as git does."""
 
     name: str
     email: str
@@ -78,7 +78,7 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 
 def author_of(commit: Commit) -> Person:
-    """Return the author of a commit, without characters that trailers and signatures forbid."""
+    """Return the author of a commit, without the characters that Git refuses in an author."""
     plain = commit_message.signature(*commit_log.author_of(commit), commit_log.time_of(commit))
     return Person(plain.name, plain.email)
 

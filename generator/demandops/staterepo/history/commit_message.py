@@ -173,8 +173,8 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     if isinstance(request, Wait):
         who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
         return f"Let {request.demand} wait", (
-            f"request '{request.id}' of demand '{request.demand}', received {time}, waits for room "
-            f"in the name of {who}: {reasons}."
+            f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "
+            f"{time}, waits for room: {reasons}."
         )
     if not changes:
         return f"Release {', '.join(decision.changes.waiting)}", (

@@ -24,7 +24,7 @@ _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-"""Matches a quoted value. Each has an escape, because a value that needs none is not quoted."""
+"""Matches a quoted value, which has an escape: a value without an escape is never quoted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,13 @@
 """The configuration at a commit, with the last valid versions of invalid files.
 
 If a file is invalid, its last valid version is in effect. The same holds for the files that apply
-only together with the invalid file. These are all files of each commit that changed it, because a
-commit applies whole or not at all, and the other files of its application definition. All other
-changes apply. If the result is still not valid, no change applies.
+only together with the invalid file:
+
+- all files of each commit that changed the invalid file, because a commit applies whole or not at
+  all;
+- the other files of the application definition, if the invalid file belongs to one.
+
+All other changes apply. If the result is still not valid, no change applies.
 """
 
 from __future__ import annotations

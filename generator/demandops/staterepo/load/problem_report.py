@@ -53,9 +53,9 @@ def with_origins(
 ) -> tuple[Problem, ...]:
     """Return a problem for each fault.
 
-    A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds them,
-    unless :func:`write` leaves the problem out of the report. A problem that is not in the report
-    counts as new again at each demand, so its commit would be searched each time.
+    A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds them.
+    A problem that :func:`write` leaves out of the report has neither, because the report cannot
+    keep them, and each demand would search the history for them again.
     """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     found = sorted({(fault.file, fault.field, fault.message) for fault in faults})

@@ -204,14 +204,14 @@ class Judgement:
     """The new ledger with the configuration that was in effect before."""
 
     def with_new_config(self) -> Advance:
-        """Return the state in effect with the new configuration, and the accepted changes."""
+        """Return ``advance`` without the changes at fault; the new configuration is in effect."""
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
         return self._without(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the state in effect with the old configuration, and the accepted changes.
+        """Return ``advance`` without the changes at fault; the old configuration is in effect.
 
         ``faults`` are the reasons why the new configuration is refused.
         """

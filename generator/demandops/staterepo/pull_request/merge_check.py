@@ -207,8 +207,9 @@ class _Edit:
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
         """Return the generated files before the merge, as path → text.
 
-        These are the files before the edit. But if a file of the merge target already equals the
-        file in ``wanted``, this text is returned, because then the merge does not change the file.
+        These are the files before the edit, with one exception. At a path where the merge target
+        already equals ``wanted``, the result equals ``wanted`` too, because the merge changes
+        nothing at this path.
         """
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():

@@ -36,7 +36,7 @@ class DamagedJournal(StateRepoError):
     def __init__(self, path: Path, line: int) -> None:
         super().__init__(
             f"{path}: line {line} is not what the generator wrote there; run `demandops journal "
-            "--set-aside` for this state repo, which moves the file away and lists its demands, "
+            "--set-aside` for this state repo to move the file away and list its demands, "
             "then send again what is still needed"
         )
 
@@ -305,7 +305,7 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         entry = JournalEntry(**record, proposal=proposal)
         received = datetime.fromisoformat(entry.received)
         if received.tzinfo is None or not 1970 <= received.year < UNSTARTED.year:
-            raise ValueError("the time has no zone, or no generator can have written it")
+            raise ValueError("the time has no zone, or a year that no generator writes")
         pending[entry.operation] = entry
     except (TypeError, LookupError, AttributeError, RecursionError) as error:
         raise ValueError("the line is not an entry") from error
