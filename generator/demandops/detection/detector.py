@@ -80,7 +80,7 @@ class Detector:
         return found
 
     def set_clock(self, seconds: float) -> None:
-        """Shift all recorded times by ``seconds``, because the clock was set by as much.
+        """Shift all recorded times, because the clock was set forward by ``seconds``.
 
         ``seconds`` is negative if the clock was set back.
         """
@@ -109,7 +109,7 @@ class Detector:
         return changed
 
     def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the values for the rule's template, from the start of the event.
+        """Return the template's values: the rule, the entities, and those from the event's start.
 
         The result is ``None`` if the template needs a value that is not known.
         """
