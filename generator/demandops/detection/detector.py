@@ -51,7 +51,7 @@ class Detector:
         """Continue the events whose demands were booked before the start; return what each wants.
 
         Args:
-            booked: each event, with the goal that started its demand. An event ends if there is no
+            booked: each event, with a goal that can end its demand. An event ends if there is no
                 longer a rule for it.
             now: the time.
             settle_s: how many seconds the events' entities may stay unseen until they count as

@@ -61,8 +61,8 @@ class DemandSender:
 
         Args:
             wants: the wanted demand of each event that has changed.
-            booked: each event whose demand was booked before the detector started, with the goal
-                that started the demand.
+            booked: each event whose demand was booked before the detector started, with a goal
+                that can end the demand.
         """
         with self._changed:
             for key, goal in (booked or {}).items():

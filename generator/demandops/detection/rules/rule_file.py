@@ -183,7 +183,8 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in seen:
-            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule its own")
+            message = f"'{rule.name}' appears twice; give each rule a name of its own"
+            yield fault(f"{where}.name", message)
         seen.add(rule.name)
         kind = next(name for name in CONDITIONS if getattr(rule, name) is not None)
         for part in ("source", "other"):
