@@ -30,9 +30,9 @@ _ASK_AGAIN_S = 0.2
 _WITH_GOAL_S = 10
 """How many seconds ROS keeps a goal that has ended."""
 _RESULT_S = 900
-"""How many seconds longer :class:`LastingResults` keeps the goal's result."""
+"""How many seconds :class:`LastingResults` keeps a result after ROS has forgotten the goal."""
 _MOST_RESULTS = 2_000
-"""How many results :class:`LastingResults` keeps; of more results, it forgets the oldest."""
+"""How many results :class:`LastingResults` keeps; if there are more, it forgets the oldest."""
 
 
 class DemandError(Exception):

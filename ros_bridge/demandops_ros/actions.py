@@ -50,7 +50,7 @@ class DeploymentRequestAdapter:
         return str(goal.id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level at which to answer a goal, or None if the goal names none."""
+        """Return None, because a goal of this action names no level at which to answer it."""
         return None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401

@@ -21,8 +21,8 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
 @click.command()
 @click.argument("file", metavar="FILE")
 @click.option("--hold", is_flag=True, help="Renew the demand until Ctrl-C, then release it.")
-@click.option("--release", is_flag=True, help="Release the demand of the file instead.")
-@click.option("--renew", is_flag=True, help="Renew the demand of the file instead.")
+@click.option("--release", is_flag=True, help="Do not put the demand of the file, but release it.")
+@click.option("--renew", is_flag=True, help="Do not put the demand of the file, but renew it.")
 @click.option(
     "--action",
     default=DEFAULT_DEMAND_ACTION_NAME,
@@ -78,7 +78,10 @@ def _read_document(file: str) -> dict[str, Any]:
     name, text = read_input(file)
     data = strict_yaml.load(text, name)
     if not isinstance(data, dict) or data.get("kind") != "Demand":
-        message = "must be a mapping with kind: Demand; for a DeploymentRequest: demandops request"
+        message = (
+            "the file must be a mapping whose kind is Demand; "
+            "demandops request sends a DeploymentRequest"
+        )
         raise InvalidInput([fault("kind", message).within(name)])
     return data
 

@@ -37,10 +37,10 @@ _DESCRIPTIONS = {
     "action_name": "Name of the action DeploymentRequest, which the reference's clients use.",
     "demand_action_name": "Name of the action Demand.",
     "answer": "When a DeploymentRequest is answered.",
-    "answer_timeout": "Most seconds that a goal waits to be reconciled or healthy.",
+    "answer_timeout": "How many seconds a goal may take to be reconciled or healthy.",
     "state_repo": "Folder or URL of the state repo.",
     "fetch_interval": "How often people's commits are fetched while no demand comes; 0 for never.",
-    "requester_queue_limit": "Most demands of one requester that may wait; more are refused.",
+    "requester_queue_limit": "How many demands of one requester may wait; more are refused.",
     "log_level": "Lowest level of messages in the log.",
 }
 

@@ -22,8 +22,8 @@ _RENAMES = re.compile(r".*__(node|name):=.*")
 _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?\.host")
 
 _REPLACED = {
-    "cluster_config": "a GitOps controller applies what is committed; --clusters gives access for "
-    "answers at reconciled or healthy",
+    "cluster_config": "a GitOps controller applies what is committed; give --clusters if the node "
+    "shall answer goals once they are reconciled or healthy",
     "helm_release_tag": "the GitOps controller removes releases that are no longer demanded",
     "url_application_registry": "registry/charts.yaml names where each chart comes from",
     "applications": "values of services are in the application definitions, appdefs/",

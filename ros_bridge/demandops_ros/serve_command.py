@@ -62,8 +62,8 @@ _FLUSH_S = 0.3
 @click.option(
     "--webhook",
     metavar="HOST:PORT",
-    help="Listen at this address for push notifications, and fetch at once: POST /push by GitHub, "
-    "GitLab, Gitea or Forgejo; see docs/operations.md. Off by default.",
+    help="Listen at this address for push notifications (POST /push) of GitHub, GitLab, Gitea or "
+    "Forgejo, and fetch when one arrives; see docs/operations.md. Off by default.",
 )
 @click.option(
     "--webhook-secret-file",

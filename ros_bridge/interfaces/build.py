@@ -5,7 +5,8 @@ ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works without any
 variable. In a ROS installation colcon builds the same packages, without this script.
 
 The environment has a record of what is installed. A build deletes the record before it changes the
-first installed file and writes a new one last, so an interrupted build never counts as finished.
+first installed file. It writes the new record as its last step. So an interrupted build never
+counts as finished.
 
 Exit codes: 0 installed or already up to date, 1 a requirement is missing (the message names it),
 2 usage, 3 a stage failed, 130 interrupted.
@@ -159,7 +160,7 @@ def missing(environ: Mapping[str, str]) -> list[str]:
             f"install with: apt-get install {' '.join(sorted(set(tools.values())))}",
         ]
     if not os.access(PREFIX, os.W_OK):
-        remedy = "run this as its owner, or in an environment of your own"
+        remedy = "run this script as its owner, or in an environment of your own"
         lines.append(f"{PREFIX} is not writable; {remedy}")
     return lines
 
@@ -280,7 +281,7 @@ def _environ() -> dict[str, str]:
 def _remove_installed(package: str) -> None:
     """Remove the files of an earlier build of a package.
 
-    Its interfaces may have had other names, so the new build may not overwrite its files.
+    The new build does not overwrite all of these files if interfaces have been renamed since.
     """
     index = PREFIX / "share" / "ament_index" / "resource_index"
     for path in (

@@ -1,4 +1,4 @@
-"""If the node is killed in bursts of goals, each accepted goal is booked, or refused in the log.
+"""The node is killed amid bursts of goals; each accepted goal is booked, or its refusal is logged.
 
 The node is killed three times by default, and a hundred times with ``GOAL_KILLS=100``.
 """

@@ -150,7 +150,7 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy_but_its_goal_
     told = 0
 
     def pass_time(seconds: int) -> None:
-        """Publish a fast clock until the node reports a time that is later by so many seconds."""
+        """Publish a fast clock until the node reports a time at least ``seconds`` later."""
         nonlocal told
         after, began = told, time.monotonic()
 

@@ -63,8 +63,8 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
 
 
 REPLACED = [
-    f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; --clusters "
-    "gives access for answers at reconciled or healthy",
+    f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; give "
+    "--clusters if the node shall answer goals once they are reconciled or healthy",
     f"parameter k3d_image_registry {UNUSED} set registry: k3d-registry.localhost:41671 in "
     "registry/images.yaml, and the names that the images have in that registry (docs/migration.md)",
 ]

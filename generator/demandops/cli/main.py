@@ -30,7 +30,7 @@ COMMANDS = {
     "config": ("repo", "List, set and choose contexts: the fleets that you work with."),
     "decommission": ("actions", "Release all claims of a node or a requester."),
     "demand": ("demandops_ros", "Send a demand to a running node."),
-    "detect": ("demandops_ros.detector", "Watch topics and demand by rules."),
+    "detect": ("demandops_ros.detector", "Watch topics, and send the demands that rules ask for."),
     "diff": ("views", "Show the differences between two commits."),
     "get": ("views", "List demands, nodes, services, overrides and so on."),
     "import": ("actions", "Import bookings from the paper's application manager."),

@@ -188,9 +188,9 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
 
 
 def _named_services(app: Application, appdef: str, config: Config) -> Iterator[Fault]:
-    """Yield a fault for each service that the demand names, but that gets no node by this.
+    """Yield a fault for each service for which the demand names a node in vain.
 
-    Such a service is unknown, must not be named by a demand, or is named with an empty node.
+    Such a service is unknown, a demand cannot name its node, or the named node is empty.
     """
     services = config.services[appdef]
     for name in app.named:

@@ -167,7 +167,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further inputs of a role for which ``part`` stands in topic names.
+        """Return those further inputs of a role for which topic names have the text ``part``.
 
         For a separate instance, the usual inputs of the role are returned too. The parts of all
         inputs are computed only once, because the plan of each service for a further topic needs

@@ -139,8 +139,8 @@ class Claim:
         """Return what is left of the claim without a node; ``None`` if nothing is left.
 
         An application loses its inputs from the node and its deliveries to it. A connection loses
-        the node as its broker. Nothing is left of an application with a service on the node, and of
-        a connection with an end there.
+        the node as its broker. Nothing is left of an application with a service on the node, or of
+        a connection that starts or ends at the node.
         """
         held = self.held.without_node(node)
         if held is None:

@@ -200,7 +200,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the path in the goal of a field of an application or connection, for faults.
+    """Return the path that a fault in an application or a connection names: a path in the goal.
 
     ``item`` is the path of the application or connection in the goal, and ``path`` is the field's
     path in the item. The requesters are a field of the goal itself.
@@ -211,7 +211,7 @@ def _field(item: str, path: str) -> str:
 
 
 def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield a fault for each given field that only a put may have."""
+    """Yield a fault for each field in a release or a renewal that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:
@@ -227,7 +227,10 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return the requirement in ``place``, or ``None`` if ``place`` is empty; add to ``faults``."""
+    """Return the requirement in ``place``, or ``None`` if ``place`` is empty.
+
+    A fault for each invalid text in ``place`` is added to ``faults``.
+    """
     if place == GoalPlace():
         return None
     told = {found.field for found in faults}

@@ -52,8 +52,8 @@ class Lease:
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
         """Return the lease as it starts at ``now``, when a person approves the claim.
 
-        If ``before`` is given, the lease that the claim had until now, the result is that lease
-        after a renewal, so it ends no earlier than ``before``.
+        ``before`` is the lease that the claim had until now, if it had one. Then the result is this
+        lease after a renewal, and ends no earlier than before.
         """
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)

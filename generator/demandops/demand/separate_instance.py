@@ -21,9 +21,10 @@ from demandops.demand.demand_request import AnyRequest, DemandRequest
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request, in which an application of another version than the default is separate.
+    """Return the request with separate instances for versions other than the default.
 
-    This holds for appdefs with ``versions: separate``.
+    Only appdefs with ``versions: separate`` have separate instances. In their applications, the
+    version replaces the channel that the request names.
     """
     demanded = (
         replace(one, held=_separated(one.held, config))

@@ -51,7 +51,7 @@ class Detector:
         """Continue the events whose demands were booked before the start; return what each wants.
 
         Args:
-            booked: each event, with the goal that started its demand. An event ends if there is no
+            booked: each event, with a goal that can end its demand. An event ends if there is no
                 longer a rule for it.
             now: the time.
             settle_s: how many seconds the events' entities may stay unseen until they count as
@@ -80,7 +80,7 @@ class Detector:
         return found
 
     def set_clock(self, seconds: float) -> None:
-        """Shift all recorded times by ``seconds``, because the clock was set by as much.
+        """Shift all recorded times, because the clock was set forward by ``seconds``.
 
         ``seconds`` is negative if the clock was set back.
         """
@@ -109,7 +109,7 @@ class Detector:
         return changed
 
     def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the values for the rule's template, from the start of the event.
+        """Return the template's values: the rule, the entities, and those from the event's start.
 
         The result is ``None`` if the template needs a value that is not known.
         """

@@ -29,7 +29,10 @@ class MessageReader:
     """Reads the messages of one source."""
 
     def __init__(self, file: RuleFile, source: str) -> None:
-        """Make a reader of those fields of the messages of ``source`` that ``file`` needs."""
+        """Make a reader for the messages of ``source``.
+
+        It reads only the fields that the source and the rules in ``file`` need.
+        """
         definition = file.sources[source]
         self._source = source
         self._entity = definition.entity and _getter(definition.entity)

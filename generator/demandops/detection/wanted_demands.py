@@ -143,7 +143,10 @@ class WantedDemands:
         return None
 
     def _owns(self, key: Key, goal: Goal) -> bool:
-        """Return whether no other event holds the goal's demand; if so, this event holds it now."""
+        """Return whether an event may send a goal, because no other event holds the goal's demand.
+
+        If so, this event holds the demand from now on.
+        """
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
     def next_at(self) -> float:

@@ -61,7 +61,8 @@ class DemandSender:
 
         Args:
             wants: the wanted demand of each event that has changed.
-            booked: the goals of events that were booked before the detector started.
+            booked: each event whose demand was booked before the detector started, with a goal
+                that can end the demand.
         """
         with self._changed:
             for key, goal in (booked or {}).items():

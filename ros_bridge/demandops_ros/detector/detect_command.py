@@ -20,7 +20,7 @@ from demandops.input_file import read_input
     type=click.Path(path_type=Path),
     metavar="BAG",
     help="Send nothing: try the rules on a recorded bag, a folder or an MCAP file, and print what "
-    "would be demanded. Needs no ROS, but the extra replay.",
+    "would be demanded. Needs no ROS; needs pip install 'demandops[replay]'.",
 )
 @click.option(
     "--plot",
@@ -33,7 +33,7 @@ from demandops.input_file import read_input
 def detect(
     ctx: click.Context, rules: str | None, bag: Path | None, plot: Path | None, output: str
 ) -> None:
-    """Watch topics and demand by rules.
+    """Watch topics, and send the demands that rules ask for.
 
     RULES is a file of rules (docs/detector.md); the ROS parameter rules can name it instead. The
     detector reads the file again when the file changes. Everything after --ros-args goes to ROS.

@@ -92,7 +92,10 @@ class DetectorNode(Node):  # type: ignore[misc]
         self.create_timer(1.0, self._report)
 
     def close(self) -> None:
-        """Stop the node. Its demands stay booked until their leases end, unless it starts again."""
+        """Stop the node. Its demands stay booked until their leases end.
+
+        If the node starts again in time, it continues with these demands.
+        """
         self._topics.close()
         self._sender.close()
 

@@ -34,7 +34,7 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
         (0.1, 3_600.0),
     ),
     "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),
-    "answer_timeout": (60.0, "Most seconds that a goal waits for an answer.", (1.0, 86_400.0)),
+    "answer_timeout": (60.0, "How many seconds a goal may wait for its answer.", (1.0, 86_400.0)),
     "log_level": ("info", "Lowest level of messages in the log: debug, info, warn, error.", None),
 }
 """Each parameter: its default, its description and, if it is a number, its range."""

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 class RecordedBag:
     """The messages that rules read from a bag.
 
-    ``topics`` are the topics that a source reads. ``unread`` has the topics whose name matches a
+    ``topics`` are the topics that the sources read. ``unread`` has the topics whose name matches a
     source but whose message type does not, each with its message type. ``left_out`` counts
     unreadable messages by topic and reason.
     """

@@ -1,4 +1,4 @@
-"""Any value that is sent as a goal is decided, or refused with faults, without any other error."""
+"""Any value sent as a goal gives a decision, or a refusal with faults, and no other error."""
 
 from __future__ import annotations
 

@@ -14,7 +14,11 @@ from tests.kit.memory import MemoryRepo
 
 
 class TestOpenBroker:
-    """The broker is the only one that exists, or the first of: requested, target's, source's."""
+    """If only one broker exists, a connection gets it.
+
+    Otherwise the connection gets the first one that exists of three: the requested broker, the
+    target's and the source's.
+    """
 
     @staticmethod
     def hosts(books: MemoryRepo) -> set[str]:

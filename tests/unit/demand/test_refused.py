@@ -1,4 +1,7 @@
-"""Demands that are refused; ``tests/unit/messages`` has the messages for both tables."""
+"""Demands that are refused.
+
+``tests/unit/messages`` has the messages for the tables ``REFUSED`` and ``CONTRADICTING``.
+"""
 
 from __future__ import annotations
 

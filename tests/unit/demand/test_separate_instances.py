@@ -108,7 +108,7 @@ def test_the_receipt_says_so_and_a_put_moves_it() -> None:
 
 
 def test_a_channel_that_leaves_the_default_version_changes_nothing_that_runs() -> None:
-    """Others ask for the default version, and share the application with the channel's demand."""
+    """One demand names the channel, another names no version; both share one application."""
     repo = MemoryRepo(SEPARATE)
     repo.send(put("a"))
     repo.send(put("b", "stable"))

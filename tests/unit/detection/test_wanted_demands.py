@@ -1,4 +1,4 @@
-"""For an event, the detector sends one goal at a time, and repeats a failed goal while wanted."""
+"""The detector sends an event's goals one at a time, and a failed goal again if still wanted."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ class Sent:
         return sending
 
     def done(self, now: float, lease_s: float = 0.0, code: str = "", message: str = "") -> str:
-        """Send and answer the next goal; return its purpose, or with a ``code`` the text to log."""
+        """Send and answer the next goal; return its purpose.
+
+        If ``code`` is given, the goal fails with it, and the result is the text for the log.
+        """
         sending = self.next(now)
         told = self.wanted.answered(sending, Outcome(code, message, lease_s), now)
         assert code or not told

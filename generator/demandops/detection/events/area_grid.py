@@ -14,7 +14,7 @@ Item = TypeVar("Item")
 
 _SMALLEST_CELL_M = 10.0
 _MOST_CELLS = 4096
-"""The most cells that an area may cover; a larger area is compared with every entity."""
+"""How many squares an area in the index may touch. A larger area is compared with every entity."""
 
 
 class AreaGrid(Generic[Item]):

@@ -34,7 +34,7 @@ class CompiledRule:
         self._names = None if "*" in patterns else re.compile("|".join(map(translate, patterns)))
 
     def is_for(self, entity: str) -> bool:
-        """Return whether the rule is for an entity."""
+        """Return whether the rule's patterns match an entity's name."""
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:

@@ -34,7 +34,7 @@ def faults_of_demand(
     Args:
         template: the template of the demand.
         field: the path of the demand in the file of rules.
-        subjects: the template's names for the entities that an event of the rule is about.
+        subjects: the names that stand for an event's entities in the template.
         momentary: the names of values that are known only when an event starts. A ``Demand`` may
             use them, except in its id and its requesters. A ``DeploymentRequest`` may not.
     """
@@ -58,9 +58,9 @@ def faults_of_demand(
 
 
 def _number_for_text(text: str) -> str:
-    """Return a message if ``text`` is only the name of a number in braces, such as ``{x}``.
+    """Return a message if ``text`` is only a name in braces, and the name's value is a number.
 
-    The result is empty for other texts.
+    ``{x}`` is such a text. The result is empty for other texts.
     """
     if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
         return f"{quoted(text)} alone becomes a number, but this field needs text; add a word to it"

@@ -91,8 +91,8 @@ class RuleDemand:
     def outline(self, values: Values) -> Goal:
         """Return the goal that starts the demand, if ``values`` has all names of the template.
 
-        If it lacks a name, the goal has only the demand's id and its requesters, which suffice to
-        end the demand.
+        If ``values`` lacks a name, the goal has only the demand's id and its requesters, which
+        suffice to end the demand.
         """
         if self.names() <= set(values):
             return self.goal(values)
@@ -109,11 +109,11 @@ class RuleDemand:
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
-        """Return the entities for which this template makes the demand ``held``.
+        """Return the entities of the event for which the rule made a booked demand.
 
         Args:
-            held: a demand in the bookkeeping.
-            subjects: the template's names for entities.
+            held: the demand in the bookkeeping.
+            subjects: the names that stand for entities in the template.
             rule: the name of the rule.
 
         Returns:

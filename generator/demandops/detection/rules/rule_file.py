@@ -79,8 +79,8 @@ class Rule(CamelModel):
 
     The rule is for entities that match ``entities``. The condition must hold for ``dwell``
     before anything is demanded. A refused demand is sent again after ``retry``. A
-    ``deploymentRequest`` is sent again every ``renew``, which renews its lease in access domains
-    that give it one.
+    ``deploymentRequest`` is sent again every ``renew``; this renews the leases that access domains
+    give its claims.
     """
 
     name: DnsLabel
@@ -106,7 +106,8 @@ class Rule(CamelModel):
             raise ValueError("needs either demand or deploymentRequest")
         if self.renew and self.demand is not None:
             raise ValueError(
-                "renew is for a deploymentRequest; leave it out, because a demand has its lease"
+                "renew is for a deploymentRequest; leave it out, because the detector renews each "
+                "demand that has a lease"
             )
         if seconds_of(self.retry) < 1 or (self.renew and seconds_of(self.renew) < 1):
             raise ValueError("retry and renew must be one second or more")
@@ -127,7 +128,7 @@ class Rule(CamelModel):
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """The template's names for the entities that an event of the rule is about."""
+        """The names that stand for an event's entities in the template, such as ``entity``."""
         if self.together is not None:
             return ("entity", "other")
         return () if self.count or self.schedule else ("entity",)
@@ -182,7 +183,8 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in seen:
-            yield fault(f"{where}.name", f"'{rule.name}' appears twice; give each rule its own")
+            message = f"'{rule.name}' appears twice; give each rule a name of its own"
+            yield fault(f"{where}.name", message)
         seen.add(rule.name)
         kind = next(name for name in CONDITIONS if getattr(rule, name) is not None)
         for part in ("source", "other"):

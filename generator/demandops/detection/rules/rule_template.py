@@ -89,9 +89,9 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return a map from the names in braces to the entities with which the template gives ``text``.
+    """Return the entities whose names turn the template into ``text``.
 
-    The map is empty if no entities give this text.
+    The result maps each name in braces to an entity. It is empty if no entities give this text.
     """
     seen: set[str] = set()
     pattern, end = "", 0
