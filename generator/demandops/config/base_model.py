@@ -134,9 +134,10 @@ def faults_of(
 
 
 def _counts_faulty_items(item: dict[str, Any]) -> bool:
-    """Return whether pydantic calls a list too short only because it does not count faulty items.
+    """Return whether an error calls a list too short, although the list has enough items.
 
-    Such an error is left out, because the faulty items have faults of their own.
+    Pydantic counts only valid items. The caller leaves out such an error, because the faulty items
+    have faults of their own.
     """
     is_short = item["type"] == "too_short" and isinstance(item.get("input"), list)
     return is_short and len(item["input"]) >= item["ctx"]["min_length"]

@@ -110,7 +110,7 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """Part of a topic name → the nodes whose ids give it by :func:`demandops.naming.topic_part`."""
+    """Part of a topic name → the nodes whose ids become this part by ``topic_part``."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     """Node type → the nodes of the type, sorted by id; the empty type stands for all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
@@ -124,13 +124,13 @@ class Config:
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     """Whether any node declares a capacity."""
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The input roles, sorted, for each of whose topics a service of some appdef runs once."""
+    """The input roles, sorted, that are the ``root`` of a service in at least one appdef."""
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
     """The names of the services whose scaling has ``downAfter``, in at least one appdef."""
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """Appdef → version or channel → this version; the empty name stands for the default."""
+    """Appdef → name of a version or channel → the version; an empty name means the default."""
 
     def __post_init__(self) -> None:
         """Set the fields that are derived from other fields."""

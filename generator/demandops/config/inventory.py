@@ -47,7 +47,7 @@ class Tls(CamelModel):
 
 
 class Credentials(CamelModel):
-    """The Secret with a broker's user name and password, and their keys in it."""
+    """The Secret with a broker's user name and password, and the keys of both in the Secret."""
 
     secret: DnsLabel
     user_key: SecretKey = "username"
@@ -125,7 +125,7 @@ def amount_of(text: str) -> int:
 
 
 def amount_text(amount: int, resource: str) -> str:
-    """Return an amount that is given in thousandths as people write it: ``1.5``, ``16Gi``."""
+    """Return ``amount``, a number of thousandths, as people write it: ``1.5``, ``16Gi``."""
     if resource.endswith(("memory", "storage")):
         for unit in ("Ti", "Gi", "Mi", "Ki"):
             if amount and amount % _FACTORS[unit] == 0:
@@ -189,7 +189,9 @@ class Toleration(CamelModel):
         if self.operator == "Exists" and self.value:
             raise ValueError("operator Exists takes no value; remove it, or use Equal")
         if self.operator == "Equal" and not self.key:
-            raise ValueError("operator Equal needs a key; add it, or use Exists for every taint")
+            raise ValueError(
+                "operator Equal needs a key; add it, or use Exists to tolerate every taint"
+            )
         return self
 
 
@@ -211,7 +213,7 @@ Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 
 
 class Position(CamelModel):
-    """A place in metres, in the map frame that all positions of a state repo share."""
+    """Coordinates in metres, in the map frame that all positions of a state repo share."""
 
     x: Coordinate
     y: Coordinate

@@ -184,8 +184,8 @@ def _refuse_unread(reader: ConfigReader) -> None:
             reader.add_fault(
                 path,
                 "",
-                f"is not read; {folder}/ has {', '.join(sorted(known))}, each as <name>.yaml, as "
-                "files <name>/*.yaml or as both; rename it, or remove it",
+                f"is not read; only <name>.yaml and <name>/*.yaml in {folder}/ are read, where "
+                f"<name> is one of {', '.join(sorted(known))}; rename the file, or remove it",
             )
 
 
@@ -331,8 +331,8 @@ def _domains_of_nodes(
             reader.add_fault(
                 file,
                 f"{place}.id",
-                f"'{node}' is in the access domains {by}; narrow these patterns so that it is in "
-                "one, and list the others as accessDomains of the node",
+                f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
+                "domain matches the node, and list the other domains as accessDomains of the node",
             )
         elif matching:
             owner[node] = matching[0]

@@ -178,7 +178,7 @@ class OverrideFile(FileModel):
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
-                "select: selects connections and services, but values are either settings of "
+                "select: selects connections and services, but 'values' has either settings of "
                 "clients or Helm values; write two overrides"
             )
         for index, selector in enumerate(self.select):
@@ -252,7 +252,7 @@ class Shaping:
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return an image of the registry, changed by the overrides' pins for its ``name``."""
+        """Return an image of the registry, changed by the pins of the overrides for ``name``."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)
@@ -287,11 +287,11 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
         yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
     if "deny" in effects and len(effects) > 1:
         others = " and ".join(name for name in effects if name != "deny")
-        yield f"with deny nothing runs, so {others} cannot apply; remove deny, or remove {others}"
+        yield f"with deny, nothing runs, so {others} cannot apply; remove deny, or remove {others}"
     frozen = [name for name in effects if name in _SHAPING]
     if "hold" in effects and frozen:
         names = " and ".join(frozen)
-        yield f"hold freezes the release, so {names} cannot apply; remove hold, or remove {names}"
+        yield f"'hold' freezes the release, so {names} cannot apply; remove hold, or remove {names}"
 
 
 def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON

@@ -160,7 +160,7 @@ class DomainRos(CamelModel):
 
 
 class AccessDomain(CamelModel):
-    """A namespace and service account, the nodes whose releases are in it, and who may use them.
+    """Nodes, the namespace and service account of their releases, and who may demand what there.
 
     Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves the
     domain. ``kinds`` are the kinds of objects that its charts may have (:attr:`allowed_kinds`).

@@ -79,7 +79,7 @@ class Chart(ChartSource):
             if other != f"channel '{name}'":
                 raise ValueError(
                     f"channels.{name} and {other} have the same version, {source.version}; give "
-                    "each its own, because a version names one chart"
+                    "each its own version, because a version names one chart"
                 )
         return self
 
@@ -272,7 +272,8 @@ def _free(env: dict[str, str]) -> dict[str, str]:
     for name in _OF_NODES:
         if name in env:
             raise ValueError(
-                f"{name} follows from 'ros' of the node; set that in the inventory, and remove this"
+                f"{name} follows from 'ros' of the node in the inventory; set 'ros' there, and "
+                f"remove {name} here"
             )
     return env
 

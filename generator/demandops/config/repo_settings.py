@@ -87,7 +87,7 @@ WebUrl = Annotated[str, without(_web_url_problem), Visible]
 
 
 class Proposals(FrozenModel):
-    """The forge on which demands that need approval are proposed.
+    """The forge where the generator proposes demands that need approval.
 
     With ``none``, the generator pushes the proposal's branch, but opens no pull request. With
     GitLab, the push options of the branch open a merge request. With GitHub and Gitea (Forgejo),

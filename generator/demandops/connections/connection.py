@@ -115,7 +115,7 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what is left of the connection without a node, its broker or one of its ends.
+        """Return what is left of the connection without ``node``, which is its broker or an end.
 
         Without its broker, the connection names no broker. Without an end, nothing is left and the
         result is ``None``.

@@ -80,7 +80,7 @@ class Mqtt(ConnectionType):
                 f"{where}.type",
                 f"'{route.source}' carries messages of {package}, and mqtt.messages in "
                 f"{config.file_of(CLIENTS_FILE, self.word)} has only {', '.join(carried)}; use an "
-                "image that has the package, and add it there",
+                "image that has the package, and add the package there",
                 code=UNSUPPORTED,
             )
 

@@ -199,7 +199,7 @@ def dds_type(ros_type: str) -> str:
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
-    """Return the router's routes from ``sender`` to ``receiver`` only."""
+    """Return the router's routes that let messages pass only from ``sender`` to ``receiver``."""
     return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
 
 

@@ -50,7 +50,7 @@ class Zenoh(ConnectionType):
                 ).within(file)
 
     def shares_clients(self, config: Config) -> bool:
-        """Return whether any node has a bridge."""
+        """Return whether any node has a bridge, which may carry several connections."""
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:

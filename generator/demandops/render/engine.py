@@ -59,7 +59,7 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the text of a template, its path, and a function that says the text is current."""
+        """Return the text of a template, its path, and a function that reports it as current."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]

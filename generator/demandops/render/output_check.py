@@ -103,8 +103,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
     """Yield the valid documents of a file, and append the faults of the others to ``faults``.
 
-    Documents for Flux and Argo CD are yielded without their ``spec``. It needs no check here,
-    because a template of the program writes it and :func:`check_values` checks the values in it.
+    Documents for Flux and Argo CD are yielded without their ``spec``. The ``spec`` needs no check
+    here, because a template of the program writes it, and :func:`check_values` checks the Helm
+    values in it.
     """
     for part in text.split("\n---\n"):
         api = _API.search(part)

@@ -19,7 +19,7 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
-"""Effects that do not change the body, so that their comments change even if the body is held."""
+"""Effects that do not change the body. Their comments change even if a hold keeps the body."""
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 

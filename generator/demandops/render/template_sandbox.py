@@ -137,7 +137,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Return a new value (a list for an iterator), and take as many steps as it has parts."""
+    """Return a value, as a list if it is an iterator, and take as many steps as it has parts."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:

@@ -85,7 +85,10 @@ def _services(
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases that an override may select, changed by its effects but ``hold``."""
+    """Yield the trial releases that an override may select, changed by the override.
+
+    The effect ``hold`` is left out.
+    """
     for release in trials:
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(
@@ -98,7 +101,7 @@ def overridden_releases(
 
 
 def render_trial_demands(world: World, engine: Engine) -> None:
-    """Render every service of every appdef once, with invented claims on a real node.
+    """Render every service of every appdef, with invented claims on a real node.
 
     A service is rendered for each version that ``registry/versions.yaml`` lists. This checks an
     appdef before its first demand, both without overrides and with each override that is in effect.

@@ -93,7 +93,9 @@ class _Work:
         self._known: dict[tuple[int, int], int] = {}
 
     def of(self, schema: object, depth: int) -> int:
-        """Return the most schemas that ``schema`` may apply to a value of ``depth`` nested levels.
+        """Return the highest number of schemas that ``schema`` may apply to a value.
+
+        The value has at most ``depth`` nested levels.
 
         Raises:
             RecursionError: if a schema applies itself to the same value, or the number is too high.
@@ -128,8 +130,8 @@ class _Work:
     def _target(self, reference: object) -> object:
         """Return the schema that a reference names.
 
-        For a path (``#/…``) to nothing, return None. For an unknown anchor, return the whole
-        document.
+        If the reference is a path (``#/…``) that leads to nothing, return None. If it is an unknown
+        anchor, return the whole document.
         """
         found = self._anchors.get(str(reference), self._document)
         if not isinstance(reference, str) or not reference.startswith("#/"):

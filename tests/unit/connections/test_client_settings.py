@@ -117,14 +117,14 @@ def test_an_override_of_connections_patches_the_settings_of_their_clients() -> N
 
 def test_settings_and_patches_that_are_not_valid_are_named() -> None:
     assert refusals(clients(env={"ROS_DOMAIN_ID": "1"}, launchfile="x")) == [
-        "registry/clients.yaml: mqtt.env: ROS_DOMAIN_ID follows from 'ros' of the node; set "
-        "that in the inventory, and remove this",
+        "registry/clients.yaml: mqtt.env: ROS_DOMAIN_ID follows from 'ros' of the node in the "
+        "inventory; set 'ros' there, and remove ROS_DOMAIN_ID here",
         "registry/clients.yaml: mqtt.launchfile: is not a field here; remove it or correct its "
         "spelling",
     ]
     both = [{"connections": ["*"]}, {"nodes": ["edge"]}]
     assert refusals({PATCH: override(*both, values={"env": {}})}) == [
-        "overrides/tested.yaml: select: selects connections and services, but values are "
+        "overrides/tested.yaml: select: selects connections and services, but 'values' has "
         "either settings of clients or Helm values; write two overrides"
     ]
     patch = override({"connections": ["*"]}, values={"resources": {"limits": {"memory": 1}}})
@@ -141,7 +141,7 @@ def test_a_message_that_the_image_does_not_carry_is_refused() -> None:
     assert repo.faults(goal([], [connection(topics=["/ego"])])) == [
         "connections[0].source_topics[0]: '/ego' carries messages of perception_msgs, and "
         "mqtt.messages in registry/clients.yaml has only std_msgs; use an image that has the "
-        "package, and add it there"
+        "package, and add the package there"
     ]
     repo.send(goal([], [connection(topics=["/of-no-known-type".replace("-", "_")])]))
 

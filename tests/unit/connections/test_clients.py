@@ -258,7 +258,7 @@ class TestWhatPeopleDidInGit:
     NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
 
     def after(self, kind: str, route: Route, **nodes: Any) -> list[str]:
-        """Return the faults of rendering a claim with this route on these nodes."""
+        """Render a claim with this route between these nodes, and return the faults."""
         world = World(state(**self.NODES))
         world.send(demand(kind))
         (claim,) = world.state.ledger.connection_claims("c")

@@ -1,4 +1,4 @@
-"""``strict_yaml`` writes simple values and reads long lists itself, with PyYAML's results."""
+"""``strict_yaml`` writes simple values and reads long lists as PyYAML does, but without it."""
 
 from __future__ import annotations
 

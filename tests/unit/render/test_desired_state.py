@@ -1,4 +1,4 @@
-"""Files below ``clusters/`` are valid, name no requesters, and are apart for each domain."""
+"""Files below ``clusters/`` are valid and name no requesters; each domain has its own folder."""
 
 from __future__ import annotations
 

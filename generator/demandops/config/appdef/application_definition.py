@@ -28,8 +28,8 @@ even if the major version changes.
 class WireNames(CamelModel):
     """How the reference's ``DeploymentRequest`` names applications of this appdef.
 
-    ``type`` is their number in the field ``Application.type``. ``inputs`` maps a topic list in the
-    message to the input of the appdef that gets these topics.
+    ``type`` is the number that stands for this appdef in the field ``Application.type``. ``inputs``
+    maps a topic list in the message to the input of the appdef that gets these topics.
     """
 
     type: Annotated[int, Field(ge=1, le=255)]

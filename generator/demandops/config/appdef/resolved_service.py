@@ -56,7 +56,7 @@ class Service(Deployed):
 
     @property
     def is_placeable(self) -> bool:
-        """Whether the generator may choose a node for the service, apart from the application's.
+        """Whether the generator may choose the service's node separately from the application's.
 
         The result is true if each instance serves applications of only one appdef, and the service
         does not run at its sources.
@@ -81,7 +81,7 @@ def resolved_services(
 ) -> tuple[Services, list[Problem]]:
     """Return all services of an appdef, and the problems that its services have.
 
-    All services are those that the appdef defines, and the shared ones that it uses. If there is a
+    The services are those that the appdef defines, and the shared ones that it uses. If there is a
     problem, no service is returned.
     """
     services = {

@@ -77,7 +77,7 @@ class Scaling(CamelModel):
     def _renamed(cls, data: object) -> object:
         if isinstance(data, dict) and "topicsPerReplica" in data:
             per = strict_yaml.short_repr(data["topicsPerReplica"])
-            raise ValueError(f"topicsPerReplica has a new name; write per: {{topics: {per}}}")
+            raise ValueError(f"'topicsPerReplica' has a new name; write 'per: {{topics: {per}}}'")
         return data
 
     @model_validator(mode="after")
@@ -89,28 +89,28 @@ class Scaling(CamelModel):
     def _problems(self) -> Iterator[str]:
         if self.min > self.max:
             yield f"min {self.min} is above max {self.max}; lower min or raise max"
-        deciding = [f"per: {measure}" for measure in self.per or ()]
-        deciding += [name for name in ("sizes", "autoscaler") if getattr(self, name)]
+        deciding = [f"'per: {measure}'" for measure in self.per or ()]
+        deciding += [f"'{name}'" for name in ("sizes", "autoscaler") if getattr(self, name)]
         if len(deciding) > 1:
             yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
         for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
-            yield f"sizes lists all numbers of replicas, so {name} does nothing; remove {name}"
+            yield f"'sizes' lists all numbers of replicas, so {name} does nothing; remove {name}"
         for name in ("per", "autoscaler"):
             if getattr(self, name) and self.min == self.max:
-                yield f"{name} has no choice between min {self.min} and max {self.max}; raise max"
+                yield f"'{name}' has no choice between min {self.min} and max {self.max}; raise max"
         if self.autoscaler and self.min == 0:
             yield "an autoscaler keeps at least one replica; raise min to 1"
         by_requesters = "requesters" in (self.per or {})
         if by_requesters and not self.may_depend_on_requesters:
             yield (
-                "with per: requesters, the rendered files show how many requesters there are; "
-                "allow this with mayDependOnRequesters: true"
+                "'per' counts requesters, so the rendered files show how many requesters there "
+                "are; allow this with 'mayDependOnRequesters: true'"
             )
         if self.may_depend_on_requesters and not by_requesters:
-            yield "mayDependOnRequesters does nothing without per: requesters; remove it"
+            yield "'mayDependOnRequesters' does nothing unless 'per' counts requesters; remove it"
         if self.down_after and not (self.per or self.sizes):
             own = " (an autoscaler has a delay of its own)" if self.autoscaler else ""
-            yield f"downAfter does nothing without per or sizes{own}; remove downAfter"
+            yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove downAfter"
         if self.down_after and seconds_of(self.down_after) < 1:
             yield "downAfter is zero; leave it out"
 

@@ -86,8 +86,8 @@ class Deployed(CamelModel):
     def _published_once(self) -> Deployed:
         if self.outputs and self.scaling.most > 1 and not self.scaling.divides_work:
             raise ValueError(
-                f"scaling: gives up to {self.scaling.most} replicas, each of which would publish "
-                "every output; allow only one replica, or say dividesWork: true if the program "
+                f"scaling: allows up to {self.scaling.most} replicas, each of which would publish "
+                "every output; allow only one replica, or set 'dividesWork: true' if the program "
                 "divides its work"
             )
         return self
@@ -166,8 +166,8 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         return
     if parameter.merge in ("max", "min"):
         yield (
-            f"{place}: '{name}' has merge: {parameter.merge}, which compares numbers; use merge: "
-            "union, so that the largest size counts"
+            f"{place}: '{name}' has 'merge: {parameter.merge}', which compares numbers; use "
+            "'merge: union', so that the largest size counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)

@@ -228,8 +228,8 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                 reader.add_fault(
                     f"appdefs/{appdef}/appdef.yaml",
                     f"uses.{name}.{service.each}",
-                    f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; both share the "
-                    "service, so use the same name in both",
+                    f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; both "
+                    "definitions share the service, so use the same name in both",
                 )
 
 
@@ -273,7 +273,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault for each shared service whose input in ``each`` is an output of an unshared one.
+    """Add a fault for each shared service that runs once per topic of an unshared service.
 
     With ``versions: separate``, each version has its own instance of the unshared service, but the
     shared service runs once for all versions.

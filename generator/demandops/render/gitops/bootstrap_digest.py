@@ -1,8 +1,8 @@
-"""The digest of a bootstrap file, an annotation that shows which version a cluster has.
+"""The digest of a bootstrap file, which shows which version of the file a cluster has.
 
 A person applies the file, so the cluster may have an older version of it. The object that applies
-an access domain's folder carries the digest of the applied file. ``demandops status`` compares this
-digest with that of the file in the state repo. The functions here are pure.
+an access domain's folder has the digest of the applied file as an annotation. ``demandops status``
+compares this digest with that of the file in the state repo. The functions here are pure.
 """
 
 from __future__ import annotations
