@@ -16,8 +16,8 @@ from demandops.strict_yaml import LOADER, load_all
 def lines(text: str, document: int = 0) -> dict[str, int]:
     """Return the line of each field of a document; a field is a path like ``nodes[3].cluster``.
 
-    The result is empty if :func:`load_all` refuses the text. The error of :func:`load_all` already
-    names the line. ``document`` counts from 0.
+    ``document`` is the index of the document in the text. The result is empty if :func:`load_all`
+    refuses the text, because the error of :func:`load_all` already names the line.
     """
     found: dict[str, int] = {}
     with suppress(InvalidInput, yaml.YAMLError):
@@ -81,7 +81,7 @@ def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) ->
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """Add to each fault that the block raises the line of the fault's field.
+    """If the block raises faults, add the line of its field to each fault.
 
     The fields of the faults must be fields of ``text``.
     """

@@ -186,7 +186,7 @@ class Gitea(Forge):
 
 
 def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
-    """Return the forge that ``demandops.yaml`` names, or None if this module does not support it.
+    """Return the GitHub or Gitea that ``demandops.yaml`` names; None if it names neither.
 
     Each call of this function reads the token from its file, so that a person can replace the token
     while the generator runs.

@@ -108,7 +108,7 @@ PATTERN_WORDS = {
     r"^oci://[^\s]+$": "a URL that begins with oci://",
     r"^values/[A-Za-z0-9_.-]+$": "a file of the folder values/, such as values/service.yaml.j2",
     r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$": "a host name or address, such as 10.0.0.1",
-    r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": f"{_ANY}, '_' and '-', parts by '/', such as fleet/one",
+    r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": f"{_ANY}, '_' and '-', split by '/', such as fleet/one",
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
     r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
     r"^[a-z0-9][a-z0-9._/:-]*$": "an image without its tag, such as registry.example/detection",

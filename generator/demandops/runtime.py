@@ -1,9 +1,9 @@
 """Time, random numbers and threads: only this module takes them from the machine.
 
 The service and the cluster's watchers take a :class:`Runtime`. A test can pass its own, with a
-clock that it moves, numbers from a seed, and threads that take turns. An object with a state repo
-uses the repo's runtime. Commands, git's processes and locks, HTTP and ROS's executors always use
-:data:`REAL`.
+clock that it moves, numbers from a seed, and threads that take turns. An object that is made with
+an open state repo uses this repo's runtime. Commands, git's processes and locks, HTTP and ROS's
+executors always use :data:`REAL`.
 
 This module also supervises the threads, so that no thread fails unnoticed.
 """
@@ -87,7 +87,7 @@ class Runtime:
 
     @property
     def failures(self) -> dict[str, str]:
-        """Why threads failed that have not recovered, by the name of the thread."""
+        """The failure of each thread that has not recovered, by the thread's name."""
         now = self.monotonic()
         known = sorted(self._failures.items())
         return {name: text for name, (text, at) in known if now - at < _STEADY_S}

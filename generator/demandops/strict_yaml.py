@@ -71,7 +71,7 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""The function that makes a scalar's value, by tag. Values of other tags do not fit JSON."""
+"""For each tag of a scalar that is not text, the function that makes the scalar's value."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -79,7 +79,7 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if the stand-in of a list was read as something else than the value of a field."""
+    """Raised if the word that stands for a list was not read as the value of a field."""
 
 
 class _Parser:
@@ -329,7 +329,7 @@ class _NotSimple(Exception):
 
 
 _SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")
-"""Matches a text whose quoted form is the text itself on one line."""
+"""Matches a text that fits in double quotes on one line, without escapes."""
 _MOST_OF_KEY = 100
 
 

@@ -409,7 +409,7 @@ class TestStatus:
             assert ran.code == 1
             assert (
                 "cluster 'c-its' does not have the current bootstrap/c-its.yaml (access domains: "
-                "perception); an administrator of the cluster applies it: git show "
+                "perception); an administrator of the cluster must apply it: git show "
                 "main:bootstrap/c-its.yaml | kubectl apply -f -\n"
             ) in ran.out
             assert "clusters with an old bootstrap file: 1" in ran.err
@@ -451,6 +451,6 @@ class TestStatus:
         }
         assert (
             "Deployment perception/mqtt-gone on cluster 'c-its' belongs to no release any more; an "
-            f"administrator of the cluster deletes it: {command}\n"
+            f"administrator of the cluster must delete it: {command}\n"
         ) in ran.out
         assert "objects that belong to no release: 1" in ran.err and ran.code == 1

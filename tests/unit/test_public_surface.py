@@ -60,7 +60,10 @@ def client() -> Json:
 
 
 def members(exported: Any) -> Json | str:
-    """Return the arguments of a class's documented constructor, public methods and fields."""
+    """Return a map from each public member of a class to its arguments, or to ``field``.
+
+    The constructor is in the map if it has a docstring.
+    """
     if not inspect.isclass(exported):
         return "type"
     names = ["__init__"] if getattr(vars(exported).get("__init__"), "__doc__", None) else []

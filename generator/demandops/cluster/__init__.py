@@ -1,4 +1,4 @@
-"""Stage 8: wakes the controllers of the clusters, and follows the releases on the clusters.
+"""Wakes the controllers of the clusters, and follows the releases on the clusters.
 
 Only this folder knows the Kubernetes API.
 """

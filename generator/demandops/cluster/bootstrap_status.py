@@ -26,7 +26,7 @@ class OldBootstrap:
         """Return a sentence about the cluster, with the remedy."""
         return (
             f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
-            f"{', '.join(self.domains)}); an administrator of the cluster applies it: "
+            f"{', '.join(self.domains)}); an administrator of the cluster must apply it: "
             f"{self.command}"
         )
 

@@ -30,7 +30,7 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """The objects of one cluster that :meth:`watch` or :meth:`read_once` was called for."""
+    """Caches objects of one cluster: those passed to :meth:`watch` or :meth:`read_once`."""
 
     def __init__(
         self,
@@ -222,7 +222,7 @@ def _request(selector: ObjectSelector) -> dict[str, str]:
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether the cluster answered with this error, so that it is reachable."""
+    """Return whether an error is an answer of the cluster, so whether the cluster is reachable."""
     return bool(getattr(error, "status", None))
 
 
@@ -236,5 +236,5 @@ def _reason(selector: ObjectSelector, error: Exception) -> str:
 
 
 def _version(item: dict[str, Any]) -> int:
-    """Return an object's resource version, which can be compared within a kind."""
+    """Return an object's resource version; only versions of the same kind can be compared."""
     return int(item["metadata"]["resourceVersion"])

@@ -35,7 +35,7 @@ class Orphan:
         """Return a sentence about the object, with the remedy."""
         return (
             f"{self.object} on cluster '{self.cluster}' belongs to no release any more; an "
-            f"administrator of the cluster deletes it: {self.command}"
+            f"administrator of the cluster must delete it: {self.command}"
         )
 
 

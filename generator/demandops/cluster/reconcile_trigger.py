@@ -3,9 +3,9 @@
 Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure,
 and the controller fetches at its next interval.
 
-Flux is woken only while it is idle. If kustomize-controller begins a reconciliation right after
-another has ended, it may still read the status from before that other one (seen with 1.9). It then
-forgets which objects the other reconciliation created, and never removes them.
+Flux is woken only while it is idle. If kustomize-controller begins a second reconciliation right
+after the first, it may read the status that was written before the first (seen with 1.9). It then
+forgets which objects the first reconciliation created, and never removes them.
 """
 
 from __future__ import annotations
@@ -35,15 +35,18 @@ log = logging.getLogger("demandops")
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
-"""A fetch begins at least this many seconds after the last one, and after Flux has applied what the
-last one brought. Two fetches within a second can make source-controller corrupt an artifact."""
+"""The next fetch begins at least this many seconds after Flux has applied what the last fetch
+brought. Two fetches within a second can make source-controller corrupt an artifact."""
 _LONGEST_WAIT_S = 60.0
 """Flux is woken this many seconds after a push at the latest, even if it is not idle."""
 _REFRESH = "argocd.argoproj.io/refresh"
 
 
 ChangesSince = Callable[[str], tuple[str, list[str] | None]]
-"""Returns the newest published commit, and the paths changed since the given commit, if known."""
+"""Returns the newest published commit, and the paths that changed since a given commit.
+
+The paths are None if they are not known.
+"""
 
 
 @dataclass(eq=False)
@@ -56,7 +59,7 @@ class _Wake:
     cluster: str
     domains: tuple[AccessDomain, ...]
     pushed: float | None = None
-    """When the oldest push came that the controller has not been told of; None without one."""
+    """When the oldest push came that still needs a call; None if no push needs one."""
     next_try: float = -inf
     pause: float = _FIRST_RETRY_S
     idle_from: float = -inf
@@ -71,7 +74,7 @@ class _Wake:
 
     @property
     def due(self) -> float:
-        """When to make the call; infinity if the controller has been told of every push."""
+        """When to make the call; infinity if no push needs one."""
         if self.pushed is None:
             return inf
         free = min(self.idle_from + _SPACING_S, self.pushed + _LONGEST_WAIT_S)
@@ -188,7 +191,7 @@ class ReconcileTrigger:
         )
 
     def _try(self, wake: _Wake) -> None:
-        """Make the call. If it fails, plan another attempt, for about a minute in all.
+        """Make the call. If it fails, plan another attempt; give up after about a minute.
 
         Only the first failure is logged.
         """
@@ -208,7 +211,7 @@ class ReconcileTrigger:
             if wake.pause == _FIRST_RETRY_S:
                 log.warning(
                     "cluster '%s' was not woken (%s); retrying for a minute; if that fails too, "
-                    "it fetches at its next interval",
+                    "its controller fetches at its next interval",
                     wake.cluster,
                     _reason(error),
                 )

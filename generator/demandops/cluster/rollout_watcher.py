@@ -104,7 +104,7 @@ class RolloutWatcher:
 
         Returns:
             A future of the health. It is resolved when the health reaches ``level``, or after the
-            timeout. The health then gives the reason why ``level`` was not reached.
+            timeout. After the timeout, the health gives the reason why it is not at ``level``.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))

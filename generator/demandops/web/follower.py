@@ -124,7 +124,7 @@ class Follower:
     def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
         """Return the newest commit that changed a file or folder; None if no commit did.
 
-        Commits after that of ``commit_state`` do not count.
+        Only the commit of ``commit_state`` and its ancestors count.
         """
         if path not in commit_state.last_changes:
             found = self.reader().log(commit_state.commit, path) if path else iter(())

@@ -79,10 +79,11 @@ class WebServer:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is closed if its client does not complete a request or read an answer.
+    """A connection that is closed if its client takes too long.
 
-    The client has 10 to 20 seconds. The connection stays open while the server computes an answer,
-    and while the client reads one, such as a stream of events.
+    The client has 10 to 20 seconds to complete a request, and as long to read the next part of an
+    answer. The time in which the server computes an answer does not count. So a stream of events
+    stays open as long as the client reads it.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

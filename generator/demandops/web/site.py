@@ -1,6 +1,6 @@
 """The site: it renders views as pages, sends events, and sets headers that keep other sites out.
 
-Every address is read only, and no page loads anything from another host. Templates escape the HTML
+No request changes anything, and no page loads anything from another host. Templates escape the HTML
 and the invisible characters in every value that they print.
 """
 

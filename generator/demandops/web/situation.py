@@ -57,8 +57,8 @@ class ReusableRows:
     """The rows of a list, kept so that a later call need not make them again.
 
     ``rows`` maps the id of each entry to the entry's values and to the row that was made from them.
-    ``statuses`` are the statuses of releases that the rows show; None if the rows were made for an
-    earlier commit.
+    ``statuses`` are the statuses of releases from which the rows were made. They are None if the
+    rows were made for an earlier commit.
     """
 
     statuses: object
@@ -252,7 +252,7 @@ def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
 
 
 def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services whose record of replicas to keep differs between two ledgers."""
+    """Yield the services for which two ledgers record different replicas to keep."""
     before, after = old.kept.steps, new.kept.steps
     for instance in {*before, *after}:
         if before.get(instance) != after.get(instance):

@@ -78,7 +78,7 @@ class ViewRequest:
     def link(self, link: Link) -> str:
         """Return the address of a link, with the chosen commit or time.
 
-        The address has the filter of the link, if any, instead of the current filter.
+        The address never has the current filter; it has the link's own filter, if there is one.
         """
         return self.to(link.path, **{"q": "", **link.params})
 

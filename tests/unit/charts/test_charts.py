@@ -106,7 +106,7 @@ def test_a_schema_has_what_the_library_has(chart: Path) -> None:
 def undescribed(schema: dict[str, Any], path: str = "") -> Iterator[str]:
     """Yield the path of each property without a description.
 
-    A property with properties of its own needs none, but its properties do.
+    A property with properties of its own needs no description, but its properties do.
     """
     for name, one in schema["properties"].items():
         if "description" not in one and "properties" in one:

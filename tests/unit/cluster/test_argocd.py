@@ -46,7 +46,10 @@ def application(
     health: str = "Healthy",
     resources: tuple[dict[str, str], ...] = (),
 ) -> dict[str, Any]:
-    """Return an Application. If ``sync`` is set, it was compared with ``wanted`` by default."""
+    """Return an Application whose spec has the source ``wanted``.
+
+    If ``sync`` is set, the Application was compared with ``compared``, or else with ``wanted``.
+    """
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}
     if sync:
@@ -58,7 +61,7 @@ def application(
 
 
 def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return an ``operationState``: that of a sync, by default of the domain's folder."""
+    """Return the ``operationState`` of a sync of source ``of``, by default the domain's folder."""
     result = {"revision": revision, "source": more.pop("of", FOLDER)}
     result["resources"] = more.pop("resources", [])
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}

@@ -37,8 +37,8 @@ class Server:
     """A stand-in for an API server with one Lease.
 
     ``trouble`` decides whether a call fails before or after its effect, or not at all (empty).
-    ``takes`` decides how many seconds a call takes. ``ages`` lists the age of the Lease after each
-    call, once for each process that leads at that time.
+    ``takes`` decides how many seconds a call takes. After each call, ``ages`` gets the age of the
+    Lease, once for each process that leads at that time.
     """
 
     turns: Turns

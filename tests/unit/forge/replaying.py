@@ -51,7 +51,7 @@ class Replay:
 
 @contextmanager
 def replaying(*names: str, variables: dict[str, str] | None = None) -> Iterator[Replay]:
-    """Replay recorded exchanges in order; each variable's value replaces its ``{name}`` in them."""
+    """Replay recorded exchanges in order, with the variables' values in place of ``{name}``."""
     replay = Replay()
     for name in names:
         text = (_EXCHANGES / f"{name}.yaml").read_text()

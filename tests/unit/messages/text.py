@@ -1,4 +1,4 @@
-"""One text with the messages for all tables of mistakes, and the JSON schema of every field."""
+"""One text: the messages for the mistakes in the tests' tables, and every field's JSON schema."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The joins that `demandops import` finds in the operators' files, with counts and requesters."""
+"""The joins that `demandops import` finds in the reference's files, with counts and requesters."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_the_versioning_of_a_fusion_is_enough() -> None:
 def test_the_versioning_of_a_connection_is_not() -> None:
     """A connection's versioning file alone does not show who holds the connection.
 
-    The first request in it lists all later requesters too.
+    The first request in the file lists all later requesters too.
     """
     files = read(experiment(3), "mqtt_versioning")
     first, *_ = files.versions[CONNECTION].values()

@@ -1,8 +1,8 @@
-"""Under overrides, demands write the files that the ledger alone would render.
+"""Under overrides too, the generated files follow from the configuration and the ledger.
 
-Random demands join and leave. After each one, the files rendered from the ledger equal the files
-that the demands have written one by one, and the claims alone tell which demands are suspended or
-kept.
+Random demands join and leave. After each one, the files that the demands have written one by one
+equal the files that the configuration and the ledger render at once. The bookkeeping lists
+exactly the denied claims as suspended, and a kept claim is the only claim on its subject.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def _why_outdated(
 
 
 def _synced_health(app: Object, name: str, objects: Objects) -> Health:
-    """Return the health of a service whose Application is synced, from its Deployments."""
+    """Return a service's health, from its synced Application and from its Deployments."""
     for item in (app.get("status") or {}).get("resources") or ():
         if item.get("kind") != "Deployment":
             continue
@@ -221,7 +221,7 @@ def _status(app: Object, part: str) -> Object:
 
 
 def _requested_sync(operation: Object) -> Object:
-    """Return the parameters of the sync that was requested; empty if there are none."""
+    """Return the parameters of the requested sync; empty if no sync was requested."""
     return (operation.get("operation") or {}).get("sync") or {}
 
 

@@ -81,7 +81,7 @@ class Flux(HealthReader):
         return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
 
     def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the last request to fetch that a domain's source has handled; empty if none."""
+        """Return the time stamp of the last fetch request that the source handled, or empty."""
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
@@ -92,8 +92,8 @@ class Flux(HealthReader):
         Args:
             domain: the domain.
             objects: the objects that are known.
-            before: what :meth:`handled_request` returned before the last request to fetch; None if
-                no request was made.
+            before: what :meth:`handled_request` returned before the last fetch request was made;
+                None if none was made.
         """
         kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
         if kustomization is None or source is None:

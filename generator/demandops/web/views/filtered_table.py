@@ -119,7 +119,7 @@ class Table:
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
-    """Return a cell with those of the texts that are not empty."""
+    """Return a cell with the non-empty texts."""
     parts = (one if isinstance(one, Part) else Part(str(one)) for one in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 

@@ -172,7 +172,7 @@ def _square(card: NodeCard) -> str:
 def _lit_nodes(
     now: Situation, wanted: Filter, nodes: Iterable[Node], content: Mapping[str, _Content]
 ) -> set[str]:
-    """Return the ids of nodes that match the filter themselves or by a service or connection."""
+    """Return the ids of nodes that match the filter, or have a service or connection that does."""
     if not wanted:
         return set()
     found = {id for id, each in content.items() if any(mark.is_lit for mark in each.marks)}

@@ -54,7 +54,7 @@ def health_cell(word: str) -> Cell:
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return a text for each value, with a link to the view filtered by ``key`` and the value."""
+    """Return a linked text for each value; the link lists the rows with the value in ``key``."""
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 

@@ -30,8 +30,8 @@ class NodeCard:
     """A node as it is drawn.
 
     ``count`` is the number of all services on the node. ``services`` lists the services that the
-    card shows; it is empty if the card is too small. ``more`` counts the services that do not fit
-    on a card that shows some.
+    card shows, and ``more`` counts the services for which the card has no room. On a small card,
+    ``services`` is empty and ``more`` is 0.
     """
 
     id: str
@@ -92,7 +92,7 @@ def by_cluster(
 def _box(
     groups: Mapping[str, list[NodeCard]], *, is_alone: bool
 ) -> tuple[list[NodeCard], float, float]:
-    """Return the cards of a cluster placed relative to its box, and the box's width and height."""
+    """Return a cluster's cards, placed relative to its box, and the box's width and height."""
     first = next(iter(next(iter(groups.values()))))
     gap = 6.0 if first.width < 50 else _GAP
     room = 34.0 if first.services or first.width > 200 else gap
