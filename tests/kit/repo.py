@@ -76,7 +76,7 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
 def write_tree(
     repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.Oid:
-    """Write ``base`` with ``files`` changed, as the program does; return the id of the new tree."""
+    """Write ``base`` with ``files`` changed, by the program's code; return the new tree's id."""
     objects = NewObjects(repo)
     tree = trees.write(objects, base, files)
     with objects.packed(tree):

@@ -180,7 +180,10 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Send two demands for places at once; if a place is held, send its release before them."""
+        """Send two demands at once, for which the generator chooses nodes.
+
+        If such a demand has a node already, send its release first.
+        """
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:

@@ -240,8 +240,8 @@ class Oracle:
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
         """Return the operations of a commit and of all commits that it merges.
 
-        Each comes with whether a proposal contained it, because the lease of a proposed demand
-        starts at the merge.
+        The second value of each pair is true if a proposal contained the operation. The lease of a
+        proposed demand starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:
