@@ -82,7 +82,7 @@ _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh pac
 
 
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""A call at the server whose error Git takes for the end of a list, so that it may lose an object.
+"""A call at the server whose error Git takes for the end of a list, so Git may lose an object.
 
 The generator cannot see this loss. docs/reliability.md describes it under "Known and open".
 """

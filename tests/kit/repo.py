@@ -364,8 +364,8 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
 FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
 """The bundle of a state repo from the first version: render version 1, ``demandops.ledger/v1``.
 
-The repo has three joins of the experiment (tag ``three-joins``), two overrides, of which one ended,
-a join by another request, a demand with a lease, and a shutdown.
+The repo has three joins of the experiment (tag ``three-joins``), two overrides (one of them
+has ended), a join by another request, a demand with a lease, and a shutdown.
 """
 
 

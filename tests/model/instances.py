@@ -25,7 +25,7 @@ MAY = {
     "vehicle01": frozenset({HALL, FURTHER}),
     "traffic": frozenset({FURTHER}),
 }
-"""The access domains in which each requester may demand, by the names of the node in them."""
+"""The names under which each requester may demand the node, one for each access domain."""
 MOST = 3
 KEPT_FOR = timedelta(seconds=120)
 
