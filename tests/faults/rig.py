@@ -372,7 +372,7 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
 
 
 def _repeat(now: datetime) -> None:
-    """Give this forked process a clock that stands still, and ids that follow from it."""
+    """Give this forked process a clock that stands still, and ids that follow from its time."""
     numbers = count(1)
 
     def fresh_id(_: Runtime) -> str:

@@ -92,7 +92,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep for ``KEPT_FOR`` the replicas that were needed ``before`` and no longer are."""
+        """Keep the replicas that were needed ``before`` and no longer are, for ``KEPT_FOR``."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))

@@ -311,8 +311,8 @@ class History:
     def set_clocks(self) -> None:
         """Set the wall clocks forward or back; after the first step back, only further back.
 
-        A step forward could make up for a step back, so that a machine notices neither. The machine
-        might then end a lease early that another machine recorded between the two steps.
+        A step forward could undo a step back, so a machine might notice neither. The machine might
+        then end a lease early that another machine recorded between the two steps.
         """
         self.oracle.check()
         self.oracle.counts["faults"] += 1

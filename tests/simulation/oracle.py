@@ -211,7 +211,7 @@ class Oracle:
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return the priority, the time and the requesters of each waiting demand in a commit."""
+        """Return priority, start of the wait, and requesters of each waiting demand in a commit."""
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
         found = [plain_yaml.load(text) for text in texts]
         return {
