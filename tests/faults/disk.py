@@ -75,7 +75,7 @@ def interrupted(rig: Rig) -> None:
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
     """Damage one file of each class: change a byte, or cut the file.
 
-    Yield the problems that the next start has with each damage.
+    Yield for each damage the result of the next start.
     """
     rig.restore()
     classes: dict[str, tuple[Path, int]] = {}
