@@ -219,7 +219,7 @@ def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
 
 @pytest.fixture
 def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
-    """Yield what starts generators as processes; kill those that run when the test ends."""
+    """Yield a starter of generator processes; after the test, kill those that still run."""
     _all_drivers.synced = synced
     yield _all_drivers
     _all_drivers.kill_runs()

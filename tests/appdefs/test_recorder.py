@@ -289,7 +289,7 @@ class TestParameters:
     def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
         self, books: MemoryRepo, recorder: dict[str, int], monitor: int
     ) -> None:
-        """The larger rate counts; an appdef's default does not count if a demand gives no rate."""
+        """The largest demanded rate counts; a demand without a rate changes nothing."""
         books.send(self.demand("a", "recorder", **recorder))
         books.send(self.demand("b", "monitor", rate=monitor))
         assert self.values(books, "drv-")["rate"] == 20

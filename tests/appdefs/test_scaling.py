@@ -292,7 +292,11 @@ class TestAutoscaler:
 
 @pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
 def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: bool) -> None:
-    """A second replica doubles what the driver publishes; the recorder publishes nothing."""
+    """The override makes a second replica of both services, driver and recorder.
+
+    That doubles what the driver publishes, unless its replicas divide the work. The recorder
+    publishes nothing, so no warning names it.
+    """
     driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
     doubled = override({"services": ["*"]}, replicas=2)
     repo = MemoryRepo({**ADDITIONS, DRIVER: driver, "overrides/two.yaml": doubled})

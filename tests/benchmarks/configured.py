@@ -138,7 +138,7 @@ def _when_idle() -> float:
 
 
 def reference(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a join and a shutdown of the reference's action; both name the node in any case."""
+    """Return a join and a shutdown of the reference's action; both always name the node."""
     join = fleet.goal(fleet.edge_id(edge), fleet.spare_id(edge))
     return [join, join | {"shutdown": True}]
 

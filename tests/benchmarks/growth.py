@@ -44,8 +44,8 @@ def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Ro
     """Return a row for each size: what the join and the leave of one more vehicle cost.
 
     A size is a number of vehicles or a number of topics. ``sizes`` maps each size to the number of
-    vehicles that hold the application. ``ego`` returns the ego topics of a goal for a size and the
-    goal's number.
+    vehicles that hold the application. ``ego`` takes a size and a goal's number, and
+    returns the goal's ego topics.
     """
     generators: dict[int, Generator] = {}
     rows: dict[int, Row] = {}

@@ -58,7 +58,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def quiet(_: str) -> None:
-    """Print nothing, in place of a report."""
+    """Ignore a line of progress; tests pass this function as the `report` of `ensure`."""
 
 
 def test_a_program_is_built_once_with_its_crds(runs: Path) -> None:

@@ -85,7 +85,7 @@ def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> 
 def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the requesters of each service and connection while the given vehicles are near.
 
-    `inside` gives the number of each such vehicle's intersection.
+    `inside` maps each of these vehicles to the number of the intersection that it is near.
     """
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):

@@ -335,7 +335,7 @@ _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 def _stand(happens: list[float], number: int) -> float:
     """Return the time at which the vehicles must stop after the first `number` causes of events.
 
-    It is shortly before the next cause, or infinity if there is no further cause.
+    The time is shortly before the next cause, or infinity if there is no further cause.
     """
     if number == len(happens):
         return math.inf

@@ -170,7 +170,7 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demand of each commit, by its trailers.
+        """Yield the demand of each commit after ``since``, read from the commit's trailers.
 
         The bookkeeping is read only at some of the commits (:data:`_LOOKS`).
         """

@@ -72,7 +72,7 @@ _UNITS = {"m": 1e-3, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 
 
 def quantity(text: str) -> float:
-    """Return a quantity of Kubernetes, such as `250m` or `1Gi`, as a number."""
+    """Return a Kubernetes quantity, such as `250m` or `1Gi`, as a number."""
     for unit, factor in _UNITS.items():
         if text.endswith(unit):
             return float(text.removesuffix(unit)) * factor

@@ -1,4 +1,4 @@
-"""The process runner ends a pod also if no watch reported that the pod was deleted."""
+"""The process runner ends a deleted pod even if no watch reported the deletion."""
 
 from __future__ import annotations
 

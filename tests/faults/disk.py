@@ -73,7 +73,10 @@ def interrupted(rig: Rig) -> None:
 
 
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
-    """Change a byte in, or cut, a file of each class; yield the problems of the next start."""
+    """Damage one file of each class: change a byte, or cut the file.
+
+    Yield for each damage the result of the next start.
+    """
     rig.restore()
     classes: dict[str, tuple[Path, int]] = {}
     for path in sorted(rig.folder.rglob("*")):

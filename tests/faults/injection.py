@@ -82,7 +82,7 @@ _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh pac
 
 
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""A call at the server whose error Git takes for the end of a list, so that it may lose an object.
+"""A call at the server whose error Git takes for the end of a list, so Git may lose an object.
 
 The generator cannot see this loss. docs/reliability.md describes it under "Known and open".
 """
@@ -107,7 +107,7 @@ class Site:
 
     @property
     def of_class(self) -> tuple[str, str, str, bool]:
-        """What calls of one class share: role, kind, class of file, and whether they create it."""
+        """The class of a call: role, kind, class of file, and whether the call creates the file."""
         return self.role, self.kind, self.file, self.creates
 
     @property
@@ -183,7 +183,7 @@ def sites(rig: Rig) -> list[Site]:
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return the call of a site, with the number that the call has in this process.
+    """Return the call of a site, with the number that :func:`sites` found for it in this rig.
 
     Numbers differ between processes, because a process may read more or fewer files. If the site's
     thread did not make the call this time, return the call of another thread on the same class of
@@ -231,9 +231,10 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    If ``short``, take only the last call of each class, and without a remote also the first call of
-    a class of syncs. In the short form, a call that only reads gets only EIO, and with a remote it
-    gets no fault.
+    With ``short``, return only some of these faults. Only the last call of each class gets faults;
+    of a class of syncs, the first call gets them too if there is no remote. A call that only reads
+    gets EIO without a remote, and no fault with a remote. Any other call gets only
+    those of its faults that ``_SHORT`` lists.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -304,7 +305,7 @@ def _at(site: Site) -> str:
 
 
 def _traces(site: Site) -> list[str]:
-    """Return options of strace to trace the calls of the site's kind and those that parse needs."""
+    """Return strace's options to trace calls of the site's kind and calls that `parse` needs."""
     return ["-s64", "-e", f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork"]
 
 

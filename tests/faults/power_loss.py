@@ -52,7 +52,7 @@ class _Data:
 
 @dataclass
 class _Change:
-    """A change by one call or successive writes; ``safe`` and ``lost`` are indices of parts."""
+    """A change by one call or by successive writes; ``safe`` and ``lost`` index its ``parts``."""
 
     name: str
     parts: list[_Name | _Data]

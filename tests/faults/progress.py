@@ -19,10 +19,11 @@ _TELL_EVERY_S = 30.0
 
 
 class Tried:
-    """The sound tasks of an interrupted run, in a file: one line for each, by the task's text.
+    """The tasks of an interrupted run that broke no promise, in a file with a line for each task.
 
-    The first line has a digest of the program that was tried. If the program has changed since, the
-    file's tasks do not count.
+    ``sound`` has the results of these tasks, by the task's text. The first line of the file has a
+    digest of the program that was tried. If the program has changed since, the file's tasks do not
+    count.
     """
 
     def __init__(self, file: Path, *, resume: bool) -> None:
@@ -46,7 +47,7 @@ class Tried:
         file.write_text("".join(f"{line}\n" for line in lines or [program]))
 
     def add(self, task: str, results: Iterable[Result]) -> None:
-        """Keep the results of a task, unless a promise was broken and it must be tried again."""
+        """Keep the results of a task, unless the task broke a promise and must be tried again."""
         kept = [asdict(result) for result in results]
         if not any(each["problems"] for each in kept):
             with self._file.open("a") as file:

@@ -167,7 +167,7 @@ class Rig:
         self.save()
 
     def _wrap_git(self) -> None:
-        """Replace git's programs, also for git itself, by a script that can trace them."""
+        """Replace git's programs by a script that can trace them, also where git starts them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
         wrapper.write_text(_GIT)
         wrapper.chmod(0o755)
@@ -372,7 +372,7 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
 
 
 def _repeat(now: datetime) -> None:
-    """Give this forked process a clock that stands still, and ids that follow from it."""
+    """Give this forked process a clock that stands still, and ids that follow from its time."""
     numbers = count(1)
 
     def fresh_id(_: Runtime) -> str:

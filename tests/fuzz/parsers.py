@@ -149,7 +149,7 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
 
 
 def file_of_the_reference(data: bytes) -> None:
-    """Check that each file of the reference that can be read gets a map, and gives goals."""
+    """Check that a readable file of the reference leads to a map, and that the map gives goals."""
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)
     joins, _ = imported_goals.remaining_joins(files)

@@ -54,7 +54,7 @@ def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any
 
 
 def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ``Demand`` document for a demand of connections in short form.
+    """Return the ``Demand`` document for a demand in short form, which lists only connections.
 
     A connection in short form has ``topics`` as the ledger writes them, and its ``type`` by name.
     It may list ``requesters``. The whole demand gets the requesters of the first connection.

@@ -7,8 +7,8 @@ the file ``DELETED`` lists the paths that the step deletes. The first step, ``0-
 
 The case ``experiment`` stores its whole start. Every other case stores how its start differs from
 the start of ``experiment``. A later step stores how it differs from the step before. A case in
-``FOLLOWING`` plays the requests of ``experiment``. Each of its later steps stores only where its
-changes differ from the changes of the same step of ``experiment``.
+``FOLLOWING`` plays the requests of ``experiment``. Each later step of such a case stores only how
+the step's changes differ from the changes of the same step of ``experiment``.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
     """Yield a mutation for each mistake at each place of a document.
 
     ``limits`` are tried in place of whole numbers. To save time, a place gets only one value of a
-    wrong type, and a text only one control character; the next place gets another one. With
+    wrong type, and a text only one control character. Successive places get different ones. With
     ``DEMANDOPS_EXAMPLES`` above 1, each place gets all of them.
     """
     for turn, place in enumerate(places(document)):

@@ -76,7 +76,7 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
 def write_tree(
     repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.Oid:
-    """Write ``base`` with ``files`` changed, as the program does; return the id of the new tree."""
+    """Write ``base`` with ``files`` changed, by the program's code; return the new tree's id."""
     objects = NewObjects(repo)
     tree = trees.write(objects, base, files)
     with objects.packed(tree):
@@ -364,8 +364,8 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
 FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
 """The bundle of a state repo from the first version: render version 1, ``demandops.ledger/v1``.
 
-The repo has three joins of the experiment (tag ``three-joins``), two overrides, of which one ended,
-a join by another request, a demand with a lease, and a shutdown.
+The repo has three joins of the experiment (tag ``three-joins``), two overrides (one of them
+has ended), a join by another request, a demand with a lease, and a shutdown.
 """
 
 

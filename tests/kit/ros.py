@@ -148,7 +148,11 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain; ``warm`` commands start faster."""
+    """Starts `demandops serve` in one ROS domain.
+
+    With ``warm``, each command is a fork of a process that has imported its modules, so it starts
+    faster.
+    """
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str

@@ -81,7 +81,7 @@ def requesters(item: Item) -> list[str]:
 
 
 def demand_of(goal: Goal, item: Item) -> Demand:
-    """Return the demand of an item; the claims on one subject belong to different demands."""
+    """Return the demand that an item belongs to; a demand has at most one claim on a subject."""
     return goal.get("id", ""), tuple(sorted(set(requesters(item))))
 
 

@@ -25,7 +25,7 @@ MAY = {
     "vehicle01": frozenset({HALL, FURTHER}),
     "traffic": frozenset({FURTHER}),
 }
-"""The access domains in which each requester may demand, by the names of the node in them."""
+"""The names under which each requester may demand the node, one for each access domain."""
 MOST = 3
 KEPT_FOR = timedelta(seconds=120)
 
@@ -61,7 +61,7 @@ class Instances(Places):
         return outcome
 
     def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any] | None:
-        """Return an application with its instance's id and its node; None if it is refused."""
+        """Return ``app`` with the id, node and version of its claim; None if it is refused."""
         asked = app["version"]
         version = self.testing if asked == "testing" else asked or DEFAULT
         asked = asked and version  # a claim records the version, not the channel
@@ -92,7 +92,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep for ``KEPT_FOR`` the replicas that were needed ``before`` and no longer are."""
+        """Keep the replicas that were needed ``before`` and no longer are, for ``KEPT_FOR``."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -120,7 +120,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return, for each number above ``least``, until when at least this many replicas are kept."""
+    """Return, for each number of replicas above ``least``, until when at least so many are kept."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)

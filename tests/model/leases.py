@@ -24,7 +24,7 @@ REPEATS_WITHIN_S = 15 * 60
 
 
 def by_message(request: str, who: Iterable[str]) -> str:
-    """Return the name of the demand that comes from a goal of the reference."""
+    """Return the name of the demand that a goal of the reference becomes."""
     return f"{BY_MESSAGE}{request} {sorted(who)}"
 
 

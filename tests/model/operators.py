@@ -46,7 +46,7 @@ class Operators:
         }
 
     def take(self, goal: Goal) -> set[str]:
-        """Count a goal as the reference's operators do; return why ours may count it otherwise.
+        """Count a goal as the reference's operators do; return why DemandOps may count differently.
 
         Each reason is the name of a row in docs/reference.md.
         """

@@ -106,9 +106,10 @@ class Step(FrozenModel):
 class Scenario(FrozenModel):
     """A whole scenario.
 
-    ``config`` changes the files that ``demandops init`` writes. A mapping is merged into that of
-    the file, and any other value replaces that of the file. ``appdefs`` names folders of
-    ``tests/appdefs`` to add. ``invalid`` lists the faults that the configuration must have.
+    ``config`` changes the files that ``demandops init`` writes. A mapping in ``config`` is merged
+    into the file's mapping, and any other value replaces the file's value. ``appdefs`` names
+    folders of ``tests/appdefs`` to add. ``invalid`` lists the faults that the configuration must
+    have.
     """
 
     must: str = Field(min_length=1)

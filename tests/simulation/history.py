@@ -180,7 +180,10 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Send two demands for places at once; if a place is held, send its release before them."""
+        """Send two demands at once, for which the generator chooses nodes.
+
+        If such a demand has a node already, send its release first.
+        """
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
@@ -308,8 +311,8 @@ class History:
     def set_clocks(self) -> None:
         """Set the wall clocks forward or back; after the first step back, only further back.
 
-        A step forward could make up for a step back, so that a machine notices neither. The machine
-        might then end a lease early that another machine recorded between the two steps.
+        A step forward could undo a step back, so a machine might notice neither. The machine might
+        then end a lease early that another machine recorded between the two steps.
         """
         self.oracle.check()
         self.oracle.counts["faults"] += 1

@@ -211,7 +211,7 @@ class Oracle:
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return the priority, the time and the requesters of each waiting demand in a commit."""
+        """Return priority, start of the wait, and requesters of each waiting demand in a commit."""
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
         found = [plain_yaml.load(text) for text in texts]
         return {
@@ -240,8 +240,8 @@ class Oracle:
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
         """Return the operations of a commit and of all commits that it merges.
 
-        Each comes with whether a proposal contained it, because the lease of a proposed demand
-        starts at the merge.
+        The second value of each pair is true if a proposal contained the operation. The lease of a
+        proposed demand starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:

@@ -25,7 +25,7 @@ SlipIn = Callable[[Manifest], None]
 
 @pytest.fixture(scope="module", autouse=True)
 def neighbour(rig: Rig) -> Iterator[None]:
-    """Make a namespace of no access domain, and Argo CD's project `default`, which has no limits.
+    """Make a namespace outside all access domains, and Argo CD's unlimited project `default`.
 
     Each installation of Argo CD has that project.
     """

@@ -77,7 +77,7 @@ def from_flux(domain: flux_view.Domain) -> None:
 
 
 def upgrade(world: FluxWorld, gitops: str) -> str:
-    """Upgrade the state repo to a controller while the generator runs; return the single commit."""
+    """Render the state repo for a controller while the generator runs; return the only commit."""
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
     output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
@@ -105,7 +105,10 @@ def to_argocd(world: FluxWorld) -> Domain:
 
 
 def forget_flux(domain: flux_view.Domain) -> None:
-    """Delete Helm's records and Flux's objects, which remove no release while suspended."""
+    """Delete Helm's records and Flux's objects.
+
+    Flux's objects are suspended, so their deletion removes no release.
+    """
     for kind in FLUX_KINDS:
         for item in domain.find(kind):
             name = item["metadata"]["name"]

@@ -27,10 +27,10 @@ class World(StateRepo[Domain]):
         self.apply(rig.kube, manifests)
 
         def is_permitted() -> bool:
-            """Return whether Argo CD has read the folder.
+            """Return whether the project permits the folder and Argo CD has read the folder.
 
-            Argo CD may apply a former project of this name for minutes. If that project forbids the
-            folder, refresh the folder.
+            For minutes, Argo CD may still use a former project of the same name. If that project
+            forbids the folder, make Argo CD look at the folder again.
             """
             trouble = domain.trouble(domain.name, NAMESPACE)
             if "is not permitted in project" in trouble:

@@ -100,7 +100,10 @@ def push_chart(world: World, added: str) -> dict[str, str]:
 
 
 class Answers:
-    """A demand is answered once it is reconciled or healthy; if it never is, with the reason."""
+    """A demand is answered once it is reconciled or healthy.
+
+    If the demand never becomes so, the answer says why.
+    """
 
     def read_repaired_chart(self, world: World) -> None:
         """Make the controller read a repaired chart; do nothing if it reads the chart by itself."""

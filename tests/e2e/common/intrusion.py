@@ -63,7 +63,7 @@ FORBIDDEN = {
 
 
 def makers(spec: Manifest) -> Iterator[Manifest]:
-    """Yield one object of each kind that makes pods, with this pod spec."""
+    """Yield one object of each kind that makes pods; each object makes pods with this spec."""
     labels = {"app": "foreign"}
     template = {"metadata": {"labels": labels}, "spec": spec}
     once = {"template": {**template, "spec": {**spec, "restartPolicy": "Never"}}}

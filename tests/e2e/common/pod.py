@@ -4,8 +4,9 @@ The process has a read-only root file system of its own, the pod's volumes at th
 pod's user, no privileges, and only the container's environment. It uses the network and the process
 ids of the machine. Only root can start such a process.
 
-Unlike in a cluster, the process has no shared memory. Tests restrict ROS 2 to the loopback, where
-ROS 2 would use shared memory, and a client outside the container would miss every message.
+Unlike in a cluster, the process cannot use shared memory. Tests restrict ROS 2 to the loopback,
+and there ROS 2 would send messages through shared memory, if it could. A client outside the
+container would not receive such messages.
 
 By default the image consists of this machine's programs and this checkout. If ``E2E_IMAGE_ROOT``
 names a folder, the image is the root file system in that folder (made by ``deploy/fresh-root``).

@@ -34,7 +34,7 @@ class Client(ros.Client):
             time.sleep(0.005)
 
     def send(self, goal: Goal) -> Sent:
-        """Send a goal from the thread that spins, because rclpy may lose responses in others."""
+        """Send a goal from the thread that spins; in other threads, rclpy may lose responses."""
         sent: list[Sent] = []
         self.executor.create_task(lambda: sent.append(super(Client, self).send(goal)))
         self.wait(lambda: bool(sent))

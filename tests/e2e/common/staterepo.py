@@ -89,9 +89,9 @@ class Generator:
 
 
 class StateRepo(Generic[Domain]):
-    """A state repo with its generator, for the controller of its rig.
+    """A state repo for the GitOps controller of a rig, and the generator that writes it.
 
-    `domains` has the access domain on each cluster that follows the state repo, by cluster.
+    `domains` maps each cluster that follows the state repo to the access domain there.
     """
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:

@@ -246,7 +246,7 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
 def _controller(rig: Rig) -> list[str]:
     """Make the namespace of the golden manifests.
 
-    Return the kinds of the controller's own objects, and Deployment.
+    Return a list of kinds: those that the controller itself defines, and Deployment.
     """
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
     return [*PARTS[rig.gitops].KINDS, "Deployment"]

@@ -42,7 +42,7 @@ def link(rig: Rig) -> Iterator[Relay]:
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[World]:
-    """A state repo that both clusters follow; its inventory has the vehicles in the second one."""
+    """A state repo that both clusters follow. It puts the vehicles into the second cluster."""
     made = make_world()
     clusters = yaml.safe_load(made.file(CLUSTERS))
     clusters["clusters"].append({"name": FLEET})

@@ -184,7 +184,7 @@ def test_what_the_cluster_refuses_of_a_commit_is_reported(world: World, slip_in:
 
 
 def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
-    """The policy drops host-network, and the operator applies the new bootstrap file."""
+    """The policy no longer allows host-network; the operator applies the new bootstrap file."""
     domain = world.domain
     nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
     policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")

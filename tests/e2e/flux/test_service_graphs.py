@@ -1,4 +1,4 @@
-"""An application has services on three nodes; a topic is carried once, while a service reads it.
+"""An application has services on three nodes; each needed topic is carried once, no other at all.
 
 Each vehicle has a driver, which all applications share. At the edge are a detection for each
 driver, a fusion, and a planner. The plan is delivered to the vehicles.

@@ -102,7 +102,7 @@ def test_two_domains_share_a_machine_and_nothing_else(
 
 
 def application(id: str) -> dict[str, Any]:
-    """Return an application on the edge; the requester's policy rules decide its access domain."""
+    """Return an application on the edge; the rules for the requester decide the access domain."""
     inputs = {"point_cloud": [{"topic": CLOUD, "source": "vehicle00"}]}
     return {"id": id, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
 
@@ -152,7 +152,8 @@ def running(domain: Domain) -> set[tuple[str, str]]:
 def granted(where: Domain, *, of: Domain) -> set[str]:
     """Return the resources that the account of domain `of` may use in the namespace of `where`.
 
-    Reviews of its own rights are left out, because every account may ask for them.
+    The resources by which an account asks for its own rights are left out, because every account
+    may use them.
     """
     rules = where.kube.rules("demandops", where.namespace, of.namespace)
     asked = {"authorization.k8s.io", "authentication.k8s.io"}

@@ -1,9 +1,9 @@
 """Argo CD's application-controller, repo-server and server, and their Redis, as plain processes.
 
 One program contains all three parts; `ARGOCD_BINARY_NAME` selects one. The server serves the
-webhook. The controller runs as the cluster's administrator. As docs/argocd.md requires, a release
-may do only what its AppProject permits, and what the service account may do that the controller
-impersonates for it. Redis is the machine's own `redis-server`.
+webhook. The controller runs as the cluster's administrator. As docs/argocd.md requires, two limits
+hold for a release: its AppProject, and the rights of the service account that the controller
+impersonates for the release. Redis is the machine's own `redis-server`.
 """
 
 from __future__ import annotations

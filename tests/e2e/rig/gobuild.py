@@ -173,7 +173,8 @@ def _watched(
 ) -> str:
     """Run a command and return its standard output.
 
-    Each line of its standard error goes to `line`, which returns whether it is only progress.
+    Each line of its standard error goes to `line`, which returns whether the line reports only
+    progress.
     `tick` is called while there is no line.
     """
     folder = workspace.module

@@ -139,9 +139,9 @@ class Kube:
         return str(call(account, namespace, {"spec": {"expirationSeconds": 3607}}).status.token)
 
     def rules(self, account: str, namespace: str, home: str = "") -> list[Manifest]:
-        """Return the resource rules of a service account in a namespace.
+        """Return the rules that say which resources of a namespace a service account may use.
 
-        The account is in the namespace `home`, by default in the same namespace.
+        The account itself is in the namespace `home`, by default in `namespace`.
         """
         who = f"system:serviceaccount:{home or namespace}:{account}"
         api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)

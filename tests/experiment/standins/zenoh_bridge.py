@@ -36,7 +36,7 @@ class Bridge(Node):
         self.create_timer(_LOOK_S, self._find)
 
     def _find(self) -> None:
-        """Subscribe to the topics that the configuration lets out and that the ROS graph has."""
+        """Subscribe to the topics of the ROS graph that the configuration allows to be sent."""
         for topic, (kind, *_) in self.get_topic_names_and_types():
             if topic not in self._readers and self._given.search(topic):
                 self._readers[topic] = self.create_subscription(
