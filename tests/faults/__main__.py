@@ -9,6 +9,7 @@ import argparse
 import gc
 import io
 import json
+import logging
 import os
 import sys
 import tempfile
@@ -92,6 +93,7 @@ def _prepare(folder: Path) -> None:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             code = command_line.run([*command, *state])
         assert code == 0, code
+    logging.getLogger().handlers.clear()  # each forked process logs to its own standard error
     gc.collect()
     gc.freeze()  # otherwise the garbage collector of each forked process would copy all memory
 
