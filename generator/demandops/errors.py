@@ -157,6 +157,11 @@ def fault(field: str, message: str, *, code: str = "invalid", line: int | None =
     return Fault(code=code, field=field, message=message, line=line)
 
 
+def internal(error: Exception) -> StateRepoError:
+    """Return the error that answers a demand if a fault of the program keeps it from an answer."""
+    return StateRepoError(f"internal error of the generator: {error!r}; see its log")
+
+
 def closest(word: str, known: Iterable[str]) -> str | None:
     """Return the known word that is most similar to ``word``, or None if none is similar."""
     close = get_close_matches(word, _neighbors(word, sorted(known)), n=1)

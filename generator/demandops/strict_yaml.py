@@ -31,7 +31,7 @@ _WORDS = frozenset(
 
 MAX_LENGTH = 4_000_000
 """How many characters a file may have; an inventory of 20,000 nodes has fewer."""
-_MAX_DEPTH = 100
+MAX_DEPTH = 100
 _MAX_BITS = 14_000
 """How many bits a whole number may have; Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
@@ -110,15 +110,15 @@ class _Parser:
             raise InvalidInput.at(where, message)
         if kind is yaml.ScalarEvent:
             return self._list(event, depth) if event.value in self._lists else self._scalar(event)
-        if depth > _MAX_DEPTH:
-            raise InvalidInput.at("", f"is nested deeper than {_MAX_DEPTH} levels; make it flatter")
+        if depth > MAX_DEPTH:
+            raise InvalidInput.at("", f"is nested deeper than {MAX_DEPTH} levels; make it flatter")
         name = "seq" if kind is yaml.SequenceStartEvent else "map"
         if event.tag not in (None, "!", f"{_TAG}{name}"):
             raise _refused_tag(event.tag, event)
         return self._sequence(depth) if name == "seq" else self._mapping(depth)
 
     def _list(self, event: Any, depth: int) -> list[str]:  # noqa: ANN401
-        if event.tag or not event.implicit[0] or depth > _MAX_DEPTH:
+        if event.tag or not event.implicit[0] or depth > MAX_DEPTH:
             raise _Misread
         return self._lists.pop(event.value)
 

@@ -38,6 +38,7 @@ _LONGEST_INPUT = 1 << 14
 _ODD = (
     *(".inf", "-.nan", "1e999", "Infinity", "null", "~", "[]", "{}", "-1", "9" * 30, "!!int", "&a"),
     *("*a", "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "..", r"\\ud800", r"\x00"),
+    r"\"\\Uffffffff\"",
 )
 """Words that some parser has misread; libFuzzer inserts them anywhere."""
 

@@ -99,14 +99,17 @@ def perception(**changed: Any) -> Goal:
     return goal([application()], [connection()]) | changed
 
 
-def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None) -> Goal:
+def numbered(
+    number: int, *, shutdown: bool = False, vehicle: int | None = None, alone: bool = False
+) -> Goal:
     """Return demand ``number``.
 
-    Its requester ``user<number>`` belongs to this demand alone. It shares its application and its
-    connection with other demands.
+    Its requester ``user<number>`` belongs to this demand alone. Its other requester belongs to all
+    demands; with ``alone``, it has none. It shares its application and its connection with other
+    demands.
     """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
-    who = [f"user{number}", "station00"]
+    who = [f"user{number}", *([] if alone else ["station00"])]
     ego = (f"/vehicles/{name}/ego_data", name)
     app = application(f"edge/fusion-{number % 5}", who=who, ego=[ego], clouds=[STATION_CLOUD])
     link = connection(f"{name}/edge", who=who, ends=(name, "edge"), topics=[ego[0]])

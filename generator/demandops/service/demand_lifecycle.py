@@ -19,16 +19,19 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 
 from demandops.errors import (
     DemandOpsError,
     QueueFull,
+    Refused,
     ShuttingDown,
     StateRepoError,
     Unsound,
     Withdrawn,
+    fault,
+    internal,
 )
 from demandops.quoting import quoted
 from demandops.runtime import Runtime
@@ -50,11 +53,6 @@ _NEXT: dict[State, tuple[State, ...]] = {
 }
 
 
-_MOST_KNOWN = 10_000
-"""How many operation ids are remembered. A demand that is sent again with one of them counts once.
-"""
-
-
 class Demands:
     """The demands that have no answer yet, and the journal.
 
@@ -63,12 +61,7 @@ class Demands:
     """
 
     def __init__(
-        self,
-        journal: Journal,
-        limit: int,
-        requester_limit: int | None,
-        runtime: Runtime,
-        bases: Mapping[str, str],
+        self, journal: Journal, limit: int, requester_limit: int | None, runtime: Runtime
     ) -> None:
         """Queue the journal's demands.
 
@@ -77,8 +70,6 @@ class Demands:
             limit: how many demands may wait.
             requester_limit: how many demands of one requester may wait; None is no limit.
             runtime: provides the time and the threads.
-            bases: a map from the operation id of each demand that main records to a commit that
-                is older than the demand's own commit.
         """
         self._journal = journal
         self._limit, self._requester_limit = limit, requester_limit
@@ -86,7 +77,6 @@ class Demands:
         self._changed = runtime.condition()
         resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
-        self._bases = {**bases, **{ticket.operation: ticket.base for ticket in resumed}}
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
@@ -226,31 +216,27 @@ class Demands:
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
-                earlier = self._tickets.get(ticket.operation)
-                if earlier is not None:
-                    earlier.join(ticket)
-                    continue
                 error = self._why_refused(ticket, len(taken))
                 if error is not None:
                     refused.append((ticket, error))
                     continue
-                if ticket.operation in self._bases:  # sent again; it may be published
-                    ticket.mark_maybe_published(self._bases[ticket.operation])
-                self._bases[ticket.operation] = ticket.base
                 self._of_requester[requester_of(ticket.goal)] += 1
                 self._tickets[ticket.operation] = ticket
                 taken.append(ticket)
-            while len(self._bases) > _MOST_KNOWN:
-                del self._bases[next(iter(self._bases))]
             try:
                 self._journal.append(ticket.journal_entry() for ticket in taken)
-            except (StateRepoError, Unsound) as failure:
-                log.error("%s", failure)
+            except Exception as failure:
+                if isinstance(failure, DemandOpsError):
+                    why = failure
+                    log.error("%s", why)
+                else:  # a bug must leave no demand without an answer
+                    why = internal(failure)
+                    log.exception("internal error while journaling demands")
                 self.wake()  # so that the worker ends the process if the journal is unsound
                 for ticket in taken:
                     del self._tickets[ticket.operation]
                     self._of_requester[requester_of(ticket.goal)] -= 1
-                    refused.append((ticket, failure))
+                    refused.append((ticket, why))
                 taken = []
             for ticket in taken:
                 _change(ticket, "waiting")
@@ -274,6 +260,9 @@ class Demands:
             return QueueFull(
                 f"{self._limit} demands are waiting already{why}; send the demand again later"
             )
+        if ticket.operation in self._tickets:
+            message = "is the operation id of another demand; choose a new one"
+            return Refused([fault("", f"'{ticket.operation}' {message}")])
         who = requester_of(ticket.goal)
         limit = self._requester_limit
         if limit is not None and self._of_requester[who] >= limit:

@@ -9,7 +9,7 @@ import logging
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand.demand_request import Decommission
-from demandops.errors import DemandOpsError, InvalidInput, Refused, StateRepoError, Withdrawn, fault
+from demandops.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.approvals.proposal import is_release
@@ -97,7 +97,7 @@ class Evaluator:
             if reason is not None:  # the state repo fails, so no demand can be evaluated
                 raise reason from None
             log.exception("internal error while evaluating demand %s", ticket.operation)
-            return StateRepoError(f"internal error of the generator: {error!r}; see its log")
+            return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         """Return the results of the demands in ``batch`` that ``tip`` records, oldest first.

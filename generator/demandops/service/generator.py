@@ -9,7 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 
-from demandops import settings
+from demandops import settings, strict_yaml
 from demandops.config.config import Config
 from demandops.errors import Refused, fault
 from demandops.runtime import REAL, Runtime
@@ -22,7 +22,6 @@ from demandops.staterepo.git.open_repository import connect
 from demandops.staterepo.git.repository import access_error
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import revisions
-from demandops.staterepo.history.commit_log import recent_operations
 from demandops.staterepo.load import state_in_effect
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.write.slot import Slot
@@ -34,12 +33,6 @@ _GRACE_S = 5.0
 """How many more seconds a stop waits for the threads after its timeout.
 
 A running call of git or ssh-keygen ends within this time.
-"""
-_MOST_RECENT = 1_000
-"""How many commits are read at the start, to find the demands that earlier processes carried out.
-
-If a client sends a demand again with the same operation id, and its commit is among those read, the
-demand counts once.
 """
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
@@ -103,8 +96,7 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        bases = recent_operations(repository.objects, snapshot.commit, _MOST_RECENT)
-        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime, bases)
+        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -182,7 +174,7 @@ class Generator:
 
         Args:
             goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`).
-            operation: a unique id of this submission; generated if left out.
+            operation: an id that no other demand ever had; generated if left out.
             listener: called with each stage and its text, in the worker thread.
 
         Returns:
@@ -200,8 +192,12 @@ class Generator:
         ticket = Ticket(operation, goal, self._runtime.now(), listener)
         try:
             ticket.goal = json.loads(json.dumps(goal))
+            is_deep = _is_deeper(ticket.goal, strict_yaml.MAX_DEPTH)
         except (TypeError, ValueError, RecursionError):
-            message = "the goal is not plain data; give text, numbers, lists and mappings"
+            is_deep = True
+        if is_deep:
+            message = "is not plain data; give text, numbers, lists and mappings, nested at most "
+            message = f"the goal {message}{strict_yaml.MAX_DEPTH} deep"
             ticket.refuse(Refused([fault("", message)]))
             return ticket
         ticket.base = str(self.snapshot.commit)
@@ -275,3 +271,11 @@ class Generator:
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
         """Stop, wait for the threads to end, and return whether everything was published."""
         return self.stop(timeout).result()
+
+
+def _is_deeper(value: object, levels: int) -> bool:
+    """Return whether lists and mappings are nested deeper than ``levels``."""
+    if not isinstance(value, dict | list):
+        return False
+    parts = value.values() if isinstance(value, dict) else value
+    return levels == 0 or any(_is_deeper(part, levels - 1) for part in parts)

@@ -74,8 +74,7 @@ class Ticket:
     ``base`` is the tip that was known when the demand arrived. ``maybe_published`` is true if the
     remote may have accepted a push of the demand although no answer arrived. ``has_released`` is
     true if the demand is a release and ended a demand that awaited approval. It then succeeds even
-    if it ends no claim. ``joined`` are tickets of the same operation id that arrived later. They
-    get the same answer.
+    if it ends no claim.
     """
 
     operation: str
@@ -89,11 +88,11 @@ class Ticket:
     has_released: bool = False
     state: State = "waiting"
     notified: set[str] = field(default_factory=set)
-    joined: list[Ticket] = field(default_factory=list)
     proposal: ProposalRecord | None = None
 
     def __post_init__(self) -> None:
-        self.future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
+        for future in (self.future, self.journaled):
+            future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
 
     @property
     def name(self) -> str:
@@ -108,20 +107,6 @@ class Ticket:
         self.future.set_exception(error)
         self.journaled.set_result(False)
 
-    def join(self, other: Ticket) -> None:
-        """Give ``other``, which has the same operation id, the stages and answer of this ticket."""
-
-        def answer(future: Future[Receipt]) -> None:
-            error = future.exception()
-            if error is None:
-                other.future.set_result(future.result())
-            else:
-                other.future.set_exception(error)
-
-        self.joined.append(other)
-        self.future.add_done_callback(answer)
-        self.journaled.add_done_callback(lambda done: other.journaled.set_result(done.result()))
-
     def notify(self, stage: Stage, text: str) -> None:
         """Report a stage to the listener, but only once, even if the demand is evaluated again.
 
@@ -131,11 +116,10 @@ class Ticket:
         if key in self.notified:
             return
         self.notified.add(key)
-        for ticket in (self, *self.joined):
-            try:
-                ticket.listener(stage, text)
-            except Exception:
-                log.exception("a listener failed")
+        try:
+            self.listener(stage, text)
+        except Exception:
+            log.exception("a listener failed")
 
     def mark_maybe_published(self, base: str) -> None:
         """Record that a push on top of ``base`` may have succeeded although it seemed to fail."""

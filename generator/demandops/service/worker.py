@@ -11,7 +11,14 @@ from collections.abc import Callable
 
 from demandops.config.config import Config
 from demandops.decision import Decision
-from demandops.errors import DemandOpsError, ShuttingDown, StateRepoError, Unsound, Withdrawn
+from demandops.errors import (
+    DemandOpsError,
+    ShuttingDown,
+    StateRepoError,
+    Unsound,
+    Withdrawn,
+    internal,
+)
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
@@ -149,7 +156,7 @@ class Worker:
         if not batch:
             self._begin_rest()
         if not isinstance(error, DemandOpsError):
-            error = StateRepoError(f"internal error of the generator: {error!r}; see its log")
+            error = internal(error)
         self._demands.fail(batch, error)
 
     def _begin_rest(self) -> None:

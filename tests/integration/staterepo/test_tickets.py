@@ -20,6 +20,7 @@ from demandops.errors import (
 )
 from demandops.runtime import Runtime
 from demandops.service import Generator, Ticket
+from demandops.staterepo.write.journal import JournalEntry
 
 from tests.kit import rig
 from tests.kit.clock import Clock
@@ -347,53 +348,39 @@ def test_an_operation_id_cannot_forge_a_trailer(bare: Path) -> None:
     assert ("Requester", "somebody else") not in made.trailers
 
 
-def test_one_operation_id_handed_in_twice_is_one_commit(bare: Path) -> None:
+def test_an_operation_id_of_a_demand_that_has_no_answer_yet_is_refused(bare: Path) -> None:
     gate = Gate()
     with rig.running(bare) as generator:
         generator.submit(goal(0), "op-0", gate)
         assert gate.reached.wait(rig.PATIENCE_S)
-        tickets = [generator.submit(goal(1), "op-1"), generator.submit(goal(1), "op-1")]
+        first, again = generator.submit(goal(1), "op-1"), generator.submit(goal(2), "op-1")
+        assert again.journaled.result(rig.PATIENCE_S) is False
+        assert "'op-1' is the operation id of another demand" in str(again.future.exception())
         gate.open.set()
-        for ticket in tickets:
-            rig.receipt(ticket)
-        rig.receipt(generator.submit(goal(1), "op-1"))
+        rig.receipt(first)
     assert rig.operations(bare) == ["op-0", "op-1"]
 
 
-def test_a_leave_that_is_sent_twice_in_a_batch_spares_the_join_between(bare: Path) -> None:
-    gate = Gate()
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        generator.submit(goal(0), "op-0", gate)
-        assert gate.reached.wait(rig.PATIENCE_S)
-        leave = generator.submit(rig.leave(1), "op-leave")
-        generator.submit(goal(1), "op-join")
-        again = generator.submit(rig.leave(1), "op-leave")
-        gate.open.set()
-        assert rig.receipt(again).commit == rig.receipt(leave).commit
-    assert rig.operations(bare)[1:] == ["op-0", "op-leave", "op-join"]
-
-
-def test_a_demand_that_is_sent_again_while_it_waits_gets_the_answer_of_its_first_sending(
-    url: str, bare: Path
+def test_a_bug_in_the_journal_leaves_no_demand_without_an_answer(
+    bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate = Gate()
-    stages: list[str] = []
-    with rig.running(url) as generator:
-        generator.submit(goal(0), "op-0", gate)
-        assert gate.reached.wait(rig.PATIENCE_S)
-        first = generator.submit(goal(1), "op-1")
-        again = generator.submit(goal(1), "op-1", lambda stage, text: stages.append(stage))
-        wrong = [generator.submit(rig.impossible(), "op-wrong") for _ in range(2)]
-        assert first.journaled.result(rig.PATIENCE_S)
-        assert again.journaled.result(rig.PATIENCE_S)
-        gate.open.set()
-        assert rig.receipt(first) == rig.receipt(again)
-        errors = [ticket.future.exception(rig.PATIENCE_S) for ticket in wrong]
-    assert isinstance(errors[0], DemandOpsError)
-    assert errors[0] is errors[1]
-    assert stages == ["admitted", "booked", "committed", "pushed"]
-    assert rig.operations(bare) == ["op-0", "op-1"]
+    with rig.running(bare) as generator:
+        monkeypatch.setattr(JournalEntry, "record", lambda entry: {"goal": object()})
+        broken = [generator.submit(goal(number)) for number in (1, 2)]
+        for ticket in broken:
+            assert "internal error" in str(ticket.future.exception(rig.PATIENCE_S))
+        monkeypatch.undo()
+        assert rig.book(generator, goal(1))[0].outcome == "booked"
+
+
+def test_a_goal_that_is_nested_deeper_than_a_journal_line_can_be_is_refused(bare: Path) -> None:
+    deep: Any = "x"
+    for _ in range(101):
+        deep = [deep]
+    with rig.running(bare) as generator:
+        ticket = generator.submit({"id": deep})
+        assert "nested at most 100 deep" in str(ticket.future.exception(rig.PATIENCE_S))
+        assert rig.book(generator, goal(1))[0].outcome == "booked"
 
 
 # ---- a disk that is full ----

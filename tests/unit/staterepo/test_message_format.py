@@ -46,6 +46,14 @@ def test_trailers_are_read_back_exactly_and_nothing_else_stands_in_the_message(
     assert [line for line in above if line] == [line for line in lines if line]
 
 
+@given(value=st.text('"\\Uux01dfn:\n'))
+@example(value='"\\Uffffffff"')
+@example(value='"\\U00110000"')
+@examples(80)
+def test_what_a_person_writes_as_a_trailer_can_be_read(value: str) -> None:
+    parse(f"x\n\nNote: {value}\n")
+
+
 @given(trailers=TRAILERS)
 @example(trailers=[("Requester", value) for value in HOSTILE])
 @examples(20)

@@ -75,7 +75,7 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
         yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
         yield f"    demand {claim['demand']}, request '{claim['request']}'{version}{until}"
         yield f"    {claim['file']}"
-        if claim["place"]:
+        if claim["place"] is not None:
             required = ", ".join(f"{name} {value}" for name, value in claim["place"].items())
             yield f"    its node was chosen for {required or 'no requirement'}"
         if claim["services"]:

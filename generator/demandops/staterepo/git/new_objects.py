@@ -123,10 +123,13 @@ class NewObjects(pygit2.OdbBackend):
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
         """Write a new synced pack with the objects that ``commit`` has and ``since`` lacks.
 
+        If ``since`` is no commit of the repository, the pack has all objects of ``commit``.
+
         The repository has these objects, but they may not be durable, because an earlier sync may
         have failed. While the block runs, git's housekeeping does not remove the pack.
         """
-        with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n^{since}\n")):
+        without = f"^{since}\n" if since and since in self.repo else ""
+        with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n{without}")):
             yield
 
     @contextmanager

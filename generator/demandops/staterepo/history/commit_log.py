@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from itertools import islice
 from typing import Literal, get_args
 
 import git
@@ -207,22 +205,6 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
             for operation in entry.trailers.get(key, ()):
                 outcomes[operation] = RecordedOutcome(entry.commit, "waiting" if waits else outcome)
     return outcomes
-
-
-def recent_operations(repo: Repository, tip: str | Oid, most: int) -> dict[str, str]:
-    """Return a map from operation id to the parent of the commit that records the operation.
-
-    The oldest operation comes first. Only the last ``most`` commits along the first parents are
-    read. Signatures are not checked, so a caller must confirm an id by :func:`operations_since`,
-    with the parent as ``base``. If the recording commit has no parent, the map has an empty text.
-    """
-    found: dict[str, str] = {}
-    with suppress(pygit2.GitError, KeyError):  # an older commit is damaged or missing
-        for commit in islice(first_parents(repo, tip), most):
-            before = str(commit.parent_ids[0]) if commit.parent_ids else ""
-            trailers = entry_of(commit).trailers
-            found.update((each, before) for key in _OUTCOMES for each in trailers.get(key, ()))
-    return dict(reversed(found.items()))
 
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:

@@ -20,7 +20,7 @@ Trailers = Iterable[tuple[str, str]]
 
 _WHY = "Why: "
 _KEY = re.compile(r"[A-Za-z0-9-]+")
-_ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8}|[nrt\\\"])"
+_ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U00(?:0[0-9a-f]|10)[0-9a-f]{4}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
