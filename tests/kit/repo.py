@@ -370,7 +370,10 @@ has ended), a join by another request, a demand with a lease, and a shutdown.
 
 
 def first_version(path: Path, revision: str = "main") -> GitRepo:
-    """Return a bare copy of the first version's state repo, with ``main`` at a revision."""
+    """Return a bare copy of a state repo of DemandOps' first version.
+
+    Its ``main`` is at ``revision``.
+    """
     git(path.parent, "clone", "--quiet", "--bare", str(FIRST_VERSION), str(path))
     git(path, "update-ref", "refs/heads/main", f"{revision}^{{commit}}")
     return GitRepo(path)

@@ -1,6 +1,6 @@
 """A model of leases and of demands in DemandOps' own format, written only from the docs.
 
-It uses plain dicts over goals as they come in YAML, and imports nothing of the program. Where the
+It takes goals as the plain dicts that YAML gives, and imports nothing of the program. Where the
 docs leave something open, a comment says what this model does. Times are whole seconds.
 """
 

@@ -134,7 +134,8 @@ class Selector(FrozenModel):
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
-                f"nothing matches both connections and {others[0]}; write two selectors"
+                f"'connections' and '{others[0]}' together can match nothing; write a selector for "
+                "each"
             )
         return self
 

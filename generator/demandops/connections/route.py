@@ -134,8 +134,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.target)} is carried back to {quoted(carried_back[route.target])} "
-                f"and to {quoted(route.source)}; a connection carries a topic back to only one "
-                "topic, so use a second connection",
+                f"and to {quoted(route.source)}; a connection carries a target topic back to only "
+                "one source topic, so use a second connection",
             )
 
 

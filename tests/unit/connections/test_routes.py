@@ -62,8 +62,8 @@ def test_a_topic_listed_with_two_ways_to_carry_it_is_told() -> None:
 def test_a_topic_that_is_carried_back_goes_to_one_place() -> None:
     routes = [Route("/a", "/x", reverse=True), Route("/b", "/x", reverse=True)]
     assert told(faults("topics", routes)) == [
-        "topics[1].target: '/x' is carried back to '/a' and to '/b'; a connection carries a topic "
-        "back to only one topic, so use a second connection"
+        "topics[1].target: '/x' is carried back to '/a' and to '/b'; a connection carries a target "
+        "topic back to only one source topic, so use a second connection"
     ]
 
 

@@ -122,8 +122,8 @@ class TestContradictions:
         ledger = joined(Ledger(), Route("/a", "/x", reverse=True))
         assert refusal(ledger, Route("/b", "/x", reverse=True)) == [
             "connections[0].topics[0].target: '/x' is already carried back to '/a': connection 'c' "
-            "is held by v; a connection carries a topic back to only one topic, so use a second "
-            "connection"
+            "is held by v; a connection carries a target topic back to only one source topic, so "
+            "use a second connection"
         ]
         assert joined(ledger, Route("/b", "/x"), who="w")
 

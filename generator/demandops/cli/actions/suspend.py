@@ -42,7 +42,7 @@ def suspend(
     options: EditOptions,
     **selected: tuple[str, ...],
 ) -> None:
-    """Stop applications and connections without releasing them.
+    """Stop applications and connections; their demands keep holding them.
 
     Their claims stay booked, but nothing runs for these claims, and new demands that match the
     options are refused. To end this, give `demandops resume` the same options. The command creates

@@ -38,7 +38,9 @@ _MOST_PATHS = 50
 )
 @dry_run_option
 @click.option(
-    "--yes", is_flag=True, help="Do not ask for confirmation before the controller changes."
+    "--yes",
+    is_flag=True,
+    help="Do not ask whether the steps before a change of controller are done.",
 )
 @signing_option
 @output_option

@@ -78,7 +78,8 @@ def _of_routes(one: Demanded, demanded: Connection, claim: Claim, held: str) -> 
             yield one.fault(
                 f"{where}.target",
                 f"'{route.target}' is already carried back to '{other.source}': connection {held}; "
-                "a connection carries a topic back to only one topic, so use a second connection",
+                "a connection carries a target topic back to only one source topic, so use a "
+                "second connection",
                 code="conflict",
             )
 

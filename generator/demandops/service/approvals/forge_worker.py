@@ -23,7 +23,7 @@ POLL_S = 30.0
 """The seconds between queries of the forge, which alone knows that a pull request was closed."""
 
 _REST_S = 60.0
-"""The pause after a forge answers that it got too many requests."""
+"""How long to pause after a forge has answered that it got too many requests."""
 
 
 @dataclass(frozen=True, slots=True)
