@@ -55,7 +55,7 @@ def ask(demandops: Run, state: Any) -> Run:
 
 
 def test_what_the_page_says_of_git_alone(played: Any) -> None:
-    """The git commands of ``docs/audit.md``: by author, trailer, message, path and claim."""
+    """The git commands of ``docs/audit.md`` find commits by author, trailer, message and path."""
 
     def log(*args: str) -> list[str]:
         return git(played, "log", *args).splitlines()

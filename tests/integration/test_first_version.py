@@ -1,4 +1,4 @@
-"""Commands can read a state repo of the first version, and an upgrade converts it."""
+"""Commands can read a state repo that DemandOps' first version wrote; an upgrade converts it."""
 
 from __future__ import annotations
 

@@ -191,8 +191,8 @@ UNKNOWN = (
         ("od-a: 1", f"od-a: {UNKNOWN}"),
         (
             "kind: Pod",
-            "kind: 'Pod' is no kind of the reference; known: MqttConnection, ObjectDetection, "
-            "ObjectFusion",
+            "kind: 'Pod' is not a kind of custom resource that the reference has; known: "
+            "MqttConnection, ObjectDetection, ObjectFusion",
         ),
         ("od-a: {'1x': {}}", f"od-a.1x: {NO_VERSION}"),
         (

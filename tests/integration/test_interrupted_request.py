@@ -18,7 +18,7 @@ from tests.kit import rig
 def test_a_request_that_is_interrupted_says_what_has_an_answer(
     bare: Path, data_home: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int
 ) -> None:
-    """Once the first demands are booked, a folder stands where the branch's lock file must be."""
+    """Once a batch is booked, a folder in place of the branch's lock file prevents more commits."""
     file = tmp_path / "demands.yaml"
     file.write_text(yaml.safe_dump_all(rig.goal(each) for each in range(60)))
     lock = bare / "refs" / "heads" / "main.lock"

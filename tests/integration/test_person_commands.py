@@ -26,7 +26,7 @@ def joined(request_json: Callable[..., Ran], state: GitRepo) -> GitRepo:
 
 @pytest.fixture(params=["folder", "url"])
 def where(request: pytest.FixtureRequest, joined: GitRepo) -> tuple[str, str]:
-    """The options that name the state repo; each test runs with its folder and with its URL."""
+    """The option that names the state repo. Each test runs twice: with the path and with a URL."""
     address = str(joined.path) if request.param == "folder" else joined.path.as_uri()
     return "--state-repo", address
 

@@ -202,7 +202,7 @@ def test_what_people_changed_is_carried_out_by_a_signed_commit(
 
 
 class TestKeysThatCannotSign:
-    """The start reports a key that cannot sign, before anything is booked."""
+    """If the key cannot sign, the command says why and books nothing."""
 
     def told(self, book: Run, state: Any, key: Path | str) -> str:
         before = state.tip

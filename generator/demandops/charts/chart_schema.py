@@ -23,7 +23,7 @@ def composed(
 
     Args:
         title: the schema's title.
-        own: the properties that the chart adds to those of the library or replaces, by name.
+        own: by name, the chart's properties that the library lacks or defines differently.
         values: the text of the chart's ``values.yaml``, which describes its values.
         library: the schema of the library.
         shared: the text of the library's ``values.yaml``.

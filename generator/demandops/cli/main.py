@@ -50,7 +50,7 @@ COMMANDS = {
     "schema": ("repo", "Print the JSON Schema of a kind of file."),
     "serve": ("demandops_ros", "Run the ROS 2 node that accepts demands."),
     "status": ("views", "Show the state of each release on its cluster."),
-    "suspend": ("actions", "Stop applications and connections; their demands keep holding them."),
+    "suspend": ("actions", "Stop applications and connections; their claims stay booked."),
     "upgrade": ("repo", "Render everything again, in one commit."),
     "verify": ("repo", "Render commits again from their ledger and compare the bytes."),
     "version": ("repo", "Print the versions of the program and of its formats."),

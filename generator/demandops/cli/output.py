@@ -48,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""A change → the sign before the name of the release or bookkeeping entry that changed."""
+"""The sign of each change. It stands before the name of the changed release or entry."""
 
 
 def terminal_width() -> int | None:
@@ -116,7 +116,7 @@ at_option = click.option(
 
 
 def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    """Return the value of an option that is a duration, in seconds."""
+    """Return how many seconds the duration in an option's value has."""
     from demandops.config.durations import seconds_of  # noqa: PLC0415 - --help must be fast
 
     try:
@@ -184,8 +184,8 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 def progress(title: str) -> Iterator[Progress]:
     """Yield a function that updates a progress bar.
 
-    Its arguments are the number of parts that are done and the number of all parts. The bar appears
-    only on a terminal, and only if the work takes long.
+    The function takes the number of parts that are done and the number of all parts. The bar
+    appears only on a terminal, and only if the work takes long.
     """
     start = REAL.monotonic()
     bar: Bar | None = None

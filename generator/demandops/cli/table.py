@@ -47,7 +47,7 @@ class Table:
     title: str = ""
     empty: str = "(nothing)"
     styles: dict[str, str] = field(default_factory=dict)
-    """The text of a cell → its color on a terminal that shows colors."""
+    """The colors of cells, by the text of the cell, for a terminal that shows colors."""
     whole: bool = False
     """Whether to keep every column and wrap nothing, however wide the table gets."""
 

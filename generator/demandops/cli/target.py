@@ -91,8 +91,8 @@ def _writable() -> str | None:
 def hint_to_pull() -> list[str]:
     """Return a list with a hint to pull if the command pushed to the remote of the checkout.
 
-    The list is empty otherwise. The checkout lacks the new commit, and other commands read only the
-    checkout.
+    Otherwise return an empty list. The hint is needed because the pushed commit is not yet in the
+    checkout, and commands that only read use the checkout.
     """
     behind = click.get_current_context().meta.get(_BEHIND)
     return ["to see the new commit in this checkout: git pull"] if behind else []

@@ -164,7 +164,7 @@ KINDS: dict[str, type[Spec]] = {
     "ObjectDetection": ObjectDetection,
     "ObjectFusion": ObjectFusion,
 }
-"""Kind of custom resource → the class of its spec."""
+"""The class of the spec, by the kind of the custom resource."""
 
 
 class _Metadata(_Part):
@@ -200,7 +200,7 @@ class ReferenceFiles:
 
 
 def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
-    """Return the content of all documents. Each document is paired with the name of its file.
+    """Return the content of all documents. Each pair has the name of a file and a document of it.
 
     Raises:
         InvalidInput: with the faults of all files.
@@ -248,7 +248,10 @@ def _read_resource(found: ReferenceFiles, file: str, where: str, item: Any) -> N
     kind = item.get("kind") if isinstance(item, dict) else None
     spec = KINDS.get(str(kind))
     if spec is None:
-        message = f"{quoted(str(kind))} is no kind of the reference; known: {', '.join(KINDS)}"
+        message = (
+            f"{quoted(str(kind))} is not a kind of custom resource that the reference has; known: "
+            f"{', '.join(KINDS)}"
+        )
         raise InvalidInput.at(f"{where}.kind".lstrip("."), message, file=file)
     name = parse(_Metadata, item, file).name
     _add(found.specs, name, parse(spec, item.get("spec"), f"{file}: {name}"), file)

@@ -19,8 +19,8 @@ from demandops.migration.reference_files import Hold, Request
 class Join:
     """Requesters that hold the same topics of a resource, each topic once.
 
-    ``version`` is the version of the resource after the join, or 0 if it is not known. It orders
-    the joins of all resources.
+    ``version`` is the version of the resource after the join, or 0 if it is not known. The joins of
+    all resources are sorted by ``version``.
     """
 
     version: int

@@ -53,7 +53,7 @@ def manifests(broker: Broker) -> dict[str, str]:
 def pods(
     manifests: dict[str, str], broker: Broker, tmp_path_factory: pytest.TempPathFactory
 ) -> Ends:
-    """Return the pods of both ends, after their init containers."""
+    """Return the pods of both ends, whose init containers have run."""
     secrets = {
         "broker-ca": {"ca.crt": broker.authority.read_text()},
         "broker-login": {"username": USER + "\n", "password": PASSWORD},

@@ -1,7 +1,8 @@
 """A running generator follows what people merge, even if no demand comes.
 
-It uses the state repo in place, by a file URL or by smart HTTP. No test measures time: each wait
-ends with the expected event. Tests repair every file that they break, and every commit verifies.
+The generator uses the state repo by its path, by a file URL or by smart HTTP. No test
+measures time: each wait ends with the expected event. Tests repair every file that they break, and
+every commit verifies.
 """
 
 from __future__ import annotations
@@ -380,7 +381,7 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, ba
 def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     url: str, bare: Path, drivers: rig.Drivers
 ) -> None:
-    """One push cannot take all these demands; the journal has the others."""
+    """The demands are more than one push takes, and all of them are in the journal."""
     many = 250
     rig.restart(url)  # creates the clone
     with rig.away(bare):

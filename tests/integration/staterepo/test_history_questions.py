@@ -1,6 +1,6 @@
 """A repository answers which of two commits is later, and what differs between them.
 
-The code that reads clusters asks this. The tests use real Git repositories.
+The program needs both answers to read the state of clusters. The tests use real Git repositories.
 """
 
 from __future__ import annotations

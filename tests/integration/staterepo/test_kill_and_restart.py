@@ -242,7 +242,7 @@ def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
 def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
     bare: Path, data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, node: str
 ) -> None:
-    """The repeated join was unchanged or refused; after the later release it could be booked."""
+    """The repeated join changed nothing or was refused; after the release it could be booked."""
     synced, again = {}, goal(1)
     again["apps"][0]["header"]["node_id"] = node
 
@@ -336,7 +336,8 @@ def _of_the_first_version(text: bytes) -> bytes:
 def _leave_journal(url: str, bare: Path, data_home: Path, whose: str) -> Path:
     """Leave a journal with the demands 1 and 2 behind; return its path.
 
-    If `whose` is "own", the journal is in the slot that the next process takes, else in another.
+    If `whose` is "own", the journal is in the slot that the next process takes. Otherwise it is in
+    another slot.
     """
     _leave_pending(url, bare, [1, 2])
     journal = next(data_home.glob("*/slot-0/outbox.jsonl"))

@@ -56,7 +56,7 @@ def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
 
 @dataclass
 class _Person:
-    """A person who keeps changing the state repo: fetch, commit, push, and again if refused."""
+    """A person who keeps changing the state repo, and repeats each push until it is accepted."""
 
     person: rig.Person
     pushed: list[str] = field(default_factory=list)

@@ -132,7 +132,7 @@ def test_what_the_platform_engineer_merges_is_honoured_and_stays_so(
 
 
 def _demand_on(generator: Generator) -> None:
-    """Book further demands of other requesters, and release some of them."""
+    """Book demands of further requesters, and release some of these demands."""
     tickets = []
     for number in range(100, 100 + FURTHER * 2 // 3):
         tickets.append(generator.submit(rig.goal(number)))

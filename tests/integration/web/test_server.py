@@ -108,7 +108,7 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
 def test_views_of_earlier_moments_keep_no_other_waiting(
     served: WebServer, follower: Follower
 ) -> None:
-    """There are more requests for earlier commits than threads; all wait for the loading lock."""
+    """More requests for earlier commits than the server has threads wait for the loading lock."""
     with ExitStack() as stack:
         stack.enter_context(follower._loading)
         for _ in range(60):

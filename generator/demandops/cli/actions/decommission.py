@@ -39,12 +39,17 @@ from demandops.staterepo.load.snapshot import Snapshot
 @click.command()
 @click.argument("name", metavar="NODE|REQUESTER", shell_complete=names_of("nodes", "requesters"))
 @writable_repo_option
-@click.option("--node", "kinds", flag_value="node", help="Decommission only the node of that name.")
+@click.option(
+    "--node",
+    "kinds",
+    flag_value="node",
+    help="Decommission only the node NAME, not a requester of the same name.",
+)
 @click.option(
     "--requester",
     "kinds",
     flag_value="requester",
-    help="Decommission only the requester of that name.",
+    help="Decommission only the requester NAME, not a node of the same name.",
 )
 @reason_option
 @dry_run_option
@@ -126,7 +131,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
-    """Return whether the goal names a node, and ``error`` says only that nothing is held."""
+    """Return whether the goal was refused only because no claim concerns its node."""
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 

@@ -63,7 +63,7 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @selecting
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
-@click.option("--keep", is_flag=True, help="Keep services running without a demand.")
+@click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
 @click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
 @click.option("--on", "target", metavar="NODE", help="Move services to this node.")
 @click.option("--use-version", "version", metavar="WORD", help="Pin the version of the chart.")

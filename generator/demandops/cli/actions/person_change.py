@@ -51,7 +51,7 @@ reason_option = click.option(
     "-m",
     "--reason",
     metavar="TEXT",
-    help="The reason, for the commit message and any override file.",
+    help="The reason. It is written to the commit message and to the file of a new override.",
 )
 yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
 propose_option = click.option(
@@ -114,7 +114,7 @@ class EditOptions:
 
 
 def editing(command: Command) -> Command:
-    """Return the command with the options of :class:`EditOptions` added.
+    """Return the command, to which the options of :class:`EditOptions` are added.
 
     The command gets the values of these options as one argument, ``options``.
     """
@@ -268,7 +268,8 @@ def _lines(edit: Edit, data: Json) -> Iterator[str]:
 def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     """Return one line for each release and claim that the override affects.
 
-    If the edit removes the override, the lines say that it no longer affects them.
+    If the edit removes the override, each line says that the release or claim is no longer
+    affected.
     """
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
@@ -289,7 +290,7 @@ SELECTORS = ("application", "appdef", "service", "connection", "node", "requeste
 
 
 def selecting(command: Command) -> Command:
-    """Return the command with the options that select an override's releases and claims."""
+    """Add the options that select an override's releases and claims; return the command."""
     for name in reversed(SELECTORS):
         command = click.option(
             f"--{name}",

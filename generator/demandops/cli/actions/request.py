@@ -179,9 +179,10 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
 
 
 def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
-    """Return one row of the output for each document, because at least one does not parse.
+    """Return a refusal for each document, as a row of the output.
 
-    Each row is a refusal. A document that parses is refused because of the others.
+    The caller has found that at least one document does not parse. The refusal of a document that
+    parses says that another document does not.
     """
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
@@ -321,7 +322,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
 def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
     """Yield a warning if the lease has no unit.
 
-    The number counts as seconds, but its author may have meant minutes.
+    A lease without a unit counts as seconds, but its author may have meant minutes.
     """
     lease = goal.get("lease") if isinstance(goal, dict) else None
     if isinstance(lease, int) and not isinstance(lease, bool):

@@ -45,7 +45,7 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 @click.option(
     "--drop-newer",
     is_flag=True,
-    help="Also drop claims that were booked after that commit. Without this option, such claims "
+    help="Also drop claims that were booked after REV or TIME. Without this option, such claims "
     "prevent the rollback.",
 )
 @dry_run_option
@@ -127,8 +127,8 @@ def _roll_back(
     """Roll back with a generator; return the outcome as JSON data.
 
     ``base`` is the commit for which the caller has computed the consequences. The result contains
-    consequences only if the caller's are wrong: if the rollback was refused, changed nothing, or is
-    based on a newer commit.
+    consequences only if those for ``base`` are wrong, because the rollback was refused, changed
+    nothing, or was decided on a newer commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:

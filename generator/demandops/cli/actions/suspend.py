@@ -42,11 +42,11 @@ def suspend(
     options: EditOptions,
     **selected: tuple[str, ...],
 ) -> None:
-    """Stop applications and connections; their demands keep holding them.
+    """Stop applications and connections; their claims stay booked.
 
-    Their claims stay booked, but nothing runs for these claims, and new demands that match the
-    options are refused. To end this, give `demandops resume` the same options. The command creates
-    an override with `deny` in your own name.
+    Nothing runs for these claims, and new demands that match the options are refused. To end the
+    suspension, give `demandops resume` the same options. The command creates an override with
+    `deny` in your own name.
 
     \b
     Examples:

@@ -16,9 +16,9 @@ def completion(shell: str) -> None:
     """Print the code that makes a shell complete commands.
 
     The code completes commands, options, and the names of demands, nodes, releases, applications,
-    requesters, proposals and overrides. The names come from the state repo that the command would
-    use. If this state repo is behind a URL, the code fetches nothing, but reads the commit that was
-    fetched last.
+    requesters, proposals and overrides. The names come from the state repo on which the completed
+    command would work. If this state repo is behind a URL, the code fetches nothing, but reads the
+    commit that was fetched last.
 
     \b
     Examples:

@@ -60,7 +60,7 @@ def init(
 ) -> None:
     """Create a state repo.
 
-    The first commit has the files that people edit, with the fleet and application of the example.
+    The first commit has the files that people edit, with the fleet that --example names.
     To make a cluster follow the state repo, install Flux or Argo CD on the cluster (docs/flux.md,
     docs/argocd.md) and run:
 
@@ -110,7 +110,7 @@ def init(
         lines.append(f"next: demandops serve --state-repo {directory}")
     else:
         lines += [
-            "next: edit inventory/ and policy/, commit, push it to your Git server, and run",
+            "next: edit inventory/ and policy/, commit, push to your Git server, and run",
             "      demandops serve --state-repo URL",
         ]
     show(output, data, lines)

@@ -176,9 +176,9 @@ def policy(
 ) -> None:
     """Write a new access domain: who may demand what on which nodes.
 
-    The patterns of at most one access domain may match a node. A new state repo has one domain,
-    whose pattern "*" matches every node. So first edit policy/access-domains.yaml: narrow the
-    patterns that match the nodes of the new domain.
+    A node may match the patterns of only one access domain. A new state repo has one domain,
+    whose pattern "*" matches every node. So first narrow, in policy/access-domains.yaml,
+    the patterns that match the nodes of the new domain.
 
     \b
     Examples:
@@ -204,7 +204,7 @@ def policy(
 @click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Select nodes by id.")
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
-@click.option("--keep", is_flag=True, help="Keep services running without a demand.")
+@click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
 @click.option(
     "--replicas", type=click.IntRange(min=0), metavar="N", help="Set the number of replicas."
 )
@@ -383,7 +383,7 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     ),
     "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
 }
-"""Option → the arguments of :func:`_asked`: question, check, and the highest number of words."""
+"""For each option the arguments of :func:`_asked`: question, check, highest number of words."""
 
 
 def _example_node(config: Config) -> str:

@@ -23,15 +23,15 @@ from demandops.staterepo.audit.verification import Verdict
     "--whole",
     is_flag=True,
     help="Load and render each commit completely. Without this option, the commits between the "
-    "first and the last are verified by their differences from the commit before.",
+    "first and the last are each verified by the differences from the commit before it.",
 )
 @output_option
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
     """Render commits again from their ledger and compare the bytes.
 
     Once the state repo has policy/allowed-signers, each further commit of the generator must have a
-    good signature. The version of this file in the commit before must list the key (docs/audit.md).
-    REV, A and B are commits or times.
+    good signature. The version of this file in the commit's parent must list the key
+    (docs/audit.md). REV, A and B are commits or times.
 
     \b
     Examples:

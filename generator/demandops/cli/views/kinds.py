@@ -73,7 +73,7 @@ def _demands(source: Source) -> list[Json]:
 
 
 def _now(state: str, lease: Lease | None, now: datetime) -> str:
-    """Return ``state``, but ``overdue`` instead of ``held`` if the lease has ended."""
+    """Return ``overdue`` if ``state`` is ``held`` and the lease has ended, else ``state``."""
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 

@@ -152,7 +152,7 @@ class Status:
     orphans: tuple[Orphan, ...]
     missing_inputs: tuple[MissingInput, ...]
     unreadable: Mapping[str, str]
-    """Name of a cluster → why its objects cannot be read."""
+    """For each cluster whose objects cannot be read, by name: the reason."""
 
     @classmethod
     def of(

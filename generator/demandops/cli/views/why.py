@@ -205,7 +205,7 @@ def _of_override(world: World, name: str) -> dict[str, Any]:
 
 
 def _held(world: World, what: str, held: Iterable[Claim]) -> dict[str, Any]:
-    """Return JSON data on the claims ``held`` and on the releases that they need.
+    """Return JSON data on the claims in ``held``, and on the releases that these claims need.
 
     ``what`` is the text that describes the subject of the answer.
     """
@@ -285,7 +285,10 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 
 
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
-    """Return commits as JSON data. Each one lists the commits by people that it carries out."""
+    """Return commits as JSON data.
+
+    If a commit of the generator carries out commits of people, its data list them.
+    """
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:
         if entry is None:
