@@ -37,7 +37,7 @@ class Migration:
         return self._demandops("import", *chosen, *how, *args, stdin=stdin)
 
     def propose(self, old: str = "", new: str = "") -> None:
-        """Let `import` propose a map; in it, set `request`, and replace `old` by `new`."""
+        """Let `import` propose a map; set `request` in the map, and replace `old` by `new`."""
         assert self.run().code == 0
         text = self.map.read_text().replace("request: imported", f"request: {REQUEST}")
         assert old in text

@@ -67,7 +67,7 @@ def read() -> ContextsFile:
         return EMPTY
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput.at(
-            "", f"cannot be read: {error}; replace it", file=str(path())
+            "", f"cannot be read: {error}; replace the file", file=str(path())
         ) from None
     with located_in(text):
         return parse_file(ContextsFile, text, str(path()))

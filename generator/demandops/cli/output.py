@@ -48,7 +48,7 @@ def console(stderr: bool = False) -> Console:
 
 
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""The sign of each change. It stands before the name of the changed release or entry."""
+"""The sign of each kind of change. It is printed before the changed release or entry."""
 
 
 def terminal_width() -> int | None:
@@ -116,7 +116,7 @@ at_option = click.option(
 
 
 def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    """Return how many seconds the duration in an option's value has."""
+    """Return the value of a duration option as a number of seconds."""
     from demandops.config.durations import seconds_of  # noqa: PLC0415 - --help must be fast
 
     try:

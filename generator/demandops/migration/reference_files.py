@@ -200,7 +200,7 @@ class ReferenceFiles:
 
 
 def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
-    """Return the content of all documents. Each pair has the name of a file and a document of it.
+    """Return the content of all documents. Each pair is a file's name and a document of it.
 
     Raises:
         InvalidInput: with the faults of all files.

@@ -12,7 +12,10 @@ from demandops.scaffold.yaml_document import document
 
 
 def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
-    """Return a map from path to text: a file for a new node, and one for a cluster that is new."""
+    """Return a map from path to text, with a file for a new node.
+
+    If the node's cluster is new too, the map also has a file for the cluster.
+    """
     if id in config.nodes:
         raise InvalidInput.at("ID", f"'{id}' is a node already; choose another id")
     path = f"inventory/nodes/{object_name('', id)}.yaml"

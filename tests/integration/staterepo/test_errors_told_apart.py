@@ -307,7 +307,7 @@ def test_a_damaged_clone_is_made_anew(
 def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture, name: str
 ) -> None:
-    """Without the clone's configuration, git reports that ``origin`` is no repository."""
+    """If the clone's configuration is gone, git blames ``origin``; the log must name the clone."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         file = generator._slot.folder / "clone.git" / name

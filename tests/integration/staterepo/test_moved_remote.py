@@ -340,7 +340,7 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
 def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """According to the clone, neither demand needs a push. But the clone lacks a newer commit."""
+    """According to the clone, neither demand needs a push. But the remote has a newer commit."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)

@@ -60,10 +60,10 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
 def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """A repeated join changes nothing, and then a release follows; the server takes its push.
+    """The server takes the push of a release that follows a repeated join.
 
-    The repeated join has no commit. If the generator decided both demands again on top of the
-    release, it would book the join.
+    The repeated join changes nothing, so it has no commit. If the generator decided both
+    demands again on top of the release, it would book the join.
     """
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:

@@ -97,7 +97,7 @@ def test_demands_wait_and_are_booked_in_turn_by_any_generator(
 def test_a_lost_answer_of_a_demand_that_waits_on_is_told_again(
     bare: Path, person: Person, tmp_path: Path
 ) -> None:
-    """The repeated demand changes nothing, so the next commit records that the demand waits."""
+    """The repeated demand gets no commit of its own; the next commit records that it waits."""
     person.change(_with_room_for_one(bare), "One at a time")
     turns, base = Turns(1), rig.tip(bare)
     generator = Generator(str(bare), data=tmp_path / "first", runtime=turns)

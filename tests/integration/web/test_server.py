@@ -108,7 +108,7 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
 def test_views_of_earlier_moments_keep_no_other_waiting(
     served: WebServer, follower: Follower
 ) -> None:
-    """More requests for earlier commits than the server has threads wait for the loading lock."""
+    """60 requests for earlier commits wait for the loading lock; the server has fewer threads."""
     with ExitStack() as stack:
         stack.enter_context(follower._loading)
         for _ in range(60):

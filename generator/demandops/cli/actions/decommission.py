@@ -131,7 +131,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
-    """Return whether the goal was refused only because no claim concerns its node."""
+    """Return whether ``error`` says only that no claim concerns a node of the inventory."""
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 

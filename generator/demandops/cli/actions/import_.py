@@ -115,7 +115,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return ``cluster NAME`` and the reference's resources there, as a list with this one pair."""
+    """Return one pair in a list: ``cluster NAME``, and the reference's resources in the cluster."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

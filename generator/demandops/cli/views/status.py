@@ -152,7 +152,7 @@ class Status:
     orphans: tuple[Orphan, ...]
     missing_inputs: tuple[MissingInput, ...]
     unreadable: Mapping[str, str]
-    """For each cluster whose objects cannot be read, by name: the reason."""
+    """The reasons why clusters' objects cannot be read, by the name of the cluster."""
 
     @classmethod
     def of(

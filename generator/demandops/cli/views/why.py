@@ -287,7 +287,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
     """Return commits as JSON data.
 
-    If a commit of the generator carries out commits of people, its data list them.
+    For a commit that carries out commits of people, the data list these commits of people.
     """
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:

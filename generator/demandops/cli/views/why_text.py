@@ -77,7 +77,7 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
         yield f"    {claim['file']}"
         if claim["place"] is not None:
             required = ", ".join(f"{name} {value}" for name, value in claim["place"].items())
-            yield f"    its node was chosen for {required or 'no requirement'}"
+            yield f"    the application's node was chosen for {required or 'no requirement'}"
         if claim["services"]:
             nodes = ", ".join(f"{name} on {node}" for name, node in claim["services"].items())
             yield f"    services on nodes of their own: {nodes}"
