@@ -158,7 +158,7 @@ def fault(field: str, message: str, *, code: str = "invalid", line: int | None =
 
 
 def internal(error: Exception) -> StateRepoError:
-    """Return the error that answers a demand if a fault of the program keeps it from an answer."""
+    """Return the error that answers a demand that failed because of a fault of the program."""
     return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
 
@@ -169,7 +169,7 @@ def closest(word: str, known: Iterable[str]) -> str | None:
 
 
 def sentences(problems: Iterable[str]) -> str:
-    """Return problems as one text, each as a sentence."""
+    """Return one text in which each problem is a sentence."""
     return ". ".join(problems).replace("?. ", "? ")
 
 

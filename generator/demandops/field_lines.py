@@ -81,7 +81,7 @@ def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) ->
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """If the block raises faults, add the line of its field to each fault.
+    """If the block raises faults, add to each fault the line of the fault's field.
 
     The fields of the faults must be fields of ``text``.
     """

@@ -119,5 +119,5 @@ def _cause(error: httpx.TransportError) -> str:
         return "the URL or a header is not valid; check them"
     text = one_line(str(error) or type(error).__name__)
     if "CERTIFICATE_VERIFY_FAILED" in text:
-        return f"{text}; if you trust the certificate, name it in SSL_CERT_FILE"
+        return f"{text}; if you trust the certificate, set SSL_CERT_FILE to its file"
     return f"{text}; check that it runs and can be reached"

@@ -71,8 +71,8 @@ def topic_problem(name: str) -> str:
         return f"{quoted(name)} is private to a node; give the full name, starting with '/'"
     if not _TOPIC.fullmatch(name):
         return (
-            f"{quoted(name)} is not a topic name that ROS 2 allows; use letters, digits and '_' "
-            "between single '/', no part starting with a digit"
+            f"{quoted(name)} is not a topic name that ROS 2 allows; use letters, digits and '_', "
+            "with a single '/' between parts; no part may start with a digit"
         )
     if len(name) > MAX_TOPIC:
         return f"has {len(name)} characters; ROS 2 takes at most {MAX_TOPIC}"
@@ -80,7 +80,10 @@ def topic_problem(name: str) -> str:
 
 
 def message_type_problem(name: str) -> str:
-    """Return why a name is not a ROS 2 message type with its package, or an empty string."""
+    """Return what is wrong with the name of a ROS 2 message type, or an empty string.
+
+    The name must include the package.
+    """
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
     return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"
@@ -108,7 +111,9 @@ PATTERN_WORDS = {
     r"^oci://[^\s]+$": "a URL that begins with oci://",
     r"^values/[A-Za-z0-9_.-]+$": "a file of the folder values/, such as values/service.yaml.j2",
     r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$": "a host name or address, such as 10.0.0.1",
-    r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": f"{_ANY}, '_' and '-', split by '/', such as fleet/one",
+    r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": (
+        f"parts of {_ANY}, '_' and '-', with '/' between them, such as fleet/one"
+    ),
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
     r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
     r"^[a-z0-9][a-z0-9._/:-]*$": "an image without its tag, such as registry.example/detection",

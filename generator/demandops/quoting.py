@@ -1,8 +1,8 @@
 """Makes text from outside safe to print, for people and programs that read line by line.
 
 A value from a goal, a file, a commit, a remote or an exception may hold any text. Code that prints
-the value uses this module, so that the value cannot begin a line, control a terminal, reorder or
-hide text, or fill a screen. Visible text stays as it is.
+the value uses this module, so that the value cannot begin a new line, control a terminal, reorder
+or hide text, or fill a screen. Visible text stays as it is.
 """
 
 from __future__ import annotations

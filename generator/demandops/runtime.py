@@ -1,9 +1,9 @@
 """Time, random numbers and threads: only this module takes them from the machine.
 
 The service and the cluster's watchers take a :class:`Runtime`. A test can pass its own, with a
-clock that it moves, numbers from a seed, and threads that take turns. An object that is made with
-an open state repo uses this repo's runtime. Commands, git's processes and locks, HTTP and ROS's
-executors always use :data:`REAL`.
+clock that it moves, numbers from a seed, and threads that take turns. An object that gets an
+open state repo uses the runtime of this state repo. Commands, git's processes and locks, HTTP and
+ROS's executors always use :data:`REAL`.
 
 This module also supervises the threads, so that no thread fails unnoticed.
 """
@@ -63,7 +63,7 @@ class Runtime:
         return str(uuid.uuid4())
 
     def lock(self) -> threading.Lock:
-        """Return a new lock. The caller must hold it only briefly, and never while it waits."""
+        """Return a new lock. The caller must hold it briefly, and not wait while holding it."""
         return threading.Lock()
 
     def event(self) -> threading.Event:

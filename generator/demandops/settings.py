@@ -45,7 +45,7 @@ GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose files are all rendered from ledger and configuration."""
 
 SCHEMAS_ROOT = "schemas"
-"""The folder of a state repo that has the JSON Schemas, for editors."""
+"""The folder for JSON Schemas in each state repo; editors read the schemas."""
 
 
 def modeline(path: str, schema: str) -> str:

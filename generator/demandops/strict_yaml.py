@@ -33,9 +33,9 @@ MAX_LENGTH = 4_000_000
 """How many characters a file may have; an inventory of 20,000 nodes has fewer."""
 MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""How many bits a whole number may have; Python prints at most 4,300 digits."""
+"""How many bits a whole number may have, because Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
-_MISFIT = "not valid YAML: a tag or number is not allowed there"
+_MISFIT = "not valid YAML: it has a tag, number or character that cannot be read"
 
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
 """Matches a quoted text, or the digits before the ``e`` of a JSON number like ``1e-09``.
@@ -349,7 +349,7 @@ def _block(value: Any, indent: str) -> str:  # noqa: ANN401
 
 
 def _item(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return what follows the dash of a list's item; the first line stands on the dash's line."""
+    """Write a list's item as YAML: return the text that follows the item's dash."""
     if isinstance(value, str):
         return f" {_scalar(value)}"
     inner = f"{indent}  "

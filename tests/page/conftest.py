@@ -37,9 +37,9 @@ Visits = Callable[..., Visit]
 
 @pytest.fixture
 def visit(browser: Browser, fleet: Story) -> Iterator[Visits]:
-    """Return a function that opens a visit of the page.
+    """Return a function that opens the page in the browser and returns the :class:`Visit`.
 
-    At the end, the fixture checks that the page called no other host and reported no error.
+    After the test, the fixture checks that the page called no other host and reported no error.
     """
     made: list[Visit] = []
 

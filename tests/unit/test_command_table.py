@@ -1,4 +1,4 @@
-"""The table of commands, from which `--help` lists them without an import of their modules."""
+"""`--help` lists the commands from a table, without an import of the commands' modules."""
 
 from __future__ import annotations
 

@@ -122,7 +122,9 @@ def test_only_trusted_certificates_are_accepted(
     answer = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
     with (
         speaking(answer, tls=tls) as url,
-        pytest.raises(NoAnswer, match="if you trust the certificate, name it in SSL_CERT_FILE"),
+        pytest.raises(
+            NoAnswer, match="if you trust the certificate, set SSL_CERT_FILE to its file"
+        ),
     ):
         call(url)
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))

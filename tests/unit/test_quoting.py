@@ -1,4 +1,4 @@
-"""Text from outside cannot begin a line, control a terminal, hide text or fill a screen."""
+"""Text from outside cannot begin a new line, control a terminal, hide text or fill a screen."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
-    """Raised when the operator's files give no usable access; the message contains no secret."""
+    """Raised when the files do not say how to wake a controller; no message contains a secret."""
 
 
 class ClusterAccess(FrozenModel):
@@ -70,9 +70,9 @@ class ClusterAccess(FrozenModel):
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
-    """Return the API of the cluster in which this process is a pod, without retries.
+    """Return the API of the cluster in which this process runs as a pod.
 
-    Its calls have the rights of the pod's service account.
+    The API does not retry a failed call. Its calls have the rights of the pod's service account.
 
     Args:
         wanted_by: the option or command that needs the API, for the message.

@@ -222,7 +222,7 @@ def _request(selector: ObjectSelector) -> dict[str, str]:
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether an error is an answer of the cluster, so whether the cluster is reachable."""
+    """Return whether the cluster answered with this error; if so, the cluster is reachable."""
     return bool(getattr(error, "status", None))
 
 
@@ -236,5 +236,5 @@ def _reason(selector: ObjectSelector, error: Exception) -> str:
 
 
 def _version(item: dict[str, Any]) -> int:
-    """Return an object's resource version; only versions of the same kind can be compared."""
+    """Return an object's resource version; compare it only within one kind of object."""
     return int(item["metadata"]["resourceVersion"])

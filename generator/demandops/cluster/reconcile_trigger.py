@@ -59,7 +59,7 @@ class _Wake:
     cluster: str
     domains: tuple[AccessDomain, ...]
     pushed: float | None = None
-    """When the oldest push came that still needs a call; None if no push needs one."""
+    """The time of the oldest push that still needs a call; None if no push needs one."""
     next_try: float = -inf
     pause: float = _FIRST_RETRY_S
     idle_from: float = -inf
@@ -144,7 +144,7 @@ class ReconcileTrigger:
                 return
 
     def _seconds_until_due(self) -> float | None:
-        """Return the seconds until the next call or the end; None if neither is planned."""
+        """Return the seconds until the next call or the thread's end; None if none is planned."""
         due = min((wake.due for wake in self._wakes.values()), default=inf)
         due = min(due, self._ends)
         return None if due == inf else max(0.0, due - self._runtime.monotonic())

@@ -52,9 +52,9 @@ def statuses(
 ) -> list[ReleaseStatus]:
     """Return the status of each release at a commit, from the caches of the clusters.
 
-    If a cluster has applied only an earlier commit, ``changed`` returns the paths in which the two
-    commits differ. If a release's file is not among these paths, the release counts as applied. So
-    a new commit does not hide the health of unchanged releases.
+    ``changed`` returns the paths in which two commits differ. If a cluster has applied only an
+    earlier commit, each release whose file is not among these paths counts as applied. So a new
+    commit does not hide the health of unchanged releases.
     """
     changed = cache(changed)
     known = _CachedHistory(history)

@@ -57,7 +57,10 @@ class ClusterWatch:
     def statuses(
         self, targets: Iterable[Target], commit: str, repository: StateRepository
     ) -> dict[str, ReleaseStatus]:
-        """Return the status of each release by name; start to watch access domains that are new."""
+        """Return the status of each release, by the release's name.
+
+        Domains of ``targets`` that are not watched yet are watched from now on.
+        """
         wanted = list(targets)
         self._watch(target.domain for target in wanted)
         found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)
@@ -82,7 +85,7 @@ class ClusterWatch:
         commit: str,
         repository: StateRepository,
     ) -> tuple[Orphan, ...]:
-        """Return the objects on clusters that belong to no release of a commit."""
+        """Return the orphans on the clusters: objects whose release is gone at ``commit``."""
         self._watch(domains)
         return tuple(orphans(domains, targets, commit, self._caches, repository))
 

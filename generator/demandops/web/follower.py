@@ -132,9 +132,10 @@ class Follower:
         return commit_state.last_changes[path]
 
     def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
-        """Return the generated files that a generator has yet to write or remove after a commit.
+        """Return the paths of the generated files that are out of date at a commit.
 
-        Return an empty set if the state repo cannot be read.
+        A generator has yet to write or remove these files. The set is empty if the state repo
+        cannot be read.
         """
         if commit_state.not_rendered is None:
             try:
@@ -189,7 +190,7 @@ class Follower:
             self.version += 1
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
-        """Return the situation at the newest commit; read statuses, proposals and history."""
+        """Read statuses, proposals and history, and return the situation at ``commit_state``."""
         self._read_history(commit_state.commit)
         statuses: Mapping[str, ReleaseStatus] = {}
         old: tuple[OldBootstrap, ...] = ()

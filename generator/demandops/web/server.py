@@ -81,9 +81,9 @@ class WebServer:
 class _BoundedConnection(H11Protocol):
     """A connection that is closed if its client takes too long.
 
-    The client has 10 to 20 seconds to complete a request, and as long to read the next part of an
-    answer. The time in which the server computes an answer does not count. So a stream of events
-    stays open as long as the client reads it.
+    The client must complete a request within 10 to 20 seconds. It has the same time to read each
+    part of an answer. The time in which the server computes an answer does not count, so a stream
+    of events stays open while the client reads the events.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

@@ -54,11 +54,11 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class ReusableRows:
-    """The rows of a list, kept so that a later call need not make them again.
+    """The rows of a list, kept for the next time that the page shows the list.
 
     ``rows`` maps the id of each entry to the entry's values and to the row that was made from them.
-    ``statuses`` are the statuses of releases from which the rows were made. They are None if the
-    rows were made for an earlier commit.
+    ``statuses`` has the status of each release when the rows were made. It is None if the rows were
+    made for an earlier commit.
     """
 
     statuses: object
@@ -82,7 +82,7 @@ class CommitState:
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
         self.last_changes: dict[str, LogEntry | None] = {}
-        """The newest commit that changed each path that was looked up; None if no commit did."""
+        """For each path that was looked up, the newest commit that changed this path, or None."""
         self.not_rendered: frozenset[str] | None = None
         """The files that a generator has yet to write or remove; None until they are looked up."""
 
@@ -252,7 +252,7 @@ def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
 
 
 def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services for which two ledgers record different replicas to keep."""
+    """Yield the services whose records of kept replicas differ between two ledgers."""
     before, after = old.kept.steps, new.kept.steps
     for instance in {*before, *after}:
         if before.get(instance) != after.get(instance):
@@ -265,8 +265,9 @@ class Situation:
 
     ``statuses`` maps names of releases to their status; it is empty for an earlier commit.
     ``watched`` names the clusters that the page watches. ``old_bootstraps`` lists the clusters
-    without the current bootstrap file, ``orphans`` the objects on clusters that belong to no
-    release. ``unread`` is the reason why a newer state cannot be read, or empty.
+    without the current bootstrap file. ``orphans`` lists the objects that clusters still have,
+    although they belong to no release. ``unread`` is the reason why a newer state cannot be read,
+    or empty.
     """
 
     commit_state: CommitState

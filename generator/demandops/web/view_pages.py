@@ -186,4 +186,4 @@ VIEWS: Mapping[str, View] = {
     "/overrides": _overrides,
     "/rates": _rates,
 }
-"""The function of each address; it returns the template and the data of a view."""
+"""For each address, the function that returns the template and the data of the view there."""

@@ -33,7 +33,7 @@ def schema(chart: Path) -> str:
 
 
 def readme(chart: Path) -> str:
-    """Return the text that a chart's README must have, with a table of its current values."""
+    """Return the text of a chart's README, with its table made anew from ``values.yaml``."""
     text = (chart / "README.md").read_text()
     values = (chart / "values.yaml").read_text()
     root = f"exports.{chart_schema.EXPORT}" if chart == LIBRARY else ""

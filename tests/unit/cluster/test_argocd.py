@@ -48,7 +48,8 @@ def application(
 ) -> dict[str, Any]:
     """Return an Application whose spec has the source ``wanted``.
 
-    If ``sync`` is set, the Application was compared with ``compared``, or else with ``wanted``.
+    If ``sync`` is set, Argo CD has compared the Application with the source ``compared``. By
+    default this is the source ``wanted``.
     """
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}
@@ -61,7 +62,7 @@ def application(
 
 
 def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return the ``operationState`` of a sync of source ``of``, by default the domain's folder."""
+    """Return the ``operationState`` of a sync from source ``of``, by default ``FOLDER``."""
     result = {"revision": revision, "source": more.pop("of", FOLDER)}
     result["resources"] = more.pop("resources", [])
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
@@ -202,7 +203,7 @@ def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
 def test_a_chart_that_changed_in_its_folder_is_waited_for(
     at: str, changing: list[tuple[str, str]], state: str
 ) -> None:
-    """The Application's source stays the same; only its last synced commit has the new chart."""
+    """The Application's source stays the same, so only the synced commit tells which chart runs."""
     objects = {
         OVER: over(sync="Synced", at="b"),
         CHILD: application(NEW, sync="Synced", at=at),

@@ -123,7 +123,7 @@ def test_the_object_that_fetches_is_annotated(
 
 
 def fetch(api: KubeApi, commit: str) -> None:
-    """Report that Flux has handled the last request, and has fetched a commit."""
+    """Have the API report that Flux has handled the last request and fetched ``commit``."""
     asked = api.patches[-1][1]["metadata"]["annotations"] if api.patches else {}
     artifact = {"revision": f"main@sha1:{commit}"}
     status = {"lastHandledReconcileAt": asked.get(REQUESTED_AT, ""), "artifact": artifact}

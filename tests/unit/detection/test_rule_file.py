@@ -127,7 +127,7 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "rules.yaml:4: sources.a: needs the name of the entity once: write {entity} as a part of "
         "topic, or set entity to the field of the message that has the name",
         "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
-        "letters, digits and '_' between single '/', no part starting with a digit",
+        "letters, digits and '_', with a single '/' between parts; no part may start with a digit",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
         "std_msgs/msg/String",
         "rules.yaml:11: sources.c.topic: has {entity} twice; name the entity once",
@@ -163,7 +163,9 @@ def test_a_zone_and_a_text_that_nobody_knows_are_mistakes() -> None:
         "rules.yaml:24: rules[0].schedule.zone: 'Europe/Berlim' is not a time zone; write it like "
         "Europe/Berlin",
     ]
-    assert faults("\ud800") == ["rules.yaml: not valid YAML: a tag or number is not allowed there"]
+    assert faults("\ud800") == [
+        "rules.yaml: not valid YAML: it has a tag, number or character that cannot be read"
+    ]
 
 
 def test_the_mistakes_of_the_documentation_are_told_as_it_says() -> None:

@@ -22,7 +22,7 @@ _IGNORED = {"host", "connection", "accept-encoding", "user-agent", "content-leng
 
 @dataclass
 class Replay:
-    """A running replay: its URL, the exchanges left, the problems, and the requests so far."""
+    """A running replay: its URL, the exchanges still to come, the problems, and past requests."""
 
     url: str = ""
     left: list[dict[str, Any]] = field(default_factory=list)
@@ -51,7 +51,10 @@ class Replay:
 
 @contextmanager
 def replaying(*names: str, variables: dict[str, str] | None = None) -> Iterator[Replay]:
-    """Replay recorded exchanges in order, with the variables' values in place of ``{name}``."""
+    """Replay recorded exchanges in order.
+
+    In the recordings, each ``{x}`` is replaced by the value of the variable ``x``.
+    """
     replay = Replay()
     for name in names:
         text = (_EXCHANGES / f"{name}.yaml").read_text()

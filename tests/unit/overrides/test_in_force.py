@@ -1,8 +1,9 @@
 """Under overrides too, the generated files follow from the configuration and the ledger.
 
-Random demands join and leave. After each one, the files that the demands have written one by one
-equal the files that the configuration and the ledger render at once. The bookkeeping lists
-exactly the denied claims as suspended, and a kept claim is the only claim on its subject.
+Random goals join and shut down. After each goal, the generated files, which changed goal by goal,
+equal the files that are rendered anew from the configuration and the ledger. The bookkeeping lists
+exactly the denied claims as suspended. The claim of an override that keeps a subject is the only
+claim on this subject.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class Flux(HealthReader):
             domain: the domain.
             objects: the objects that are known.
             before: what :meth:`handled_request` returned before the last fetch request was made;
-                None if none was made.
+                None if there was no fetch request.
         """
         kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
         if kustomization is None or source is None:

@@ -1,4 +1,4 @@
-"""The part of the health of releases that is the same for each GitOps controller. Pure."""
+"""The computation of releases' health that all GitOps controllers share. Pure."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class HealthReader(ABC):
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
         """Return the objects to read again before a release counts as healthy.
 
-        The owners come first, then the Deployments that they own.
+        The objects that represent services come first, then the Deployments that they own.
         """
         kinds = (self.service_kind, "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)

@@ -147,8 +147,8 @@ def _apart(
     """Return the parts to draw together, and the parts to draw one by one.
 
     If there are at most ``most`` parts, all are drawn one by one. If there are more, only the
-    special parts are drawn one by one. If there are more than ``most`` special parts, all parts are
-    drawn together.
+    special parts are drawn one by one. But if there are more than ``most`` special parts, all parts
+    are drawn together.
     """
     if len(drawn) <= most:
         return [], drawn

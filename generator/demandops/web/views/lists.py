@@ -54,7 +54,7 @@ def health_cell(word: str) -> Cell:
 
 
 def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return a linked text for each value; the link lists the rows with the value in ``key``."""
+    """Return each value as a text, linked to the rows that have the value in field ``key``."""
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 

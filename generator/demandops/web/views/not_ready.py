@@ -1,4 +1,4 @@
-"""Which applications are not ready, for which causes, since when, and who can fix the causes."""
+"""Which applications are not ready, why and since when, and who can fix the causes."""
 
 from __future__ import annotations
 

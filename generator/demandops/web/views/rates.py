@@ -76,7 +76,9 @@ def plots(
     return [
         make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
         make.counts(
-            "Demands released", _times(commits, _RELEASED), "commits that release or expire demands"
+            "Demands released",
+            _times(commits, _RELEASED),
+            "commits that release demands, or end demands whose lease expired",
         ),
         make.counts(
             "People's commits",
@@ -119,7 +121,7 @@ class _PlotMaker:
         summary = "nothing was seen yet"
         if every:
             late = every[math.ceil(0.95 * len(every)) - 1]
-            summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, of {len(every)}"
+            summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"
         values = [median(one) if one else 0.0 for one in bins]
         return self._plot(title, "in seconds", about, values, summary, " s")
 

@@ -107,7 +107,7 @@ def _of_images(release: Release, config: Config, command: str, last_change: Last
 
 
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
-    """Return a text that names the people who last changed files or folders, or an empty text."""
+    """Return a text that names who last changed each path; empty if no person changed any."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
     return f" ({', '.join(people)} changed it last)" if people else ""

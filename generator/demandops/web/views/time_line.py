@@ -138,8 +138,8 @@ def strip(
     Args:
         found: the events, newest first.
         now: the time at the end of the line.
-        span: a key of ``SPANS``; any other value means the shortest span that has 20 events, or
-            three quarters of all events if that is less.
+        span: a key of ``SPANS``; any other value means the shortest span that has enough
+            events: 20, or three quarters of all events, whichever is less.
         chosen: the time and the id of the chosen commit; None if no earlier commit is chosen.
     """
     if span not in SPANS:
