@@ -142,8 +142,9 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
     assert repo.faults(goal([application("cloud/y", node="cloud", clouds=[REAR])])) == [
         "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
         "object_list of object-detection is /vehicle01_local_objectlist, which object-detection "
-        "for /front/points of 'vehicle01' publishes on 'cloud' already; list the usual topic of "
-        "the two in topics.point_cloud of 'vehicle01' in inventory/nodes.yaml"
+        "for /front/points of 'vehicle01' publishes on 'cloud' already; choose one of the two "
+        "topics as the usual one, and list it in topics.point_cloud of 'vehicle01' in "
+        "inventory/nodes.yaml"
     ]
 
 
