@@ -119,7 +119,8 @@ class UnsuspendedClaims(Ledger):
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions that unsuspended claims on an application ask for.
 
-        An empty text in the result stands for the default version.
+        The result also has an empty text if an unsuspended claim asks for no version, or for an
+        unknown version.
         """
         booked = Ledger.versions_asked(self, application, known)
         asked = {

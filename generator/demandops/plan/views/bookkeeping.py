@@ -264,7 +264,7 @@ class EntryChange:
 
 
 def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    """Return each service and then each connection that differs, both sorted by name."""
+    """Return the changes of services, then those of connections, each sorted by name."""
     return (
         *_changes("service", dict(old.services), dict(new.services)),
         *_changes("connection", dict(old.connections), dict(new.connections)),
@@ -292,8 +292,8 @@ def _changes(
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
     """Yield the facts about an entry, as texts.
 
-    ``other`` is the same entry on the other side of a change. A fact that holds for only one of the
-    two entries is part of the change.
+    One of ``entry`` and ``other`` is an entry before a change, and one is the same entry after the
+    change. A fact that holds for only one of the two is part of the change.
     """
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
