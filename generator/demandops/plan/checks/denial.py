@@ -1,4 +1,4 @@
-"""Denials: a demand is refused if an override with ``deny`` selects what it asks for.
+"""Denials: a demand is refused if an override with ``deny`` selects what the demand asks for.
 
 The fault names the reason and the owner of the override. A demand that only repeats existing claims
 renews these claims. Such a demand is always allowed, but its requester gets a warning that an

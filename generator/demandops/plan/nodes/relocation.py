@@ -263,7 +263,7 @@ def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
 
 
 def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> Iterator[Fault]:
-    """Yield the faults of moved claims, checked as if their demands asked for them."""
+    """Yield the faults of moved claims; each claim is checked like a demand for its content."""
     for change in changes:
         claim = change.after
         if claim is None:

@@ -282,8 +282,8 @@ def _needed(
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     """Return the overrides that keep the subject of a claim, the highest in rank first.
 
-    For a kept claim, ``requesters`` of a selector is not compared. A kept claim names the owner of
-    the override as its requester, and the original claim already matched with its own requesters.
+    For a kept claim, ``requesters`` of a selector is not compared, because the only requester of a
+    kept claim is the owner of the override. The requesters of the original claim already matched.
     """
     traits = traits_of(claim)
     if claim.keeping_override is not None:

@@ -85,7 +85,7 @@ class WaitingEntry:
 
 @dataclass(frozen=True, slots=True)
 class ResourceEntry:
-    """What services request of a resource on a node, and its capacity, as Kubernetes quantities."""
+    """What services request of a node's resource, and the capacity, as Kubernetes quantities."""
 
     requested: str
     capacity: str
@@ -179,7 +179,7 @@ def _time(moment: datetime) -> str:
 
 
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
-    """Return the resources of the nodes that declare a capacity: node → resource → amounts."""
+    """Return the amounts of each resource with a declared capacity, by node and resource."""
     usage = whole_usage(world)
     found: dict[str, dict[str, ResourceEntry]] = {}
     machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
