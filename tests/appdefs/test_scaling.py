@@ -306,8 +306,8 @@ def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: 
         == [
             (
                 "overrides/two.yaml",
-                "runs 2 replicas of driver, each of which publishes every output; run only one, or "
-                "set dividesWork: true in the application definition if the program divides its "
+                "runs 2 replicas of driver, and each replica publishes every output; run only one, "
+                "or set dividesWork: true in the application definition if the program divides its "
                 "work among replicas",
             )
         ]

@@ -131,8 +131,8 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     assert found.code == 0
     assert found.err.splitlines() == [
         "warning: overrides/idle.yaml: matches nothing now; if it should match something, correct "
-        "select",
-        "warning: overrides/many.yaml: runs 2 replicas of object-detection, each of which "
+        "its field 'select'",
+        "warning: overrides/many.yaml: runs 2 replicas of object-detection, and each replica "
         "publishes every output; run only one, or set dividesWork: true in the application "
         "definition if the program divides its work among replicas",
         "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z and no longer applies; "

@@ -76,14 +76,14 @@ def admit(
     throttle: Throttle = lambda request, config: (),
     trial: placement.Trial | None = None,
 ) -> DemandRequest:
-    """Return the request that a goal becomes, after the checks of the configuration and throttle.
+    """Return the request that a goal becomes, if the goal passes all checks.
 
     If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
     this node.
 
     Raises:
-        Refused: with every fault in the form and in the content of the goal. If there is none, with
-            the faults of ``throttle``.
+        Refused: with every fault in the form and in the content of the goal. ``throttle`` is called
+            only if there is no such fault. Then its faults refuse the request.
     """
     config, ledger = state.config, state.ledger
     not_placed: list[Fault] = []

@@ -33,7 +33,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only newer generators write, for records of which node each service has."""
+"""Folders that only newer generators write; their files record the node of each service."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
 _VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
@@ -401,7 +401,7 @@ def read(text: str, path: str) -> Claim:
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return the kind of subject that the claim file at a path is for.
+    """Return whether the claim file at a path is for an application or for a connection.
 
     Return ``None`` if the path is not that of a claim file.
     """

@@ -91,7 +91,7 @@ class KeptReplicas:
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        """Return the records with these steps of an instance; empty steps remove its record."""
+        """Return all records, with that of ``instance`` set to ``steps``; empty steps remove it."""
         known = self.steps.get(instance) or ()
         if known == steps:
             return self

@@ -152,7 +152,7 @@ class Ledger:
         yield from sorted(usual - {but})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for inputs in ``role`` that ``part`` stands for in topic names.
+        """Yield (input, version) for each input in ``role`` that is called ``part`` in topic names.
 
         ``part`` is the text that replaces ``{instance}`` in output patterns. Only further topics
         and the inputs of separate instances are yielded. ``version`` is the version of the separate
@@ -211,7 +211,10 @@ class Ledger:
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the ids of the applications that ``part`` stands for in topic names, sorted."""
+        """Return the ids of the applications that are called ``part`` in topic names, sorted.
+
+        ``part`` is the text that replaces ``{instance}`` in output patterns.
+        """
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:

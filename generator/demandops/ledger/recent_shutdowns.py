@@ -1,7 +1,7 @@
 """Recent shutdowns, so that a shutdown that is sent again within 15 minutes is recognized.
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
-record of the first shutdown, the repeat would release another demand of the same requesters. If a
+record of the first shutdown, the repeat could release another demand of the same requesters. If a
 join adds something for one of the requesters, the record is removed, because the next shutdown may
 mean what the join added.
 
@@ -94,7 +94,7 @@ class RecentShutdowns:
         return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        """Return the records with ``shutdown`` at ``digest``; ``None`` removes this record."""
+        """Return all records, with the one at ``digest`` replaced; ``None`` removes the record."""
         known = self.by_digest.get(digest)
         if known == shutdown:
             return self

@@ -22,9 +22,10 @@ from demandops.subject import TopicKey
 class PublishedTopic(NamedTuple):
     """A topic that a service reads, and the node that publishes the topic.
 
-    ``root`` is the key of a demanded topic. If the demand lists ``topic`` as an input, this is
-    ``topic`` itself. Otherwise it is the input from which a service makes ``topic``. ``root`` is
-    empty if a service makes ``topic`` from all its inputs together.
+    ``root`` is the key of the demanded topic from which ``topic`` comes. If the demand lists
+    ``topic`` as an input, this is the key of ``topic`` itself. Otherwise it is the key of the input
+    from which services make ``topic``. ``root`` is empty if a service makes ``topic`` from all its
+    inputs together.
     """
 
     topic: InputTopic

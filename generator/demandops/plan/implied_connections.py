@@ -28,10 +28,11 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
-    """Return the field of the goal to name in a fault at ``path`` of an implied connection.
+    """Return the field that a fault of an implied connection names.
 
-    A fault in a requester names ``path``. Any other fault names ``field``, the input, delivery or
-    node because of which the connection is needed.
+    The goal does not list the connection, so a fault at ``path`` in the connection names ``field``.
+    This is the goal's input, delivery or node because of which the connection is needed. Only a
+    fault in a requester names ``path``.
     """
     return path if path.startswith("requesters") else field
 

@@ -193,8 +193,8 @@ def demanded_inputs(
 ) -> Iterator[tuple[str, str, TopicKey]]:
     """Yield (role, topic, root) for each topic that a service reads because of an application.
 
-    ``role`` is the input of the service that reads the topic. ``root`` is the key of the demanded
-    topic that it comes from (:class:`demandops.plan.flows.PublishedTopic`).
+    ``role`` is the service's input that reads the topic. ``root`` is the key of the demanded topic
+    from which this topic comes (:class:`demandops.plan.flows.PublishedTopic`).
     """
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
@@ -214,8 +214,8 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     """Return the release name of a service instance.
 
     If the instance runs for a topic, the name contains the node and the topic's source, as in
-    ``od-edge-vehicle00``. The name also contains a slug of the topic, unless the inventory lists
-    the topic as the usual topic of the source (``topics``).
+    ``od-edge-vehicle00``. The name also contains a slug of the topic, unless ``topics`` in the
+    source's inventory entry lists the topic as the usual one.
     """
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)

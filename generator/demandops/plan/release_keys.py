@@ -28,7 +28,7 @@ ReleaseKey = ServiceKey | ClientKey
 
 
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that the claims on ``subject`` need, without suspended claims.
+    """Yield the keys of the releases that the unsuspended claims on ``subject`` need.
 
     If the definition of the application is missing, nothing is yielded. With ``strict``, this
     raises ``Refused`` instead, so that no service ends because its definition was deleted.

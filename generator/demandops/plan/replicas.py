@@ -73,11 +73,11 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return how many replicas a service has, and the step because of which it keeps some of them.
+    """Return how many replicas a service has, and the step that keeps more than its demands need.
 
     A service may keep replicas for a while (``scaling.downAfter``). ``steps`` say how many replicas
-    the service keeps, and how long (:mod:`demandops.ledger.kept_replicas`). If the service keeps no
-    more replicas than its demands need, ``None`` is returned instead of a step.
+    the service keeps, and how long (:mod:`demandops.ledger.kept_replicas`). If the demands need at
+    least as many replicas as the service keeps, ``None`` is returned instead of a step.
     """
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None
@@ -86,7 +86,10 @@ def with_kept(
 
 
 def overridden(replicas: int | Autoscaler, by: int) -> int | Autoscaler:
-    """Return the replicas after an override sets ``by``; ``by`` is both bounds of an autoscaler."""
+    """Return the number of replicas ``by`` that an override sets.
+
+    If ``replicas`` is an autoscaler, return an autoscaler with ``by`` as both bounds.
+    """
     return Autoscaler(by, by, replicas.targets) if isinstance(replicas, Autoscaler) else by
 
 

@@ -23,7 +23,7 @@ from demandops.plan.release_keys import ReleaseKey
 def with_kept_replicas(
     before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
 ) -> tuple[Ledger, tuple[Instance, ...]]:
-    """Return the ledger with its kept replicas updated, and the instances for which they changed.
+    """Return the updated ledger, and the service instances whose kept replicas changed.
 
     Args:
         before, after: the world before and after the demand.

@@ -186,8 +186,7 @@ def test_a_name_without_claims_changes_nothing_and_an_unknown_name_is_refused(
     assert call("vehicel01") == (
         1,
         "",
-        "error: name: there is no claim of a node or requester 'vehicel01'; did you mean "
-        "'vehicle01'?\n",
+        "error: name: no claim names a node or requester 'vehicel01'; did you mean 'vehicle01'?\n",
     )
     assert call("user1", "--node")[0] == 1
     assert call("user1\n")[0] == 1

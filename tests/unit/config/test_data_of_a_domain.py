@@ -111,9 +111,9 @@ SHARED = (
     "its own ros.domainId"
 )
 CLOSED = (
-    f"{DOMAINS}: 'network: namespace' of access domain 'fleet' has no effect on pods with the "
-    "host's network, as on 'vehicle00', 'vehicle01', 'vehicle02' and 1 more; set hostNetwork: "
-    "false for these nodes, or separate their network yourself"
+    f"{DOMAINS}: 'network: namespace' of access domain 'fleet' has no effect on nodes whose "
+    "pods use the host's network: 'vehicle00', 'vehicle01', 'vehicle02' and 1 more; set "
+    "hostNetwork: false for these nodes, or separate their network yourself"
 )
 
 

@@ -189,11 +189,12 @@ def test_what_cannot_be_known_is_said() -> None:
         f"{CHART}/charts/sub/Chart.yaml": "name: sub\nversion: 0.1.0\n",
     }
     assert warned(files) == [
-        f"{CHART}/Chart.yaml: dependencies[0]: 'redis' is not unpacked in charts/, so its kinds "
-        "are not known; check yourself that the access domain allows them",
+        f"{CHART}/Chart.yaml: dependencies[0]: subchart 'redis' is not unpacked in charts/, so the "
+        "kinds of its objects are not known; check yourself that the access domain allows these "
+        "kinds",
         f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among the kinds of access "
         "domain 'perception', so the cluster refuses such an object if the chart renders one; add "
         f"CustomResourceDefinition to kinds in {DOMAINS}, or remove it from the chart",
-        f"{CHART}/templates/any.yaml:1: kind '{{{{ .Values.kind }}}}' is computed; "
+        f"{CHART}/templates/any.yaml:1: the template computes the kind '{{{{ .Values.kind }}}}'; "
         "check yourself that the access domain allows it",
     ]

@@ -71,7 +71,10 @@ def assert_outcome(taken: Any, expected: str, promises: Promises) -> None:
 
 
 def assert_recorded(world: running.World, promises: Promises) -> None:
-    """Check that each recorded end is not later than promised, and earlier by the slack at most."""
+    """Check the recorded end of each lease against the promised end.
+
+    The recorded end must not be later than the promised end, nor earlier by more than the slack.
+    """
     for claim in world.state.ledger:
         demand, subject = name_of(claim)
         promised = promises.held[demand][subject].promised

@@ -199,7 +199,7 @@ def test_a_connection_that_brings_what_a_service_publishes_is_refused(
 
 
 def claims_after(*goals: Any) -> list[Claim]:
-    """Return the claims that the goals get, if each goal is decided in a new repo."""
+    """Return the claims that the goals get if each goal is sent to a new repo of its own."""
     repos = [MemoryRepo() for _ in goals]
     for repo, one in zip(repos, goals, strict=True):
         repo.send(one)

@@ -99,7 +99,7 @@ def assert_changes(taken: Decision, expected: Result) -> None:
 
 
 def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
-    """Return whether a text names a subject and a requester, with the topic or without a topic."""
+    """Return whether a text names a subject and a requester, and no topic other than ``topic``."""
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
     named = ": " not in text or f": {words} " in text
     return named and f"'{subject}'" in text and text.endswith(f" for {who}")

@@ -79,10 +79,11 @@ def running(repo: MemoryRepo) -> Books:
 
 
 class Recorded:
-    """One table of the recorded run: the books (``books``), or what runs (``runs``).
+    """One of the two tables of the recorded run: ``books`` (who requests what) or ``runs``.
 
     ``there`` is the table of the reference after a step. ``here`` is the table that DemandOps must
-    have. The record of a step lists only what changed in ``there``, and what differs in ``here``.
+    have after the same step. The record of a step lists only the changes of ``there``, and the
+    changes of the difference between ``there`` and ``here``.
     """
 
     def __init__(self, name: str) -> None:

@@ -1,4 +1,7 @@
-"""A delivery ends when the inputs of its output end, also if their node is decommissioned."""
+"""A delivery ends when nothing makes the delivered output any longer.
+
+The output may have lost its inputs because a node was decommissioned.
+"""
 
 from __future__ import annotations
 

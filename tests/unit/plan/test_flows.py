@@ -36,10 +36,10 @@ CLUSTER_NODE = "cloud"
 class Origin(NamedTuple):
     """What a service can read: the topics of an input role, or the output of a service.
 
-    ``kind`` says where the topics are made: ``source`` means at their sources, ``topic`` means one
-    for each input topic at the node of an application, and ``once`` means a single topic for an
-    application, a node or a cluster. ``roots`` are the roles from which the topics are made;
-    ``roots`` is empty if ``kind`` is ``once``.
+    ``kind`` says how the topics are made. ``source``: at their sources. ``topic``: at the node of
+    an application, one for each input topic. ``once``: a single topic for an application, a node or
+    a cluster. ``roots`` are the roles from which the topics are made; ``roots`` is empty if
+    ``kind`` is ``once``.
     """
 
     name: str
@@ -53,10 +53,10 @@ class Graphs:
     def __init__(
         self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
     ) -> None:
-        """Make the definitions; some services get the fields of ``place``.
+        """Make the definitions.
 
-        These are services that run once for an application. With ``each``, services that run once
-        for each topic may get these fields too.
+        Some services that run once for an application also get the fields in ``place``. If ``each``
+        is set, some services that run once for each topic get these fields too.
         """
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
@@ -112,7 +112,8 @@ class Graphs:
     def _add(self, type: str, name: str, scope: str, at_source: bool, read: list[Origin]) -> Origin:
         """Add a service to a type of application; return the service's output as an origin.
 
-        A service for a topic has one instance for each topic of the first origin that it reads.
+        With the scope ``topic``, the service has one instance for each topic of the first origin in
+        ``read``.
         """
         if scope == "topic":
             roots = {self._root(type, read[0])}
@@ -128,7 +129,7 @@ class Graphs:
         return next(iter(self.services[type][name]["roots"])) if "." in origin.name else origin.name
 
     def _each(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
-        """Return a random origin that can be the first origin of a service for a topic."""
+        """Return a random origin that a service with the scope ``topic`` can read first."""
 
         def is_for_each(one: Origin) -> bool:
             service = self.services[type].get(one.name.partition(".")[0])

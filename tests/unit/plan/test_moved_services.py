@@ -1,4 +1,7 @@
-"""When an override moves a service, its inputs and deliveries follow, and return with it."""
+"""When an override moves a service, the inputs and deliveries of the service follow.
+
+When the service moves back, its inputs and deliveries follow again.
+"""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def test_services_that_are_placed_fit_stay_and_leave_drained_nodes(
 
 
 class Extreme(Random):
-    """A random generator that draws the first or the last choice more often than others."""
+    """A source of random numbers that draws the first or the last choice more often than others."""
 
     def __init__(self, seed: int) -> None:
         self._often = seed % 10 / 10

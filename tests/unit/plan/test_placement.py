@@ -238,7 +238,7 @@ def test_the_middle_of_all_sources_decides() -> None:
 
 
 def with_limits(random: Random) -> MemoryRepo:
-    """Return a random repo in which a quota, a missing broker or a rule may refuse a node."""
+    """Return a random repo in which a quota, a missing broker or a rule may forbid a node."""
     edges = [f"edge{number}" for number in range(random.randint(1, 5))]
     ids = (*SOURCES, *edges)
     kinds = {id: "vehicle" if id in SOURCES else "edge" for id in ids}

@@ -76,5 +76,5 @@ def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:
     )
     kinds = " or ".join(sorted(request.kinds))
     close = suggestion(request.id, {name for found in names for name in found})
-    message = f"there is no claim of a {kinds} '{request.id}'{close}"
+    message = f"no claim names a {kinds} '{request.id}'{close}"
     return fault("name", message, code="not-held")

@@ -74,10 +74,10 @@ def _holds(
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
     """Yield (text, claim, keys) for each topic that a shutdown lists.
 
-    The text describes the listed topic. The claim is the one from which holds are taken, and the
-    keys are those of the claim's topics that the shutdown means by the listed topic. The claim is
-    ``None`` if the requester holds none of these topics. If no topic is listed, the claim is the
-    first of ``claims``, and the keys are those of all its topics.
+    The text describes the listed topic. The claim is the first one in which the requester holds a
+    topic that matches the listed topic, or ``None`` if there is no such claim. The keys are those
+    of the matching topics that the requester holds in this claim. If no topic is listed, the claim
+    is the first of ``claims``, and the keys are those of all its topics.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]

@@ -1,4 +1,4 @@
-"""Denials: a demand is refused if an override with ``deny`` selects what it asks for.
+"""Denials: a demand is refused if an override with ``deny`` selects what the demand asks for.
 
 The fault names the reason and the owner of the override. A demand that only repeats existing claims
 renews these claims. Such a demand is always allowed, but its requester gets a warning that an
@@ -30,7 +30,11 @@ from demandops.plan.release_keys import keys_of_claims
 
 
 def faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:
-    """Yield a fault for each new application or connection that an override denies."""
+    """Yield a fault for each demanded application or connection that an override denies.
+
+    There is no fault if the demand changes at most the lease of its claim on the application or
+    connection.
+    """
     denying = [one for one in reversed(after.overrides) if one.deny]
     if not denying or not request.adds_claims:
         return
@@ -57,7 +61,7 @@ def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
 
 
 def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
-    """Return the field that makes an override deny ``one``, or an empty text."""
+    """Return the field of ``one`` because of which an override denies it, or an empty text."""
     for selector in override.select:
         for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):
@@ -93,8 +97,8 @@ def _message(override: Override) -> str:
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
     """Yield a warning for each suspended claim that concerns a demand.
 
-    A claim concerns the demand if it is the demand's own claim, or if it is on an application or
-    connection that the demand lists. The claim must also have a requester of the demand.
+    A claim concerns a demand if the demand holds the claim or lists the claim's application or
+    connection. A claim that has no requester of the demand never concerns the demand.
     """
     if not any(override.deny for override in world.overrides):
         return

@@ -60,7 +60,7 @@ def faults(
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
-    """Yield the topic clashes of a claim that a person wrote or restores, located in its file."""
+    """Yield the topic clashes that a claim would cause, each located in the claim's file."""
     keys = keys_of_claims(after, [claim])
     for found in faults(request_for(claim), before, after, keys):
         yield found.within(path_of(claim.key))
@@ -86,7 +86,10 @@ def _of_service(
 def _clashes(
     world: World, key: ServiceKey, service: Service, topic: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield (source, remedy), in words, for each other source of a topic on the node of ``key``."""
+    """Yield (clash, remedy), in words, for each other source of a topic on the node of ``key``.
+
+    The clash names the other source, as in ``connection 'a' brings to``.
+    """
     for other in _publishers(world, key.node, topic, but=key):
         yield f"{_words(other)} publishes on", _remedy(key, other, service, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
@@ -176,8 +179,8 @@ def _publishers(
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the service instances on a node that publish ``topic``, except ``but``.
 
-    The output patterns of the appdefs tell which instances would publish the topic. Only those of
-    them that claims need are yielded.
+    The output patterns of the appdefs tell which instances would publish the topic. An instance
+    that no claim needs is left out.
     """
     for services in world.config.services.values():
         for name, service in services.items():
@@ -198,11 +201,11 @@ def _publishers(
 def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances that ``instance`` stands for in topic names.
+    """Yield the keys of a service's instances that are called ``instance`` in topic names.
 
-    The instances are on ``node``, and not all of them need to run. ``but`` is the key of the
-    instance for which clashes are looked for. The topic of that instance does not count as the
-    usual topic of its source.
+    The instances are on ``node``. Some of them may not run. ``but`` is the key of the instance for
+    which the caller looks for clashes. The topic of that instance does not count as the usual topic
+    of its source.
     """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
@@ -224,7 +227,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of the instances of a service on a node; not all of them need to run."""
+    """Yield the keys of the instances of a service on a node; some of them may not run."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)

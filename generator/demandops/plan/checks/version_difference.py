@@ -158,7 +158,7 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters of the first claim that asks for ``version``, and the claim's word.
+    """Return the requesters and the word of the first claim that asks for ``version``.
 
     The word is the version or channel that the claim names. It is empty if the claim asks for the
     default version.

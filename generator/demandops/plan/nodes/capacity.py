@@ -72,7 +72,7 @@ def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return how requests grow when claims change, as a map from (node, resource) to the growth.
+    """Return a map from (node, resource) to how much more services request when claims change.
 
     A release that cannot be planned requests nothing. The map is empty if no node declares a
     capacity.

@@ -47,7 +47,7 @@ class Chosen:
 
 
 Positions = Mapping[str, Position]
-"""A map from node to its position in a demand; a position in the inventory has precedence."""
+"""The positions of nodes that a demand states; a position in the inventory has precedence."""
 
 
 def requirement_of(service: Service) -> Requirement:
@@ -279,7 +279,7 @@ class Choice:
             misses.append((count, self._rank(node, centre, positions), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
         more = [f"{len(misses) - len(shown)} more do not fit"] if len(misses) > len(shown) else []
-        message = f"no node fits: {'; '.join([*shown, *more]) or 'there is none'}"
+        message = f"no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
         less = f"change place in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {self.config.place_of(NODES_FILE)}"
         return self._fault(message, code)

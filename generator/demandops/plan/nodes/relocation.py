@@ -80,9 +80,9 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return which services of an application are placed on a node on their own.
+    """Return the services of an application that have ``node`` as a node of their own.
 
-    ``None`` in the result stands for the application itself, if it is placed on the node.
+    ``None`` in the result stands for the application itself, if its node is ``node``.
     """
     app = world.ledger.application(id)
     if app is None:
@@ -176,7 +176,7 @@ class LedgerAfterMoves:
     ledger: Ledger
     keys: tuple[ClaimKey, ...]
     stays: tuple[tuple[str, str], ...]
-    """(file, message) for each override that cannot move a service, by application."""
+    """(file, message) for each override that cannot move a service of an application."""
 
 
 def following_overrides(
@@ -238,7 +238,7 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
 def _all_moved(
     world: World, applications: Iterable[str], move: Move
 ) -> tuple[World, dict[str, tuple[ClaimChange, ...]]]:
-    """Return the world with these applications moved, and the changes of claims by application."""
+    """Return the world with these applications moved, and a map from application to changes."""
     changes: dict[str, tuple[ClaimChange, ...]] = {}
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
@@ -263,7 +263,7 @@ def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
 
 
 def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> Iterator[Fault]:
-    """Yield the faults of moved claims, checked as if their demands asked for them."""
+    """Yield the faults of moved claims; each claim is checked like a demand for its content."""
     for change in changes:
         claim = change.after
         if claim is None:
@@ -285,7 +285,7 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
     """Yield a fault for each output that the claimed connection brings to a node a second time.
 
-    This is so if another connection brings an output of the same name from another node. A topic
+    Another connection already brings a topic of the same name there from another sender. A topic
     that a demand lists as an input is never a fault, because the demand names the source.
     """
     if claim.is_on_application:

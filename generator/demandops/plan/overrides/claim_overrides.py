@@ -119,7 +119,8 @@ class UnsuspendedClaims(Ledger):
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions that unsuspended claims on an application ask for.
 
-        An empty text in the result stands for the default version.
+        The result also has an empty text if an unsuspended claim asks for no version, or for an
+        unknown version.
         """
         booked = Ledger.versions_asked(self, application, known)
         asked = {
@@ -281,8 +282,8 @@ def _needed(
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     """Return the overrides that keep the subject of a claim, the highest in rank first.
 
-    For a kept claim, ``requesters`` of a selector is not compared. A kept claim names the owner of
-    the override as its requester, and the original claim already matched with its own requesters.
+    For a kept claim, ``requesters`` of a selector is not compared, because the only requester of a
+    kept claim is the owner of the override. The requesters of the original claim already matched.
     """
     traits = traits_of(claim)
     if claim.keeping_override is not None:

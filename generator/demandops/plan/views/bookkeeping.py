@@ -85,7 +85,7 @@ class WaitingEntry:
 
 @dataclass(frozen=True, slots=True)
 class ResourceEntry:
-    """What services request of a resource on a node, and its capacity, as Kubernetes quantities."""
+    """What services request of a node's resource, and the capacity, as Kubernetes quantities."""
 
     requested: str
     capacity: str
@@ -179,7 +179,7 @@ def _time(moment: datetime) -> str:
 
 
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
-    """Return the resources of the nodes that declare a capacity: node → resource → amounts."""
+    """Return the amounts of each resource with a declared capacity, by node and resource."""
     usage = whole_usage(world)
     found: dict[str, dict[str, ResourceEntry]] = {}
     machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
@@ -264,7 +264,7 @@ class EntryChange:
 
 
 def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    """Return each service and then each connection that differs, both sorted by name."""
+    """Return the changes of services, then those of connections, each sorted by name."""
     return (
         *_changes("service", dict(old.services), dict(new.services)),
         *_changes("connection", dict(old.connections), dict(new.connections)),
@@ -292,8 +292,8 @@ def _changes(
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
     """Yield the facts about an entry, as texts.
 
-    ``other`` is the same entry on the other side of a change. A fact that holds for only one of the
-    two entries is part of the change.
+    One of ``entry`` and ``other`` is an entry before a change, and one is the same entry after the
+    change. A fact that holds for only one of the two is part of the change.
     """
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):

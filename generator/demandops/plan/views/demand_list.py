@@ -79,7 +79,7 @@ def demands(world: World) -> list[HeldDemand]:
 
 
 def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
-    """Return the entry in the list for the demand that holds ``claims``, and no other claims."""
+    """Return the entry in the list for a demand; ``claims`` are all claims that it holds."""
     states = {state_of(claim, world) for claim in claims}
     (state,) = states if len(states) == 1 else ("partly suspended",)
     suspending = filter(None, (suspended_by(claim, world) for claim in claims))

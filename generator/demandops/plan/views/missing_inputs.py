@@ -1,8 +1,8 @@
 """Missing inputs: topics that applications need, but that no longer arrive.
 
 A demand that needs a connection gets the connection, or its requester gets a warning. Later an
-override may suspend the connection, its demands may release it, or people may remove a node or an
-output from the configuration. Then a topic no longer arrives.
+override may suspend the connection, demands may release the connection, or people may remove a node
+or an output from the configuration. Then a topic no longer arrives.
 """
 
 from __future__ import annotations

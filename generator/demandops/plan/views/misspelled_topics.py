@@ -47,7 +47,7 @@ class _KnownTopics:
         self._told: set[tuple[str, str]] = set()
 
     def notes_on(self, held: Application | Connection) -> Iterator[str]:
-        """Yield a warning for each misspelled topic, but only one for each topic of a node."""
+        """Yield a warning for each misspelled topic for which there was no warning before."""
         if isinstance(held, Application):
             for role, one in held.all_inputs():
                 known = self._of(one.source) | self._usual(role, one.source)

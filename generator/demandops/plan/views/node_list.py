@@ -20,8 +20,8 @@ class UsedNode:
     """A node that the inventory has or that claims name, and what uses the node.
 
     ``releases`` are the releases that run on the node. ``applications``, ``connections`` and
-    ``requesters`` come from the claims that need the node. These include claims that only read an
-    input from the node.
+    ``requesters`` come from the claims that need the node. These include claims on applications
+    that only read an input from the node.
     """
 
     name: str

@@ -83,17 +83,20 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
                 "or write a later time",
             )
         elif entry.state == "matches nothing":
-            yield override.path, "matches nothing now; if it should match something, correct select"
+            yield (
+                override.path,
+                "matches nothing now; if it should match something, correct its field 'select'",
+            )
         elif entry.state == "held back":
             yield (
                 override.path,
-                "changes nothing while an override with hold keeps the same files; remove one of "
-                "the two overrides, or give this one a higher priority",
+                "changes nothing, because another override with 'hold' keeps the same files as "
+                "they are; remove one of the two overrides, or give this one a higher priority",
             )
         elif doubled := sorted({*_doubled(entry)}):
             yield (
                 override.path,
-                f"runs {override.replicas} replicas of {' and '.join(doubled)}, each of which "
+                f"runs {override.replicas} replicas of {' and '.join(doubled)}, and each replica "
                 "publishes every output; run only one, or set dividesWork: true in the application "
                 "definition if the program divides its work among replicas",
             )

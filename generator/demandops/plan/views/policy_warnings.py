@@ -124,9 +124,9 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
         if config.domains[name].network == "namespace":
             ids = [node.id for _, node in group]
             message = (
-                f"'network: namespace' of access domain '{name}' has no effect on pods with the "
-                f"host's network, as on {_listed(ids)}; set hostNetwork: false for these nodes, or "
-                "separate their network yourself"
+                f"'network: namespace' of access domain '{name}' has no effect on nodes whose pods "
+                f"use the host's network: {_listed(ids)}; set hostNetwork: false for these nodes, "
+                "or separate their network yourself"
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
     graphs: dict[tuple[str, int], dict[str, None]] = {}
@@ -149,7 +149,7 @@ def _listed(ids: list[str]) -> str:
 
 
 def _charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each Kubernetes kind that an access domain does not allow in a chart.
+    """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
 
     There is also a warning for each kind that cannot be read from the chart's files.
     """
@@ -165,9 +165,10 @@ def _charts(config: Config) -> Iterator[Fault]:
 
 
 def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return the access domains in which each chart may run, as chart folder → access domains.
+    """Return a map from the folder of each chart to the access domains in which the chart may run.
 
-    In these domains, a rule allows an application that uses the chart.
+    An access domain without rules allows every application. In any other access domain, a rule
+    must allow an application that uses the chart.
     """
     found: dict[str, list[AccessDomain]] = {}
     for appdef, services in config.services.items():
@@ -193,7 +194,8 @@ def _template(path: str, text: str, domains: list[AccessDomain], config: Config)
             yield from _refused(path, line, plain[1], domains, config)
         else:
             message = (
-                f"kind {quoted(value)} is computed; check yourself that the access domain allows it"
+                f"the template computes the kind {quoted(value)}; check yourself that the access "
+                "domain allows it"
             )
             yield fault("", message, line=line).within(path)
 
@@ -217,7 +219,7 @@ def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
     for one in chart_files.dependencies(folder, files):
         if one.folder is None and f"{folder}/charts/{one.name}/Chart.yaml" not in files:
             message = (
-                f"{quoted(one.name)} is not unpacked in charts/, so its kinds are not known; "
-                "check yourself that the access domain allows them"
+                f"subchart {quoted(one.name)} is not unpacked in charts/, so the kinds of its "
+                "objects are not known; check yourself that the access domain allows these kinds"
             )
             yield fault(f"dependencies[{one.index}]", message).within(f"{folder}/Chart.yaml")

@@ -53,7 +53,10 @@ def needs(claim: Claim, release: Release) -> bool:
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return the versions that claims on a service's applications name, as version → requesters."""
+    """Return a map from version to requesters, for each version that a claim names.
+
+    The claims are those on the applications of the service.
+    """
     found: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:
