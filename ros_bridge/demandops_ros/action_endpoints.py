@@ -36,7 +36,7 @@ _MOST_RESULTS = 2_000
 
 
 class DemandError(Exception):
-    """Raised when a demand fails. ``code`` is the reason for programs, such as ``unknown-node``."""
+    """Raised when a demand fails. ``code`` tells programs the reason, such as ``unknown-node``."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -171,8 +171,8 @@ class GoalSender:
         """Send a goal in the thread that also receives; return the future of the node's response.
 
         rclpy 9.1 registers two futures for a goal, one after the other, and returns the second. If
-        another thread sent the goal, a response could arrive in between. It would resolve only the
-        first future, for which nobody waits.
+        another thread sent the goal, a response could arrive between the two registrations. The
+        response would then resolve only the first future, for which nobody waits.
         """
         sent: list[Any] = []
         done = REAL.event()
@@ -253,8 +253,8 @@ class OtherServers:
             now = self._others(action)
             if now and now != others:
                 self._node.get_logger().warning(
-                    f"{', '.join(now)} serves {action} too: a client may get an answer of "
-                    "either, or none; give each node an action name of its own"
+                    f"{', '.join(now)} serves {action} too, so a client may get its answer "
+                    "from another node, or no answer; give each node an action name of its own"
                 )
             elif others and not now:
                 self._node.get_logger().info(f"no other node serves {action} any more")

@@ -80,7 +80,7 @@ def _read_document(file: str) -> dict[str, Any]:
     if not isinstance(data, dict) or data.get("kind") != "Demand":
         message = (
             "the file must be a mapping whose kind is Demand; "
-            "demandops request sends a DeploymentRequest"
+            "to send a DeploymentRequest, use demandops request"
         )
         raise InvalidInput([fault("kind", message).within(name)])
     return data

@@ -88,7 +88,7 @@ def _of_actions(generator: Generator, others: dict[str, list[str]]) -> Diagnosti
 def status(
     name: str, address: str, level: bytes, text: str, values: dict[str, str]
 ) -> DiagnosticStatus:
-    """Return a diagnostic status, with its text and each of its values put on one line."""
+    """Return a diagnostic status; its text, its keys and its values have no line breaks."""
     pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
     message = one_line(text)
     return DiagnosticStatus(

@@ -1,4 +1,4 @@
-"""Converts ROS messages to plain data and back, with message packages only, without rclpy."""
+"""Converts ROS messages to plain data and back; needs only message packages, not rclpy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from demandops_interfaces.action import Demand as DemandMessage
 
 
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-    """Return a message as mappings, lists and plain values, like those of its YAML form.
+    """Return a message as mappings, lists and plain values, in the form that its YAML text has.
 
     A ``DeploymentRequest.Goal`` becomes the data for
     :func:`demandops.demand.deployment_request_goal.parse`, so that a goal over ROS 2 equals the

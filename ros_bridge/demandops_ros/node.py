@@ -301,9 +301,9 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- events that other threads pass to the executor's thread ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Send a stage as feedback; if the stage is ``refused``, log the refusal at once instead.
+        """Send a stage as feedback; if the stage is ``refused``, send nothing and log the refusal.
 
-        The result reports the refusal too, but a crash may come before the result.
+        The result will report the refusal too, but a crash may come before the result.
         """
         if stage == "refused":
             goal.is_refused = True

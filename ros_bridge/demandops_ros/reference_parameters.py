@@ -2,7 +2,8 @@
 
 A fleet may start our node with the parameter file of the reference's node. The file calls that node
 ``application_manager``. Our node takes the action's name from the file. Brokers, topics and
-namespaces come from the state repo. Each value in the file that the repo lacks causes a warning.
+namespaces come from the state repo. If the file names a broker, a topic or a namespace that the
+state repo lacks, the node warns.
 """
 
 from __future__ import annotations
@@ -72,9 +73,9 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     images = config.images.values()
     if registry and not all(image.repository.startswith(f"{registry}/") for image in images):
         yield (
-            "parameter k3d_image_registry of the reference is not used: set registry: "
-            f"{registry} in {config.place_of(IMAGES_FILE)}, and the names that the images have in "
-            "that registry (docs/migration.md)"
+            "parameter k3d_image_registry of the reference is not used: set the field "
+            f"registry to {registry} in {config.place_of(IMAGES_FILE)}, and give the images the "
+            "names that they have in that registry (docs/migration.md)"
         )
     yield from _brokers(values, config)
     topics = values.get("connections.init_comm_topics") or ()
@@ -84,7 +85,8 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     if missing := [topic for topic in topics if topic not in known]:
         yield (
             "parameter connections.init_comm_topics of the reference is not used: add "
-            f"{', '.join(missing)} to bridged of the source's node in {config.place_of(NODES_FILE)}"
+            f"{', '.join(missing)} to the field bridged of the source node in "
+            f"{config.place_of(NODES_FILE)}"
         )
 
 

@@ -110,7 +110,7 @@ class RosLogHandler(logging.Handler):
 def started(
     arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
 ) -> Iterator[list[str]]:
-    """Run the block with ROS initialized from ``arguments``, and yield these as a list.
+    """Run the block with ROS initialized from ``arguments``, and yield the arguments as a list.
 
     Raises:
         click.UsageError: if ``arguments`` begin with anything but ``--ros-args``.

@@ -69,8 +69,8 @@ _FLUSH_S = 0.3
     "--webhook-secret-file",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The secret that signs the webhook's notifications; needed unless it listens on a "
-    "loopback address.",
+    help="The secret that signs the webhook's notifications; needed unless the webhook "
+    "listens on a loopback address.",
 )
 @click.option(
     "--web",
@@ -181,7 +181,7 @@ def _page(
     follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
     generator.on_publish(lambda config: follower.wake())
     page = WebServer(address, "--web", follower)
-    get_logger("demandops").info(f"showing the state repo at {page.url}")
+    get_logger("demandops").info(f"the page of the state repo is at {page.url}")
     return page
 
 

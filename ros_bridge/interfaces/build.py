@@ -109,7 +109,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
         "--build-dir",
         type=Path,
         metavar="DIR",
-        help="build here and keep it, so that the next build compiles less "
+        help="build in this folder and keep the folder, so that the next build compiles less "
         "(default: a temporary folder, kept only when a stage fails)",
     )
     options = parser.parse_args(argv)
@@ -135,7 +135,7 @@ def fingerprint() -> str:
 
 
 def is_current(digest: str) -> bool:
-    """Return whether the record has this digest and every file that it names still exists."""
+    """Return whether the record has this digest, and whether all files in the record exist."""
     try:
         record = json.loads(RECORD.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -36,7 +36,7 @@ def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
 def servers(
     tmp_path: Path, data_home: Path, ros_domain: int, warm: WarmCommands
 ) -> Iterator[Servers]:
-    """The starter of commands that use ROS; the end of the test kills commands that still run."""
+    """Starts commands that use ROS; commands that still run at the end of the test are killed."""
     made = Servers(tmp_path, ros_domain, warm)
     yield made
     made.kill()

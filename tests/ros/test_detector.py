@@ -103,7 +103,7 @@ class Fleet:
         return {pair.key: pair.value for pair in status.values}["entities"] if status else ""
 
     def until(self, true: Callable[[], object], what: str) -> None:
-        """Publish poses until `true` returns a true value; an error says `what` did not happen."""
+        """Publish poses until `true()` holds; fail after 60 s, with `what` in the message."""
         next_look = [0.0]
 
         def spun() -> object:

@@ -100,8 +100,8 @@ def test_another_node_that_serves_the_same_action_is_noticed(
     caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.OK))
     caller.wait(lambda: len(told()) == 2)
     assert told() == [
-        f"/test_client serves {DEFAULT_ACTION_NAME} too: a client may get an answer of either, "
-        "or none; give each node an action name of its own",
+        f"/test_client serves {DEFAULT_ACTION_NAME} too, so a client may get its answer from "
+        "another node, or no answer; give each node an action name of its own",
         f"no other node serves {DEFAULT_ACTION_NAME} any more",
     ]
 
@@ -133,8 +133,8 @@ def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, b
     args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
     served = serve(f"file://{bare}", *args)
     client.ready()
-    client.wait(lambda: "showing the state repo at " in served.log.read_text())
-    found = re.search(r"state repo at (http://127.0.0.1:[0-9]+/)", served.log.read_text())
+    client.wait(lambda: "the page of the state repo is at " in served.log.read_text())
+    found = re.search(r"state repo is at (http://127.0.0.1:[0-9]+/)", served.log.read_text())
     assert found is not None
 
     def shown(view: str) -> str:

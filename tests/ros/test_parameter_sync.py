@@ -69,7 +69,7 @@ StartFusion = Callable[[], "subprocess.Popen[bytes]"]
 
 @pytest.fixture
 def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
-    """Return a function that starts a stand-in of the fusion, which the test's end kills."""
+    """Return a function that starts a stand-in for the fusion; the end of the test kills it."""
     environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain), "PYTHONFAULTHANDLER": "1"}
     names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
     topics = [f"{name}_topic:=/{name}" for name in names]

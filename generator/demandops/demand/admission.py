@@ -74,7 +74,7 @@ def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
                 message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
                 yield one.fault("parameters", message, code="too-large")
     if items > limits.demand_items:
-        listed = f"lists {items} applications, connections, topics and requesters"
+        listed = f"lists {items} items (applications, connections, topics, requesters and so on)"
         message = _too_large(listed, "demandItems", limits.demand_items)
         yield fault("id" if request.is_reference else "demand", message, code="too-large")
 
@@ -149,7 +149,9 @@ def _delivery(where: str, delivery: Delivery, services: Services) -> Iterator[Fa
         message = f"{quoted(delivery.output)} is not an output{suggestion(delivery.output, known)}"
         yield fault(f"{where}.output", message)
     elif delivery.topic and service.roots:
-        message = f"{name} may make several topics, so a delivery cannot rename them; leave it out"
+        message = (
+            f"{name} may make several topics, so a delivery cannot rename them; leave topic out"
+        )
         yield fault(f"{where}.topic", message)
     problem = topic_problem(delivery.topic) if delivery.topic else ""
     if problem:
@@ -172,8 +174,9 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
             yield fault(
                 "node",
                 f"'{app.node}' is in cluster '{cluster}', where the application's service "
-                f"{service.name} has no node; choose a node in {' or '.join(service.nodes)}, or "
-                f"ask for a change of nodes in {service.file}",
+                f"{service.name} has no node; choose a node in cluster "
+                f"{' or '.join(service.nodes)}, or ask for an entry for cluster '{cluster}' in the "
+                f"field nodes of {service.file}",
                 code="no-node",
             )
     yield from _named_services(app, appdef.name, config)
@@ -188,9 +191,10 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
 
 
 def _named_services(app: Application, appdef: str, config: Config) -> Iterator[Fault]:
-    """Yield a fault for each service for which the demand names a node in vain.
+    """Yield a fault for each wrong entry in the demand's map from services to nodes.
 
-    Such a service is unknown, a demand cannot name its node, or the named node is empty.
+    An entry is wrong if the service is unknown, if a demand cannot name the service's node, or if
+    the node is empty.
     """
     services = config.services[appdef]
     for name in app.named:
@@ -315,7 +319,8 @@ def with_chosen_types(
 
     A type that the request names stays. If the request names none, a claimed connection keeps the
     type of its claim, and a new connection gets the first type that can carry it
-    (:func:`connection_types.choose_type`). If no type can carry it, it gets none.
+    (:func:`connection_types.choose_type`). If no type can carry a connection, its type
+    stays ``None``.
 
     Args:
         request: the request.

@@ -167,11 +167,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return those further inputs of a role for which topic names have the text ``part``.
+        """Return the further inputs of a role whose text in topic names is ``part``.
 
-        For a separate instance, the usual inputs of the role are returned too. The parts of all
-        inputs are computed only once, because the plan of each service for a further topic needs
-        them.
+        For a separate instance, usual inputs of the role with this text are returned too. The texts
+        of all inputs are computed only once, because the plan of each service for a further topic
+        needs them.
         """
         if not self._further:
             for known, topic in self.all_inputs():
@@ -269,7 +269,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
         """Yield (text, keys) for each input that a shutdown lists in ``listed``.
 
-        The keys are those of the matching inputs of this application.
+        ``text`` describes the listed input. ``keys`` are the keys of this application's inputs that
+        match it.
         """
         assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
@@ -330,7 +331,11 @@ def _exact(values: Mapping[str, object]) -> str:
 
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return one topic for each (topic, source), sorted: the first that has a type, if any has."""
+    """Return the topics sorted, with one topic for each topic name and source.
+
+    Of several with the same name and source, the first one with a type is kept. If none has a type,
+    the first one is kept.
+    """
     merged: dict[tuple[str, str], InputTopic] = {}
     for topic in topics:
         known = merged.setdefault((topic.topic, topic.source), topic)

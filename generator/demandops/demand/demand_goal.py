@@ -200,7 +200,7 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the path that a fault in an application or a connection names: a path in the goal.
+    """Return the goal's path to a field of an application or connection; faults name this path.
 
     ``item`` is the path of the application or connection in the goal, and ``path`` is the field's
     path in the item. The requesters are a field of the goal itself.
@@ -221,7 +221,7 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
             "demand without that part",
         )
     if goal.priority:
-        yield fault("priority", f"a {goal.operation} does not wait for room; leave it out")
+        yield fault("priority", f"a {goal.operation} does not wait for room; leave priority out")
     if goal.positions:
         yield fault("positions", f"a {goal.operation} chooses no node; leave the positions out")
 

@@ -144,9 +144,9 @@ class Expire(DemandRequest):
 class Decommission(DemandRequest):
     """An operator's request to remove a node or a requester, named by ``id``, for good.
 
-    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` lists the names of the node in its
-    access domains. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. Only the
-    journal contains the request as plain data; actions and demand files cannot contain it.
+    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` lists the names that the node has in
+    its access domains. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. Only
+    the journal contains the request as plain data; actions and demand files cannot contain it.
     """
 
     kinds: frozenset[str] = frozenset()

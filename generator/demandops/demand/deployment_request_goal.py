@@ -88,7 +88,7 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the path that a fault in an application names: a path in the goal.
+    """Return the path in the goal for a field of an application; faults name this path.
 
     ``item`` is the application's path in the goal (``apps[0]``), and ``path`` is the field's path
     in :class:`Application`. ``lists`` maps roles to the goal's lists of topics.
@@ -109,7 +109,7 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the path that a fault in a connection names: a path in the goal.
+    """Return the path in the goal for a field of a connection; faults name this path.
 
     ``item`` is the connection's path in the goal (``connections[0]``), and ``path`` is the field's
     path in :class:`Connection`. The goal has two lists of topics: the names at the source, and the

@@ -50,10 +50,10 @@ class Lease:
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease as it starts at ``now``, when a person approves the claim.
+        """Return the lease with its start at ``now``, when a person approves the claim.
 
-        ``before`` is the lease that the claim had until now, if it had one. Then the result is this
-        lease after a renewal, and ends no earlier than before.
+        If the claim already has a lease, ``before`` is that lease. The result is then the lease
+        ``before`` after a renewal, and never ends earlier than ``before``.
         """
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)

@@ -1,8 +1,9 @@
 """Permission: the check that requesters may demand the applications, nodes and leases they ask for.
 
-The access domains of the nodes decide. Every refusal names the rule. A connection between two
-domains needs a rule in each domain that names the other domain. A domain, one of its rules or an
-application definition can also require that a person approves claims before they are booked.
+The access domains of the nodes decide. Every refusal names the access domain, and what in it does
+not allow the request. For a connection between two domains, each of the two domains needs a rule
+that names the other one. A domain, one of its rules or an application definition can also require
+that a person approves claims before they are booked.
 """
 
 from __future__ import annotations
@@ -47,7 +48,10 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield each access domain that an application or connection uses, and the access it needs."""
+    """Yield (access domain, access) for each node that an application or connection uses.
+
+    The access domain is the node's. The access is what a rule of this domain must grant.
+    """
     more: Access = []
     if isinstance(held, Application):
         nodes, first = _service_nodes(held, config), [("applications", held.appdef)]
@@ -120,7 +124,10 @@ def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: 
     where = f"access domain '{domain.name}'"
     if kind == PEERS:
         whose = f"rule '{rule.name}' of {where}" if domain.rules else where
-        return f"{whose} does not let '{requester}' connect its nodes to nodes of '{value}' (peers)"
+        return (
+            f"{whose} does not let '{requester}' connect the domain's nodes to nodes of '{value}' "
+            "(peers)"
+        )
     return (
         f"rule '{rule.name}' of {where} lets '{requester}' have {kind} "
         f"{' '.join(getattr(rule, kind))}, not '{value}'"
@@ -128,7 +135,7 @@ def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: 
 
 
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
-    """Return the first pair of ``access`` that a rule does not grant; ``None`` if it grants all."""
+    """Return the first pair of ``access`` that ``rule`` lacks; ``None`` if it grants all pairs."""
     return next(
         ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
     )

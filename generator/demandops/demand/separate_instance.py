@@ -5,9 +5,9 @@ application of its own. This application has the version in its id (``edge/fusio
 services, topics and connections have names of their own. It is removed with its last claim. A
 service that several appdefs share still runs only once, for all versions.
 
-With ``versions: separate``, a claim records the version, not the channel that the demand named,
-even if this is the default version. If it recorded the channel, a channel that moves would change
-the version of an application that others share.
+With ``versions: separate``, a claim records the version, not the channel that the demand named. It
+does so for the default version too. If claims recorded the channel, a channel that moves to another
+version would change an application that others share.
 """
 
 from __future__ import annotations

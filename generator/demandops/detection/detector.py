@@ -90,8 +90,8 @@ class Detector:
         """Replace the rules; return what changes for the events that have not ended.
 
         An event ends if its rule is gone or is no longer for its entities. If the rule has changed,
-        the event wants the goal of the new rule instead, unless the rule's template needs a value
-        that is not known. ``settle_s`` is as in :meth:`resume`.
+        the event wants the goal of the changed rule. If the template of the changed rule needs a
+        value that is not known, the event keeps its goal. ``settle_s`` is as in :meth:`resume`.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)
@@ -109,9 +109,10 @@ class Detector:
         return changed
 
     def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the template's values: the rule, the entities, and those from the event's start.
+        """Return the values for the rule's template.
 
-        The result is ``None`` if the template needs a value that is not known.
+        They are the rule's name, the entities' names, and the values from the event's start. The
+        result is ``None`` if the template needs a value that is not known.
         """
         named = dict(zip(rule.subjects, key[1], strict=True))
         values: Values = {**self._values.get(key, {}), "rule": rule.name, **named}

@@ -22,7 +22,7 @@ Getter = Callable[[Any], Any]
 
 
 class Unreadable(Exception):
-    """Raised for a message with a missing or unusable field; its text is one line."""
+    """Raised for a message with a missing or unusable field; the error's text is one line."""
 
 
 class MessageReader:

@@ -3,7 +3,7 @@
 This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
 outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
 nothing is sent for it. If two events want demands with the same id, the second event waits until
-the first one has ended its demand. This happens when a rule gets another name.
+the first one has ended its demand. Such events exist after a rule gets another name.
 """
 
 from __future__ import annotations
@@ -143,9 +143,9 @@ class WantedDemands:
         return None
 
     def _owns(self, key: Key, goal: Goal) -> bool:
-        """Return whether an event may send a goal, because no other event holds the goal's demand.
+        """Return whether an event may send a goal: only if no other event holds the goal's demand.
 
-        If so, this event holds the demand from now on.
+        An event that may send the goal holds the demand from now on.
         """
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
@@ -160,8 +160,8 @@ class WantedDemands:
         """Record the outcome of a goal.
 
         Returns:
-            The problem for the log, if the goal failed for another reason than the event's last
-            goal; otherwise an empty text.
+            The reason of a failure, for the log. The text is empty if the goal succeeded, or if the
+            attempt before it failed for the same reason.
         """
         entry = self._entries[sending.key]
         entry.is_under_way = False

@@ -19,7 +19,7 @@ from demandops.input_file import read_input
     "bag",
     type=click.Path(path_type=Path),
     metavar="BAG",
-    help="Send nothing: try the rules on a recorded bag, a folder or an MCAP file, and print what "
+    help="Send nothing: try the rules on a recorded bag (a folder or an MCAP file), and print what "
     "would be demanded. Needs no ROS; needs pip install 'demandops[replay]'.",
 )
 @click.option(

@@ -1,8 +1,8 @@
 """The node of the event detector, which watches topics and sends demands.
 
-The node's decisions depend only on events, not on which services are deployed. Only at its start,
-the node reads the latched bookkeeping. It contains the demands of the node's earlier run, so that a
-restart does not end them.
+The node's decisions depend only on events, not on which services are deployed. The node reads the
+latched bookkeeping only at its start, to find the demands of its earlier run. So a restart does not
+end these demands.
 """
 
 from __future__ import annotations

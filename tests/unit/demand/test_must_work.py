@@ -14,10 +14,10 @@ from tests.kit.memory import MemoryRepo
 
 
 class TestOpenBroker:
-    """If only one broker exists, a connection gets it.
+    """If only one broker exists, every connection gets this broker.
 
-    Otherwise the connection gets the first one that exists of three: the requested broker, the
-    target's and the source's.
+    If several brokers exist, a connection gets the requested broker. If there is no such broker,
+    it gets the target's broker, or else the source's broker.
     """
 
     @staticmethod

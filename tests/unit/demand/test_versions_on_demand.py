@@ -247,7 +247,7 @@ class Walk:
             assert entry["application_version"] == max(versions, key=LISTED.index)
 
     def assert_rendered_from_the_claims(self) -> None:
-        """Check that the claims alone, in any order, render the files of the repo."""
+        """Check that rendering the claims, in any order, gives the files of the repo."""
         claims = sorted(self.repo.state.ledger, key=lambda claim: str(claim.key))
         self.random.shuffle(claims)
         for ledger in (rebuilt(claims), ledger_in(self.repo.files)):

@@ -108,7 +108,8 @@ def faults(text: str) -> list[str]:
                 deploymentRequest={"id": "r", "connections": [{"requester_ids": ["s"]}]},
             ),
             "rules.yaml:27: rules[0].deploymentRequest.connections[0].requester_ids: must name "
-            "{entity}, because a shutdown finds claims by their requesters",
+            "{entity}, because a shutdown ends what its requesters hold, so each event needs its "
+            "own requesters",
         ),
     ],
 )
@@ -141,7 +142,7 @@ def test_two_rules_for_the_same_entities_have_demands_of_their_own() -> None:
     told = faults(text_of(rule("a", near=NEAR, demand=same), rule("b", near=far, demand=other)))
     assert told == [
         "rules.yaml:30: rules[1].demand.demand: is the id of a demand of rule 'a' too, so the "
-        "event that ends first would end the demand of both; add {rule} to one of the ids"
+        "event that ends first would end the other event's demand; add {rule} to one of the ids"
     ]
     cars = rule("a", near=NEAR, demand=same, entities=["car*"])
     rule_file.read(text_of(cars, rule("b", near=far, entities=["bus*"])), "rules.yaml")

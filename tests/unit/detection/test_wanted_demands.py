@@ -1,4 +1,4 @@
-"""The detector sends an event's goals one at a time, and a failed goal again if still wanted."""
+"""The detector sends an event's goals one at a time; it repeats a failed goal if still wanted."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ class Sent:
         return sending
 
     def done(self, now: float, lease_s: float = 0.0, code: str = "", message: str = "") -> str:
-        """Send and answer the next goal; return its purpose.
+        """Send and answer the next goal; return the goal's purpose.
 
-        If ``code`` is given, the goal fails with it, and the result is the text for the log.
+        If ``code`` is given, the goal fails with this code. Then return the text for the log
+        instead of the purpose.
         """
         sending = self.next(now)
         told = self.wanted.answered(sending, Outcome(code, message, lease_s), now)

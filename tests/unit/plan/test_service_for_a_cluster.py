@@ -111,8 +111,8 @@ def test_a_cluster_without_a_node_for_it_is_refused() -> None:
     demanded["applications"][0]["connect"] = "none"
     assert MemoryRepo(files()).faults(demanded) == [
         "applications[0].node: 'vehicle02' is in cluster 'depot', where the application's service "
-        "map-server has no node; choose a node in c-its, or ask for a change of nodes in "
-        "appdefs/map-server/service.yaml"
+        "map-server has no node; choose a node in cluster c-its, or ask for an entry for cluster "
+        "'depot' in the field nodes of appdefs/map-server/service.yaml"
     ]
 
 

@@ -39,7 +39,7 @@ class AreaGrid(Generic[Item]):
         self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
 
     def at(self, x: float, y: float) -> Sequence[Item]:
-        """Return all items whose area or margin contains a position, and some that are near."""
+        """Return a superset of the items whose area or margin contains a position."""
         return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
 
 

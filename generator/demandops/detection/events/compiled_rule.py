@@ -1,4 +1,4 @@
-"""Rules in a form that checks observations quickly, with one class for each kind of condition."""
+"""Rules in a form that checks observations quickly; a rule's condition determines its class."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ Seen = Mapping[Who, Observation]
 
 
 class Facts(NamedTuple):
-    """The values that an event gives to the rule's template, and a sentence for people."""
+    """The values of an event for the rule's template, and the event's cause in words for people."""
 
     values: Values
     text: str
 
 
 class CompiledRule:
-    """The base class of rules in the form that checks observations."""
+    """The base class of the rules in this module."""
 
     def __init__(self, rule: Rule) -> None:
         self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
@@ -46,10 +46,10 @@ class CompiledRule:
         return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the current values and text of an event.
+        """Return the current facts of an event.
 
         Args:
-            subjects: the entities of the event, which are all seen.
+            subjects: the names of the event's entities; ``seen`` has all these entities.
             seen: the last observation of each entity.
             count: how many entities the rule counts.
         """
@@ -117,7 +117,7 @@ class AreaRule(CompiledRule):
 
 
 class PairRule(CompiledRule):
-    """A rule on the distance of two entities.
+    """A rule on the distance between two entities.
 
     The map is divided into squares as wide as the distance at which the condition stops. The rule
     looks for the partners of an entity in the entity's square and the squares around it.
@@ -138,8 +138,8 @@ class PairRule(CompiledRule):
     def key(self, one: Who, other: Who) -> Key:
         """Return the key of a pair's event.
 
-        In the key, entities of the same source are sorted by name. Otherwise the entity of the
-        first source comes first.
+        Two entities of the same source are sorted by name in the key. Of two entities of different
+        sources, the entity of the rule's first source comes first.
         """
         if self._first == self._second:
             return self.name, (min(one[1], other[1]), max(one[1], other[1]))
@@ -167,8 +167,9 @@ class PairRule(CompiledRule):
     ) -> None:
         """Move an entity in ``cells`` from the square where it was to the square where it is now.
 
-        ``before`` and ``after`` are its last and its new observation. If one of them is ``None`` or
-        has no position, there is no square to leave or to enter.
+        ``before`` and ``after`` are the entity's last and new observation. If ``before`` is
+        ``None`` or has no position, the entity was in no square. The same holds for ``after`` and
+        the square that the entity enters.
         """
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
@@ -204,7 +205,7 @@ def distance(one: Observation, other: Observation) -> float:
 
 
 def compiled(rule: Rule) -> CompiledRule:
-    """Return a rule in the form that checks observations, by the rule's kind of condition."""
+    """Return the :class:`CompiledRule` for a rule; its class depends on the kind of condition."""
     condition = rule.condition
     if isinstance(condition, Near | Count):
         return AreaRule(rule, condition)

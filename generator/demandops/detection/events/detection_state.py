@@ -72,14 +72,15 @@ class State:
     ``phases`` has the conditions that are met now, by key. ``engaged`` has, for each entity, the
     keys of the conditions in which the entity takes part.
 
-    ``awaited`` has the entities of earlier events that have not been seen since the start, each
-    with the time at which it counts as gone. Before ``settled``, no condition on a count stops.
+    ``awaited`` has the entities that take part in an earlier event and have not been seen since the
+    start, each with the time at which the entity counts as gone. Before the time ``settled``, no
+    condition on a count stops.
 
     ``counted`` has, for each entity, the rules that count it. ``counts`` has, for each rule, how
     many entities it counts. ``cells`` has the entities by square, for rules on pairs.
 
-    Unless an observation arrives, nothing changes before ``due``, and no schedule begins or ends
-    before ``hours_due``.
+    Before the time ``due``, only an observation can change anything. Before the time
+    ``hours_due``, no schedule begins or ends.
     """
 
     now: float
@@ -100,7 +101,7 @@ class State:
         return frozenset(key for key, phase in self.phases.items() if phase.lasts)
 
     def shifted(self, seconds: float) -> State:
-        """Return the state after the clock was set forward by ``seconds``, or back if negative."""
+        """Return the state with its times moved by ``seconds``, as the clock was."""
         return replace(
             self,
             now=self.now + seconds,

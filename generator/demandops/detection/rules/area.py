@@ -12,7 +12,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A point, or a polygon of at least three corners; an edge joins the last one to the first."""
+    """A point, or a polygon of at least three corners; an edge joins its last and first corner."""
 
     corners: tuple[Point, ...]
 

@@ -29,7 +29,7 @@ def _field_problem(path: str) -> str:
 
 
 FieldPath = Annotated[str, without(_field_problem)]
-"""A field of a message: ``pose.position.x`` or ``state.continuous_state[0]``."""
+"""A field of a message, such as ``pose.position.x`` or ``state.continuous_state[0]``."""
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Metres = Annotated[float, Field(ge=0, le=1e6)]
@@ -64,7 +64,10 @@ def _refuse_distances(start: float, stop: float) -> None:
 
 
 class Near(_InArea):
-    """A condition that starts within ``start`` metres of an area and stops beyond ``stop``."""
+    """A condition that starts if an entity is at most ``start`` metres from an area.
+
+    It stops if the entity is more than ``stop`` metres from the area.
+    """
 
     start: Metres
     stop: Metres
@@ -114,7 +117,10 @@ class Count(_InArea):
 
 
 class Threshold(CamelModel):
-    """A condition that starts if a number passes a limit and stops if it is back at ``stop``."""
+    """A condition that starts if a number is above ``above``, or below ``below``.
+
+    It stops if the number is back at ``stop``, or has passed ``stop`` on its way back.
+    """
 
     source: DnsLabel
     field: FieldPath

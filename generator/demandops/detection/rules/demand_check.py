@@ -86,7 +86,7 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
                     yield fault(path, f"{message}leave that name out")
     else:
         yield from _missing(data, field, "id")
-        why = "a shutdown finds claims by their requesters"
+        why = "a shutdown ends what its requesters hold, so each event needs its own requesters"
         listed = [(path, who, why) for path, who in _requesters_by_field(data)]
     for path, values, why in listed:
         missing = needed - {f"{{{name}}}" for value in values for name in names(value)}

@@ -208,7 +208,7 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                 if id == other_id and _may_meet(rule, other):
                     message = (
                         f"is the id of a demand of rule '{other.name}' too, so the event that ends "
-                        "first would end the demand of both; add {rule} to one of the ids"
+                        "first would end the other event's demand; add {rule} to one of the ids"
                     )
                     yield fault(f"{where}.demand.demand", message)
                     break

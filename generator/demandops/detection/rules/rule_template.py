@@ -75,7 +75,7 @@ def names(text: str) -> set[str]:
 
 
 def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
-    """Return a fault for each single brace, and for each name in braces that is not ``known``."""
+    """Return a fault for each single brace, and for each name in braces that ``known`` lacks."""
     found = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):

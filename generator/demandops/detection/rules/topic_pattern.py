@@ -18,9 +18,9 @@ def topic_pattern_problem(pattern: str) -> str:
 
 
 def entity_in(pattern: str, topic: str) -> str | None:
-    """Return the entity in a topic that matches a pattern.
+    """Return the entity that ``topic`` names; ``None`` if ``topic`` does not match ``pattern``.
 
-    The result is ``None`` if the topic does not match, and "" if the pattern has no entity.
+    If the topic matches and the pattern has no ``{entity}``, the result is an empty text.
     """
     before, found, after = pattern.partition(ENTITY)
     if not found:
