@@ -217,8 +217,8 @@ class Config:
         if node is None or domain is None:
             missing = self.place_of(NODES_FILE) if node is None else "any access domain"
             message = (
-                f"'{id}' is in use, but not in {missing}; restore it, or release what it holds: "
-                f"demandops decommission {shlex.quote(id)}"
+                f"'{id}' is in use, but not in {missing}; restore it there, or release all that "
+                f"uses it: demandops decommission {shlex.quote(id)}"
             )
             file = NODES_FILE if node is None else DOMAINS_FILE
             raise Refused.at("node", message, code="unknown-node", file=file)

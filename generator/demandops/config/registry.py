@@ -288,10 +288,10 @@ class Resources(FrozenModel):
 
 
 class ClientSettings(CamelModel):
-    """How the containers of one connection type's clients run.
+    """How the client containers of one connection type run.
 
-    Without ``host_network``, a client uses the setting of its node. A probe is a Kubernetes core/v1
-    Probe.
+    Without ``host_network``, a client uses the setting of its node. Each probe has the form of a
+    Kubernetes core/v1 Probe.
     """
 
     env: Annotated[dict[_EnvName, Text], AfterValidator(_free)] = Field(default_factory=dict)

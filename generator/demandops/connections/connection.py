@@ -70,9 +70,10 @@ class Connection:
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return ``more`` with this connection's topics added.
+        """Return this connection with the topics of ``more`` added.
 
-        If ``more`` names no broker, it gets this connection's broker.
+        All other fields come from ``more``. If ``more`` names no broker, this connection's broker
+        stays.
         """
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)

@@ -140,7 +140,7 @@ def message_type(route: Route, sender: str, config: Config) -> str:
 
 
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault: the inventory or the registry lacks what a connection type needs."""
+"""The code of a fault if the inventory or the registry does not permit a connection's type."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 

@@ -122,8 +122,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.source)} goes to {quoted(first.target)} and to "
-                f"{quoted(route.target)}; one source topic has one target, so use a second "
-                "connection",
+                f"{quoted(route.target)}; a connection carries a source topic to only one "
+                "target topic, so use a second connection",
             )
         for name, value, other in contradictions(first, route):
             yield fault(

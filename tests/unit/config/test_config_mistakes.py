@@ -46,7 +46,7 @@ def argocd(**section: object) -> dict[str, str]:
 
 
 def second_definition(*edits: tuple[str, str]) -> dict[str, str]:
-    """Return a copy of the application definition in the folder ``copy``, with edits."""
+    """Return the files of ``appdefs/copy``: the skeleton's application definition, with edits."""
     copy = {
         path.replace("object-detection-fusion/", "copy/", 1): text
         for path, text in skeleton().items()

@@ -229,7 +229,7 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                     f"appdefs/{appdef}/appdef.yaml",
                     f"uses.{name}.{service.each}",
                     f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; both "
-                    "definitions share the service, so use the same name in both",
+                    "definitions share the service, so give this input the same origin in both",
                 )
 
 
@@ -360,7 +360,7 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
     if selected and not any(service.is_movable for service in selected):
         message = (
             f"moves nothing, because {selected[0].name} runs at its sources or at the nodes that "
-            "its definition lists; change its definition, or remove node"
+            "its definition lists; change its definition, or remove 'node'"
         )
         reader.add_fault(override.path, "node", message)
     if node in config.nodes and node not in config.domain_of and config.domains:
