@@ -221,7 +221,7 @@ def _resolve(
     definitions: Mapping[str, ServiceDefinition],
     reader: ConfigReader,
 ) -> Services:
-    """Return the services of an appdef, and add their faults to the reader.
+    """Return the services of an appdef, and add their faults to ``reader``.
 
     Return no services if the appdef, or a definition that it uses, is invalid.
     """

@@ -148,7 +148,7 @@ class ChartsFile(FileModel):
 class ImagesFile(FileModel):
     """``registry/images.yaml``, and files of ``registry/images/``.
 
-    All images of a file are pulled from its ``registry`` if it is given.
+    If a file gives a ``registry``, all images of the file are pulled from this registry.
     """
 
     kind: Literal["Images"]

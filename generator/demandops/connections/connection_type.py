@@ -125,7 +125,7 @@ class End(Client):
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS, so that the other end publishes it."""
+        """Return whether this end reads the topic from ROS. If not, it publishes the topic."""
         return route.reverse is (self.side == "target")
 
 

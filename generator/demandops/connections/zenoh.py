@@ -101,9 +101,10 @@ class Zenoh(ConnectionType):
                 rate, other = publishers.setdefault(route.read_topic, (route.rate, id))
                 if rate != route.rate:
                     message = (
-                        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts an "
-                        f"existing claim: '{other}' carries it from '{key.id}' with rate {rate}, "
-                        "and the node's bridge has one rate for each topic; use the same rate"
+                        f"rate {route.rate} of '{route.read_topic}' in connection '{id}' "
+                        f"contradicts an existing claim: connection '{other}' carries the topic "
+                        f"from '{key.id}' with rate {rate}, and the node's bridge "
+                        "has one rate for each topic; use the same rate"
                     )
                     raise Refused.at("connections", message, code="conflict")
         if not peers:

@@ -97,7 +97,8 @@ class OwnService(Deployed):
     """A service of one appdef.
 
     ``inputs`` maps each input to its origin: a role of the appdef, or ``<service>.<output>``.
-    ``each`` names one of these inputs, or a role of the appdef, which then becomes an input too.
+    ``each`` names one of these inputs, or a role of the appdef. Such a role becomes an input of the
+    service.
     """
 
     inputs: dict[Word, str] = Field(default_factory=dict)

@@ -1,6 +1,7 @@
 """Checks across files and entries, for example for an unknown cluster or a prefix used twice.
 
-The checks run after all files are parsed. Every check runs, and the reader collects all faults.
+The checks run after all files are parsed. Every check runs, and a :class:`ConfigReader` collects
+all faults.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from demandops.errors import InvalidInput, suggestion
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    """Run all checks, and add the faults that they find to the reader."""
+    """Run all checks, and add their faults to ``reader``."""
     for check in (
         _check_inventory,
         _check_domains,
@@ -84,8 +85,8 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 file,
                 f"{place}.namespace",
-                f"'{domain.namespace}' is already the namespace of '{other}'; give each its own "
-                "namespace",
+                f"'{domain.namespace}' is already the namespace of '{other}'; give each "
+                "access domain its own namespace",
             )
         if argocd and domain.namespace == argocd.namespace:
             reader.add_fault(
