@@ -70,10 +70,10 @@ class Connection:
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return this connection with the topics of ``more`` added.
+        """Return this connection and ``more`` as one connection.
 
-        All other fields come from ``more``. If ``more`` names no broker, this connection's broker
-        stays.
+        The result has the topics of both, and the other fields of ``more``. If ``more`` names no
+        broker, the result has this connection's broker.
         """
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
