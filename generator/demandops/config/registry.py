@@ -217,7 +217,7 @@ class VersionList(CamelModel):
 class VersionsFile(FileModel):
     """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
 
-    If an application definition has no entry, the versions of its charts are its versions.
+    An application definition without an entry here has the versions of its charts.
     """
 
     kind: Literal["Versions"]
