@@ -127,7 +127,7 @@ class TestOverride:
             ((), "give the reason: -m TEXT"),
             (("-m", "why"), "select what the override applies to, for example --node edge"),
             (("-m", "why", "--node", "edge"), "has no effect; give at least one of values"),
-            (("-m", "why", "--node", "edge", "--hold", "--deny"), "with deny, nothing runs"),
+            (("-m", "why", "--node", "edge", "--hold", "--deny"), "with 'deny', nothing runs"),
             (("-m", "why", "--node", "edge", "--hold", "--expires", "soon"), "'soon' is not a"),
         ):
             ran = demandops("override", "create", "calm", *options, *where)

@@ -305,8 +305,8 @@ def test_a_node_in_use_that_is_taken_away_is_told_with_how_to_give_it_up(
     told = [(one["file"], one["message"]) for one in found()["faults"]]
     assert (
         "inventory/nodes.yaml",
-        "'vehicle00' is in use, but not in inventory/nodes.yaml; restore it, or release what it "
-        "holds: demandops decommission vehicle00",
+        "'vehicle00' is in use, but not in inventory/nodes.yaml; restore it there, or release all "
+        "that uses it: demandops decommission vehicle00",
     ) in told
 
 

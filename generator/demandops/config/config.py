@@ -110,7 +110,7 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """Part of a topic name → the nodes whose ids become this part by ``topic_part``."""
+    """Part of a topic name → the nodes for whose ids ``topic_part`` returns this part."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     """Node type → the nodes of the type, sorted by id; the empty type stands for all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
@@ -217,8 +217,8 @@ class Config:
         if node is None or domain is None:
             missing = self.place_of(NODES_FILE) if node is None else "any access domain"
             message = (
-                f"'{id}' is in use, but not in {missing}; restore it, or release what it holds: "
-                f"demandops decommission {shlex.quote(id)}"
+                f"'{id}' is in use, but not in {missing}; restore it there, or release all that "
+                f"uses it: demandops decommission {shlex.quote(id)}"
             )
             file = NODES_FILE if node is None else DOMAINS_FILE
             raise Refused.at("node", message, code="unknown-node", file=file)

@@ -30,7 +30,7 @@ def seconds_of(text: str) -> int:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration in all units that it needs, as text that :func:`seconds_of` reads."""
+    """Return a duration, rounded to seconds, as text for :func:`seconds_of`: ``1h30m``."""
     text, left = "", round(seconds)
     for size, name in _UNITS:
         whole, left = divmod(left, size)

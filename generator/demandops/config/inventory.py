@@ -70,7 +70,8 @@ class Zenoh(CamelModel):
     def _reachable(self) -> Zenoh:
         if self.listen and not self.endpoint:
             raise ValueError(
-                "listen needs an endpoint, where other bridges reach this one; add endpoint"
+                "'listen' needs 'endpoint', the address at which other bridges reach this one; "
+                "add 'endpoint'"
             )
         return self
 
@@ -187,10 +188,10 @@ class Toleration(CamelModel):
     @model_validator(mode="after")
     def _sensible(self) -> Toleration:
         if self.operator == "Exists" and self.value:
-            raise ValueError("operator Exists takes no value; remove it, or use Equal")
+            raise ValueError("operator Exists takes no value; remove the value, or use Equal")
         if self.operator == "Equal" and not self.key:
             raise ValueError(
-                "operator Equal needs a key; add it, or use Exists to tolerate every taint"
+                "operator Equal needs a key; add a key, or use Exists to tolerate every taint"
             )
         return self
 

@@ -160,7 +160,7 @@ def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
 
 
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the clients' settings from all files, and the file that sets each connection type."""
+    """Return the clients' settings of all types, and a map from type to the file that has them."""
     found, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
@@ -221,7 +221,7 @@ def _resolve(
     definitions: Mapping[str, ServiceDefinition],
     reader: ConfigReader,
 ) -> Services:
-    """Return the services of an appdef, and add their faults to the reader.
+    """Return the services of an appdef, and add their faults to ``reader``.
 
     Return no services if the appdef, or a definition that it uses, is invalid.
     """

@@ -114,8 +114,8 @@ def _filled_in(model: FrozenModel) -> None:
 class Selector(FrozenModel):
     """Selects the releases and claims that match every field given here.
 
-    Patterns may contain ``*`` and ``?``. ``requesters`` matches if it matches one of the
-    requesters. ``labels`` matches if the node's selector has all of these labels.
+    Patterns may contain ``*`` and ``?``. ``requesters`` matches if a pattern matches one requester
+    of the release or claim. ``labels`` matches if the node's selector has all of these labels.
     """
 
     applications: Patterns | None = None
@@ -134,8 +134,8 @@ class Selector(FrozenModel):
         others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
         if self.connections and others:
             raise ValueError(
-                f"'connections' and '{others[0]}' together can match nothing; write a selector for "
-                "each"
+                f"one selector cannot have both 'connections' and '{others[0]}', because nothing "
+                "matches both; write a selector for each"
             )
         return self
 
@@ -179,20 +179,21 @@ class OverrideFile(FileModel):
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
-                "select: selects connections and services, but 'values' has either settings of "
-                "clients or Helm values; write two overrides"
+                "select: selects connections and services, but 'values' can have settings of "
+                "clients or Helm values, not both; write two overrides"
             )
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
             if selector.connections and wrong:
                 yield (
-                    f"select[{index}].connections: '{wrong[0]}' is for services, but this selects "
-                    f"connections; remove 'connections', or {wrong[0]}"
+                    f"select[{index}].connections: '{wrong[0]}' is for services, but this selector "
+                    f"selects connections; remove 'connections' or '{wrong[0]}'"
                 )
             if selector.requesters and "node" in effects:
                 yield (
-                    f"select[{index}].requesters: 'node' moves a service for every requester; "
-                    "select by applications, appdefs, services, nodes or labels"
+                    f"select[{index}].requesters: 'node' moves a service for all its "
+                    "requesters, so it cannot be limited to some of them; select by applications, "
+                    "appdefs, services, nodes or labels"
                 )
             if selector.services and "keep" in effects:
                 yield (
@@ -201,7 +202,7 @@ class OverrideFile(FileModel):
                 )
 
     def selects_clients(self) -> bool:
-        """Return whether any selector of the override names connections."""
+        """Return whether the override selects connections, and so their clients."""
         return any(selector.connections for selector in self.select)
 
     def patches_clients(self) -> bool:
@@ -287,12 +288,17 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
     if not effects:
         yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
     if "deny" in effects and len(effects) > 1:
-        others = " and ".join(name for name in effects if name != "deny")
-        yield f"with deny, nothing runs, so {others} cannot apply; remove deny, or remove {others}"
+        others = " and ".join(f"'{name}'" for name in effects if name != "deny")
+        yield (
+            f"with 'deny', nothing runs, so {others} cannot apply; remove 'deny', or remove "
+            f"{others}"
+        )
     frozen = [name for name in effects if name in _SHAPING]
     if "hold" in effects and frozen:
-        names = " and ".join(frozen)
-        yield f"'hold' freezes the release, so {names} cannot apply; remove hold, or remove {names}"
+        names = " and ".join(f"'{name}'" for name in frozen)
+        yield (
+            f"'hold' freezes the release, so {names} cannot apply; remove 'hold', or remove {names}"
+        )
 
 
 def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON

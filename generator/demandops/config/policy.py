@@ -69,9 +69,9 @@ class LeasePolicy(CamelModel):
 
     A demand that requests no lease gets ``default``, or ``longest`` if there is no ``default``. If
     neither is set, its claims last forever. Goals of the reference's ``DeploymentRequest`` get a
-    lease only with ``deployment_requests``. Their clients must then repeat the goals in time. The
-    recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
-    release a claim late by that much.
+    lease only with ``deployment_requests``. A client must then send its goal again before the
+    lease ends. The recorded end of a lease may lag behind the last renewal by ``slack``, so the
+    generator may release a claim late by that much.
     """
 
     default: Duration | None = None
@@ -86,10 +86,10 @@ class LeasePolicy(CamelModel):
             if value is not None and seconds_of(value) < 1:
                 raise ValueError(f"{name} is zero; leave it out, or give a longer duration")
         if self.deployment_requests and self.default is None:
-            raise ValueError("deploymentRequests needs a default lease; add default")
+            raise ValueError("'deploymentRequests' needs a default lease; add 'default'")
         if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
-            message = f"default {self.default} is above longest {self.longest}"
-            raise ValueError(f"{message}; lower default or raise longest")
+            message = f"'default' ({self.default}) is above 'longest' ({self.longest})"
+            raise ValueError(f"{message}; lower 'default' or raise 'longest'")
         return self
 
 

@@ -148,7 +148,7 @@ class ChartsFile(FileModel):
 class ImagesFile(FileModel):
     """``registry/images.yaml``, and files of ``registry/images/``.
 
-    All images of a file are pulled from its ``registry`` if it is given.
+    If a file gives a ``registry``, all images of the file are pulled from this registry.
     """
 
     kind: Literal["Images"]
@@ -217,7 +217,7 @@ class VersionList(CamelModel):
 class VersionsFile(FileModel):
     """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
 
-    If an application definition has no entry, the versions of its charts are its versions.
+    An application definition without an entry here has the versions of its charts.
     """
 
     kind: Literal["Versions"]
@@ -288,10 +288,10 @@ class Resources(FrozenModel):
 
 
 class ClientSettings(CamelModel):
-    """How the containers of one connection type's clients run.
+    """How the client containers of one connection type run.
 
-    Without ``host_network``, a client uses the setting of its node. A probe is a Kubernetes core/v1
-    Probe.
+    Without ``host_network``, a client uses the setting of its node. Each probe has the form of a
+    Kubernetes core/v1 Probe.
     """
 
     env: Annotated[dict[_EnvName, Text], AfterValidator(_free)] = Field(default_factory=dict)

@@ -47,7 +47,7 @@ GitUrl = Annotated[str, without(_git_url_problem), Visible]
 
 
 class Flux(FrozenModel):
-    """How Flux fetches this repo, in a GitRepository for each access domain.
+    """How Flux fetches this repo. Each access domain has a GitRepository with these settings.
 
     Without ``url`` there are no bootstrap files, so no cluster can follow the repo.
     """
@@ -111,7 +111,7 @@ class Proposals(FrozenModel):
         if self.api is not None and not has_api:
             raise ValueError(f"api: is not used with forge: {self.forge}; leave it out")
         if self.labels and self.forge != "gitlab":
-            raise ValueError("labels: only GitLab's push options set them; leave them out")
+            raise ValueError("labels: are used only with forge: gitlab; leave them out")
         return self
 
     @property

@@ -70,9 +70,10 @@ class Connection:
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return ``more`` with this connection's topics added.
+        """Return this connection and ``more`` as one connection.
 
-        If ``more`` names no broker, it gets this connection's broker.
+        The result has the topics of both, and the other fields of ``more``. If ``more`` names no
+        broker, the result has this connection's broker.
         """
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)

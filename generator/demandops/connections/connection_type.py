@@ -125,7 +125,7 @@ class End(Client):
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS, so that the other end publishes it."""
+        """Return whether this end reads the topic from ROS. If not, it publishes the topic."""
         return route.reverse is (self.side == "target")
 
 
@@ -140,7 +140,7 @@ def message_type(route: Route, sender: str, config: Config) -> str:
 
 
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault: the inventory or the registry lacks what a connection type needs."""
+"""The code of a fault if the inventory or the registry does not permit a connection's type."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 

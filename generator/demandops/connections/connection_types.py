@@ -134,5 +134,6 @@ def route_faults(
             yield fault(
                 f"{where}.target",
                 f"'{route.source}' cannot become '{route.target}', because {kind.name} keeps the "
-                f"name of a topic; use one name, or type {able}",
+                f"name of a topic; use the same name at both ends, or use type "
+                f"{able}",
             )

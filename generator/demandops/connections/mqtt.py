@@ -80,7 +80,7 @@ class Mqtt(ConnectionType):
                 f"{where}.type",
                 f"'{route.source}' carries messages of {package}, and mqtt.messages in "
                 f"{config.file_of(CLIENTS_FILE, self.word)} has only {', '.join(carried)}; use an "
-                "image that has the package, and add the package there",
+                "image that has the package, and add the package to mqtt.messages",
                 code=UNSUPPORTED,
             )
 
@@ -100,7 +100,7 @@ class Mqtt(ConnectionType):
         return replace(connection, broker=broker.node), note
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the broker's node as the value that ``brokers`` of a policy's rule must allow."""
+        """Return the broker's node, which ``brokers`` in a policy's rule must allow."""
         broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
@@ -129,8 +129,8 @@ def choose_broker(connection: Connection, config: Config) -> Broker | None:
     """Return the broker of a connection, or ``None`` if no broker fits.
 
     The choice is that of the reference. If there is only one broker, it is chosen. If there are
-    several, the choice is the first that exists of the broker on the node that the connection
-    names, the broker on the target, and the broker on the source.
+    several, the function looks for a broker on the node that the connection names, then on the
+    target, then on the source.
     """
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))

@@ -59,8 +59,8 @@ class Ros(ConnectionType):
             yield fault(
                 f"{where}.type",
                 f"the message type of '{route.source}' is not known, and ROS needs it; give the "
-                "type in the request, if the request has a field for it, or add the type to types "
-                f"of '{sender}' in {config.file_of(NODES_FILE, sender)}",
+                "type in the request, if the request has a field for it, or add the type under "
+                f"'types' of '{sender}' in {config.file_of(NODES_FILE, sender)}",
             )
         if route.durability and not route.reliability:
             yield fault(
@@ -148,9 +148,9 @@ class RosEnd(End):
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of one end's router.
 
-        A topic passes only from the end that reads it to the end that writes it. The general routes
-        are for topics that come from the source. Most topics do, so most new topics need no route
-        of their own and no restart.
+        A topic passes only from the end that reads it to the end that writes it. ``routes`` is for
+        the topics that come from the source, as most topics do. A reverse topic needs an entry in
+        ``topic-routes``, and a new entry there restarts the router.
         """
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []

@@ -27,9 +27,10 @@ class Route:
     (``std_msgs/msg/String``), empty if not given. An option that has its default leaves the
     client's own behavior unchanged.
 
-    The options of MQTT are ``qos`` (0 to 2), ``retained`` and ``primitive`` (the payload is plain
-    text or a number, not a ROS message). Those of the ROS endpoints are ``reliability``,
-    ``durability`` and ``queue``. ``rate`` is the highest rate in Hz, 0 for all messages.
+    ``qos`` (0 to 2), ``retained`` and ``primitive`` (the payload is plain text or a number, not a
+    ROS message) are options of MQTT. ``reliability``, ``durability`` and ``queue`` are options of
+    the clients' ROS publishers and subscribers. ``rate`` is the highest rate in Hz, 0 for all
+    messages.
     """
 
     source: str
@@ -122,8 +123,8 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             yield fault(
                 f"{where}[{index}].target",
                 f"{quoted(route.source)} goes to {quoted(first.target)} and to "
-                f"{quoted(route.target)}; one source topic has one target, so use a second "
-                "connection",
+                f"{quoted(route.target)}; a connection carries a source topic to only one "
+                "target topic, so use a second connection",
             )
         for name, value, other in contradictions(first, route):
             yield fault(

@@ -46,7 +46,7 @@ class Zenoh(ConnectionType):
                 yield fault(
                     f"{place}.zenoh",
                     f"'{other}' already runs a bridge on the same host and ROS domain; remove one "
-                    "of them",
+                    "of the two bridges",
                 ).within(file)
 
     def shares_clients(self, config: Config) -> bool:
@@ -54,7 +54,7 @@ class Zenoh(ConnectionType):
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if a node has no bridge, or if there is no route between both bridges."""
+        """Yield a fault if an end has no bridge, or if the two bridges cannot reach each other."""
         source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:
             return
@@ -73,9 +73,9 @@ class Zenoh(ConnectionType):
         if not (source.zenoh.endpoint or target.zenoh.endpoint or shared):
             yield fault(
                 "type",
-                f"{self.name} finds no route between '{source.id}' and '{target.id}'; give one "
-                f"of them an endpoint under zenoh in {config.place_of(NODES_FILE)}, or add the "
-                "same router to connect of both",
+                f"{self.name} cannot link '{source.id}' and '{target.id}'; in "
+                f"{config.place_of(NODES_FILE)}, give one of the nodes an 'endpoint' under "
+                "'zenoh', or list the same router under 'connect' of both nodes",
                 code=UNSUPPORTED,
             )
 
@@ -101,9 +101,10 @@ class Zenoh(ConnectionType):
                 rate, other = publishers.setdefault(route.read_topic, (route.rate, id))
                 if rate != route.rate:
                     message = (
-                        f"rate {route.rate} of '{route.read_topic}' in '{id}' contradicts an "
-                        f"existing claim: '{other}' carries it from '{key.id}' with rate {rate}, "
-                        "and the node's bridge has one rate for each topic; use the same rate"
+                        f"rate {route.rate} of '{route.read_topic}' in connection '{id}' "
+                        f"contradicts an existing claim: connection '{other}' carries the topic "
+                        f"from '{key.id}' with rate {rate}, and the node's bridge "
+                        "has one rate for each topic; use the same rate"
                     )
                     raise Refused.at("connections", message, code="conflict")
         if not peers:
@@ -137,7 +138,7 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
     if node.zenoh is None:
         message = (
             f"'{node.id}' carries Zenoh connections, but has no zenoh in "
-            f"{config.file_of(NODES_FILE, node.id)} any longer; restore it"
+            f"{config.file_of(NODES_FILE, node.id)} any longer; restore 'zenoh' there"
         )
         raise Refused.at("node", message, code=UNSUPPORTED)
     endpoints = set(node.zenoh.connect)

@@ -59,7 +59,7 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return the text of a template, its path, and a function that reports it as current."""
+        """Return a template's text, its path, and a function that says that the text is current."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]
@@ -118,7 +118,7 @@ def _literal(value: str, indent: int) -> _Verbatim:
 
 
 def _bare(value: str) -> _Verbatim:
-    """Return a path that a template can write into a comment without quotes.
+    """Return a path as text that a template writes into a comment without quotes.
 
     Raises:
         ValueError: if the path has characters that need quotes.

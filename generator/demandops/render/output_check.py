@@ -89,9 +89,8 @@ def check_files(files: Mapping[str, str | None]) -> None:
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
-            faults.append(
-                fault("", "is in no folder that the generator writes; report it").within(path)
-            )
+            message = "is in no folder that the generator writes; report this bug"
+            faults.append(fault("", message).within(path))
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
@@ -101,7 +100,7 @@ def check_files(files: Mapping[str, str | None]) -> None:
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield the valid documents of a file, and append the faults of the others to ``faults``.
+    """Yield a file's valid documents, and append the faults of its other documents to ``faults``.
 
     Documents for Flux and Argo CD are yielded without their ``spec``. The ``spec`` needs no check
     here, because a template of the program writes it, and :func:`check_values` checks the Helm

@@ -76,7 +76,7 @@ def split_comments(text: str) -> tuple[list[str], str]:
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
-    """Return the chart sources to keep because a held release may still use them, by path.
+    """Return, by path, the chart sources that stay because a held release may still use them.
 
     If the files of a chart are in the state repo, the old source is not kept, because it would
     fetch the changed chart.

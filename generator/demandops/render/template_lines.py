@@ -40,8 +40,8 @@ class TemplateLines:
     def _line_of(self, number: int) -> int | None:
         """Return the number of the template's line that produced a line of the rendered text.
 
-        Prefer an identical line of the template to a line with expressions. Return None if no line
-        of the template, or more than one, may have produced the rendered line.
+        If the template has an identical line, lines with expressions are not tried. Return None if
+        no line of the template, or more than one, may have produced the rendered line.
         """
         if number > len(self._rendered) or len(self._rendered[number - 1]) > _LONGEST:
             return None

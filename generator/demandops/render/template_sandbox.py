@@ -383,7 +383,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         """Return the result of a macro, function or method.
 
         Raises:
-            SecurityError: for a method of a built-in type that ``_METHODS`` does not list.
+            SecurityError: if ``_METHODS`` does not list the method of a built-in type.
         """
         steps = _budget.get()
         for value in (*args, *kwargs.values()):

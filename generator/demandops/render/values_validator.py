@@ -1,6 +1,7 @@
 """Validators for a chart's ``values.schema.json``.
 
-A validator reads no other file. Schemas whose validation could take long are refused.
+A validator reads no file besides the schema's. A schema whose validation could take long is
+refused.
 """
 
 from __future__ import annotations

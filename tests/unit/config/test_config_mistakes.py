@@ -46,7 +46,7 @@ def argocd(**section: object) -> dict[str, str]:
 
 
 def second_definition(*edits: tuple[str, str]) -> dict[str, str]:
-    """Return a copy of the application definition in the folder ``copy``, with edits."""
+    """Return the files of ``appdefs/copy``: the skeleton's application definition, with edits."""
     copy = {
         path.replace("object-detection-fusion/", "copy/", 1): text
         for path, text in skeleton().items()
@@ -420,7 +420,7 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
 
 @pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
 def test_an_id_that_is_no_label_needs_a_selector(id: str) -> None:
-    """Without a selector, a release selects ``node_id: <id>``, which the API server refuses."""
+    """Without a selector, a release selects ``node_id: <id>``, which must be a valid label."""
     (found,) = refused(edited(NODES, V1, f'- id: "{id}"\n'))
     assert found.file == NODES
     assert "selector" in str(found)

@@ -143,7 +143,7 @@ def test_a_fault_in_one_of_many_files_names_the_file_and_the_field() -> None:
     second = "policy/access-domains/other.yaml"
     assert faults({second: domains}) == (
         f"{second}: domains[0].namespace: 'perception' is already the namespace of 'perception'; "
-        "give each its own namespace\n"
+        "give each access domain its own namespace\n"
     )
 
 

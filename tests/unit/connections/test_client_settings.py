@@ -124,8 +124,8 @@ def test_settings_and_patches_that_are_not_valid_are_named() -> None:
     ]
     both = [{"connections": ["*"]}, {"nodes": ["edge"]}]
     assert refusals({PATCH: override(*both, values={"env": {}})}) == [
-        "overrides/tested.yaml: select: selects connections and services, but 'values' has "
-        "either settings of clients or Helm values; write two overrides"
+        "overrides/tested.yaml: select: selects connections and services, but 'values' can have "
+        "settings of clients or Helm values, not both; write two overrides"
     ]
     patch = override({"connections": ["*"]}, values={"resources": {"limits": {"memory": 1}}})
     assert refusals({PATCH: patch}) == [
@@ -141,7 +141,7 @@ def test_a_message_that_the_image_does_not_carry_is_refused() -> None:
     assert repo.faults(goal([], [connection(topics=["/ego"])])) == [
         "connections[0].source_topics[0]: '/ego' carries messages of perception_msgs, and "
         "mqtt.messages in registry/clients.yaml has only std_msgs; use an image that has the "
-        "package, and add the package there"
+        "package, and add the package to mqtt.messages"
     ]
     repo.send(goal([], [connection(topics=["/of-no-known-type".replace("-", "_")])]))
 

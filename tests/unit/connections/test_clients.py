@@ -190,7 +190,7 @@ class TestRos:
 
 
 class TestMqtt:
-    """Each setting is at the right end of a connection. tests/golden tests the options."""
+    """Each end of a connection gets its own settings. ``tests/golden`` tests the options."""
 
     def test_a_connection_that_only_brings_back_has_its_ends_turned(self) -> None:
         world = World(state())

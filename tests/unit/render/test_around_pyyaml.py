@@ -1,4 +1,4 @@
-"""``strict_yaml`` writes simple values and reads long lists as PyYAML does, but without it."""
+"""``strict_yaml`` writes simple values and reads long lists as PyYAML does, but without PyYAML."""
 
 from __future__ import annotations
 

@@ -77,12 +77,12 @@ X, Y = "clusters/c/d/n/x.yaml", "clusters/c/d/n/y.yaml"
     ("files", "told"),
     [
         *(
-            ({path: None}, [f"{path}: is in no folder that the generator writes; report it"])
+            ({path: None}, [f"{path}: is in no folder that the generator writes; report this bug"])
             for path in ("inventory/nodes.yaml", "demandops.yaml", "clusters/../x.yaml", "x")
         ),
         (
             {"/clusters/x.yaml": None},
-            ["/clusters/x.yaml: is in no folder that the generator writes; report it"],
+            ["/clusters/x.yaml: is in no folder that the generator writes; report this bug"],
         ),
         ({X: CONFIG + "data: {a: 1}\nfoo: bar\n"}, [f"{X}: ", f"{X}: "]),
         (

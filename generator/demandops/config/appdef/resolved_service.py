@@ -25,8 +25,8 @@ class Service(Deployed):
     ``folder`` is the folder in ``appdefs/`` that has the service's definition. ``inputs`` maps each
     input of the service to its origin: a role of the appdef, or ``<service>.<output>``. A service
     with ``each`` runs once for each topic of the role ``root``. ``roots`` is set if each instance
-    serves a single source. These are the roles whose topics the instance reads from this source,
-    directly or through other services.
+    serves a single source. ``roots`` lists the roles whose topics the instance reads from this
+    source, directly or through other services.
 
     ``nodes`` and ``runs_at`` are set if the service runs once for each cluster. ``nodes`` maps a
     cluster to the node where the service runs. ``runs_at`` maps the node of an application to the
@@ -133,7 +133,8 @@ def _unbound(
         for role in inputs.keys() - bound.keys():
             yield (
                 f"uses.{name}.{role}",
-                "is missing; say what it reads: an input of this definition, or <service>.<output>",
+                "is missing; say where the input comes from: an input of this definition, or "
+                "<service>.<output>",
             )
         for role in bound.keys() - inputs.keys():
             known = suggestion(role, inputs)

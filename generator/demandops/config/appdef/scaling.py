@@ -54,9 +54,9 @@ class Scaling(CamelModel):
     """How many replicas a service has.
 
     A service has ``min`` replicas unless one of three fields decides the number. With ``per``, each
-    replica serves up to the given number of topics, sources, claims or requesters. ``sizes`` gives
-    the replicas of the size that a parameter names. ``autoscaler`` has the targets of a
-    HorizontalPodAutoscaler, in percent of what the pods request.
+    replica serves up to the given number of topics, sources, claims or requesters. With
+    ``sizes``, a parameter names a size, and each size has its number of replicas. ``autoscaler``
+    has the targets of a HorizontalPodAutoscaler, in percent of what the pods request.
 
     ``divides_work`` says that no two replicas publish the same data. Additional replicas start
     without delay. With ``down_after``, the service keeps additional replicas for this time after
@@ -97,7 +97,7 @@ class Scaling(CamelModel):
             yield f"'sizes' lists all numbers of replicas, so {name} does nothing; remove {name}"
         for name in ("per", "autoscaler"):
             if getattr(self, name) and self.min == self.max:
-                yield f"'{name}' has no choice between min {self.min} and max {self.max}; raise max"
+                yield f"'{name}' does nothing, because min and max are both {self.max}; raise max"
         if self.autoscaler and self.min == 0:
             yield "an autoscaler keeps at least one replica; raise min to 1"
         by_requesters = "requesters" in (self.per or {})

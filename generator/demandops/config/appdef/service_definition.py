@@ -30,7 +30,7 @@ Scope = Literal["application", "topic", "node", "cluster"]
 
 
 class Place(CamelModel):
-    """Requirements on a service's node: type, labels of its selector, capabilities, properties.
+    """Requirements on a service's node: its type, selector labels, capabilities and properties.
 
     ``properties`` maps the name of a property to the value that the property must have. For a
     number, there may be bounds instead of a value: ``{min: 8}``.
@@ -97,7 +97,8 @@ class OwnService(Deployed):
     """A service of one appdef.
 
     ``inputs`` maps each input to its origin: a role of the appdef, or ``<service>.<output>``.
-    ``each`` names one of these inputs, or a role of the appdef, which then becomes an input too.
+    ``each`` names one of these inputs, or a role of the appdef. Such a role becomes an input of the
+    service.
     """
 
     inputs: dict[Word, str] = Field(default_factory=dict)
@@ -109,7 +110,7 @@ class OwnService(Deployed):
                 "placement 'source' needs 'each', because an application has no single source"
             )
         if self.placement == "source" and self.place:
-            raise ValueError("place and placement 'source' both choose the node; keep one")
+            raise ValueError("'place' and 'placement: source' both choose the node; keep one")
         return self
 
 
@@ -146,8 +147,8 @@ class ServiceDefinition(Deployed, FileModel):
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
         if self.place and self.scope != "application":
             raise ValueError(
-                "place needs the scope 'application', because with any other scope one instance "
-                "serves several applications, which could need different nodes"
+                "'place' needs the scope 'application', because with any other scope one "
+                "instance serves several applications, which could need different nodes"
             )
         if problems := [*size_problems(self.scaling, self.parameters)]:
             raise ValueError(sentences(problems))
@@ -166,8 +167,8 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         return
     if parameter.merge in ("max", "min"):
         yield (
-            f"{place}: '{name}' has 'merge: {parameter.merge}', which compares numbers; use "
-            "'merge: union', so that the largest size counts"
+            f"{place}: '{name}' has 'merge: {parameter.merge}', which compares numbers, "
+            "but a size is a word; use 'merge: union', so that the largest demanded size counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)

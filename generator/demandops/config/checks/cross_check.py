@@ -1,6 +1,7 @@
 """Checks across files and entries, for example for an unknown cluster or a prefix used twice.
 
-The checks run after all files are parsed. Every check runs, and the reader collects all faults.
+The checks run after all files are parsed. Every check runs, and a :class:`ConfigReader` collects
+all faults.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from demandops.errors import InvalidInput, suggestion
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    """Run all checks, and add the faults that they find to the reader."""
+    """Run all checks, and add their faults to ``reader``."""
     for check in (
         _check_inventory,
         _check_domains,
@@ -84,8 +85,8 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 file,
                 f"{place}.namespace",
-                f"'{domain.namespace}' is already the namespace of '{other}'; give each its own "
-                "namespace",
+                f"'{domain.namespace}' is already the namespace of '{other}'; give each "
+                "access domain its own namespace",
             )
         if argocd and domain.namespace == argocd.namespace:
             reader.add_fault(
@@ -229,7 +230,7 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                     f"appdefs/{appdef}/appdef.yaml",
                     f"uses.{name}.{service.each}",
                     f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; both "
-                    "definitions share the service, so use the same name in both",
+                    "definitions share the service, so give this input the same origin in both",
                 )
 
 
@@ -360,7 +361,7 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
     if selected and not any(service.is_movable for service in selected):
         message = (
             f"moves nothing, because {selected[0].name} runs at its sources or at the nodes that "
-            "its definition lists; change its definition, or remove node"
+            "its definition lists; change its definition, or remove 'node'"
         )
         reader.add_fault(override.path, "node", message)
     if node in config.nodes and node not in config.domain_of and config.domains:

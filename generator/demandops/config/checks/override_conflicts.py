@@ -34,12 +34,12 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
             continue
         contested = contested_effects(one, other)
         if contested and may_select_same_release(one.select, other.select, config):
+            names = " and ".join(f"'{name}'" for name in contested)
             reader.add_fault(
                 other.path,
                 "priority",
-                f"is {other.priority}, as in {one.path}, and both may set "
-                f"{' and '.join(contested)} of the same release; give one of them another "
-                "priority, or select different releases",
+                f"is {other.priority}, as in {one.path}, and both overrides may set {names} of the "
+                "same release; give one override another priority, or select different releases",
             )
 
 

@@ -2,7 +2,7 @@
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
 may affect any release, so this module compares all releases. The files decide whether a release
-differs, because the clusters follow the files. The plans of both sides describe the difference.
+differs, because the clusters follow the files. The plans before and after say how it differs.
 The functions here are pure.
 """
 

@@ -1,9 +1,9 @@
 """The rule by which a cluster lets pods of an access domain run only on the domain's nodes.
 
 The rule is an expression of the Common Expression Language. Its variable ``variables.selector`` is
-a pod's node selector. The rule matches nodes with the default selector by the patterns of the
-policy, not by name. So a new vehicle with this selector does not change the rule, and no person has
-to apply the rule again.
+a pod's node selector. For nodes with the default selector, the rule contains the patterns of
+the policy instead of the nodes' names. So a new vehicle with this selector does not change the
+rule, and no person has to apply the rule again.
 """
 
 from __future__ import annotations
