@@ -34,7 +34,7 @@ _RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
 class LeaseExpiry:
-    """Decides which leases have ended, and makes a demand to release the claims of each."""
+    """Decides which leases have ended, and makes tickets to release the claims of these leases."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -73,7 +73,7 @@ class LeaseExpiry:
         return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the current time, and the claims whose lease has ended, sorted by their ends.
+        """Return the current time, and the claims whose lease has ended, earliest end first.
 
         A demand's ended claims are released together. If one of them gets more time after a jump of
         the clock, none of them is returned.

@@ -46,9 +46,9 @@ class ProposalRecord:
     """The journal's record of a proposal: what a restarted process needs to continue it.
 
     ``commits`` lists the commits at which the branch may be, newest last. ``base`` is the commit of
-    main on which the newest of them was made. ``pushed`` is true if the branch has ever existed.
-    ``link`` is the address of its merge request. ``withdrawn`` is the reason to delete the branch,
-    or empty.
+    main on which the newest of them was made. ``pushed`` is true if the branch was pushed, so
+    that a missing branch was deleted by somebody. ``link`` is the address of the branch's merge
+    request. ``withdrawn`` is the reason why the demand was withdrawn, or empty.
     """
 
     branch: str
