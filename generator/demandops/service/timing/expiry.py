@@ -86,9 +86,9 @@ class LeaseExpiry:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        The minimum lets the worker wait although a lease has ended. The ledger keeps a lease that
-        has ended if the release of its claim failed, or if it gets more time after a jump of the
-        clock.
+        Without the minimum, the worker would never wait while the ledger keeps a lease that has
+        ended. The ledger keeps such a lease if the release of the claim failed, or if the lease
+        gets more time after a jump of the clock.
         """
         first = ledger.first_to_end()
         if first is not self._first:  # a search is slow if many leases end at one time

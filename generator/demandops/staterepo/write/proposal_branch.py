@@ -1,4 +1,4 @@
-"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
+"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve the demands.
 
 The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
 branch in the end. It does neither if somebody else has moved the branch. This module knows nothing
