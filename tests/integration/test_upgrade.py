@@ -290,8 +290,8 @@ def test_where_nothing_would_change_nothing_is_committed(
     [
         (
             ["--url", "https://git.example/else.git"],
-            f"demandops.yaml: flux.url: is {URL} already; change it in this file, or leave out "
-            "--url",
+            f"demandops.yaml: flux.url: is set to {URL} already; change it in this file, or "
+            "leave out --url",
         ),
         (
             ["--gitops", "argocd", "--url", "git.example"],

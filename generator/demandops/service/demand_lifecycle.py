@@ -98,7 +98,7 @@ class Demands:
 
     @property
     def proposed(self) -> list[Ticket]:
-        """The demands on a branch that a person may merge, even those withdrawn since."""
+        """The demands on a branch that a person may merge, even if they were withdrawn later."""
         with self._changed:
             return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
 

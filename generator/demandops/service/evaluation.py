@@ -124,7 +124,7 @@ class Evaluator:
 
 def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt | DemandOpsError:
     if arrival.outcome == "refused":
-        message = "the demand was refused, but the reason was lost; send it again"
+        message = "the demand was refused, but the reason was lost; send the demand again"
         return Refused([fault("", message, code="refused")])
     goal = ticket.goal
     outcome: Outcome = "booked"

@@ -24,7 +24,7 @@ def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dic
 
     Args:
         to: the commit whose claims are booked again.
-        drop_newer: whether the rollback may undo newer claims; if not, it fails if there are any.
+        drop_newer: whether the rollback may undo newer claims. If not, newer claims make it fail.
         reason: why the person rolls back.
         who: the person's name and e-mail address.
     """

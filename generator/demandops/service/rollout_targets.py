@@ -62,7 +62,7 @@ def domains_of_state(state: State) -> list[ClusterDomain]:
 
 
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
-    """Return an access domain on a cluster, as :mod:`demandops.cluster` reads it.
+    """Return an access domain on a cluster, in the form that :mod:`demandops.cluster` needs.
 
     With Argo CD, the result names the Application that applies the folder of the domain.
     """
@@ -73,6 +73,6 @@ def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings)
 
 
 def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True) -> Target:
-    """Return the target of a release; ``wanted`` says whether its cluster should run it."""
+    """Return the target of a release; ``wanted`` says whether the cluster should run it."""
     domain = cluster_domain(release.node.cluster, release.domain, repository)
     return Target(domain, release.name, isinstance(release, ServiceRelease), wanted)

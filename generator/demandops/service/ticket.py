@@ -73,8 +73,8 @@ class Ticket:
 
     ``base`` is the tip that was known when the demand arrived. ``maybe_published`` is true if the
     remote may have accepted a push of the demand although no answer arrived. ``has_released`` is
-    true if the demand is a release and ended a demand that awaited approval. It then succeeds even
-    if it ends no claim.
+    true if the demand is a release and ended a demand that awaited approval. Such a release
+    succeeds even if it ends no claim.
     """
 
     operation: str
@@ -135,7 +135,7 @@ class Ticket:
 def receipt_of(
     ticket: Ticket, decision: Decision, commit: str, targets: tuple[Target, ...]
 ) -> Receipt:
-    """Return the receipt of a demand for the decision on it."""
+    """Return the receipt of a demand, with the results of its decision."""
     return Receipt(
         operation=ticket.operation,
         request_id=decision.request.id,

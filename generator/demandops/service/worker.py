@@ -188,8 +188,8 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        The batch is empty afterwards. The demands that there was no time to evaluate are in the
-        queue again.
+        The batch is empty afterwards. The demands that the worker had no time to evaluate are
+        in the queue again.
 
         Raises:
             ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
@@ -278,7 +278,7 @@ class Worker:
             self._demands.put_back(batch)
             backoff.published()
             return None
-        log.info("the state repo has moved; evaluating %d demands again", len(results))
+        log.info("the state repo got new commits; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
@@ -303,9 +303,9 @@ class Worker:
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
-        """Publish a commit batch and answer its demands; False if another writer published first.
+        """Publish a commit batch and answer its demands, or return false and answer none.
 
-        If another writer published first, no demand is answered. If the remote denies the push, the
+        The result is false if another writer published first. If the remote denies the push, the
         demands after the first ``certain`` results get this error as their answer, unless they are
         withdrawn.
 
@@ -355,8 +355,7 @@ class Worker:
     def _follow(self) -> None:
         """Fetch if a fetch is due, carry out people's changes, and do the work of :class:`OwnWork`.
 
-        That work ends overrides, drains nodes, scales down, and books waiting demands. Of a
-        repository on this disk, the worker reads the tip in every call, because that is cheap.
+        In a repository on this disk, the worker reads the tip in every call, because that is cheap.
         """
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
@@ -373,7 +372,7 @@ class Worker:
             self._own_work.postpone()
 
     def _check_proposals(self) -> None:
-        """Check the proposals, with the newest main, if a check is due."""
+        """Check the proposals against the newest main, if a check is due."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:

@@ -181,7 +181,7 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return the ledger files that this program writes in another format, as path → new text."""
+    """Return the ledger files that change if this program writes them, as path → new text."""
     written = {}
     for path, text in files.items():
         new = text
@@ -230,7 +230,7 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
             known = getattr(repository, repository.gitops)
             text = strict_yaml.set_key(text, gitops, {"url": request.url or known.url})
         elif request.url not in (None, section.url):
-            message = f"is {section.url} already; change it in this file, or leave out --url"
+            message = f"is set to {section.url} already; change it in this file, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", message)])
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None

@@ -158,7 +158,10 @@ def test_a_published_demand_is_found_even_if_the_commit_before_it_is_gone(
     ("point", "reason"),
     [
         ("publishing:2", "unknown-node: apps[0].header.node_id: 'nowhere' is not in inventory/"),
-        ("published:2", "refused: the demand was refused, but the reason was lost; send it again"),
+        (
+            "published:2",
+            "refused: the demand was refused, but the reason was lost; send the demand again",
+        ),
     ],
 )
 def test_a_demand_that_is_refused_around_a_kill_is_refused_in_the_log(

@@ -202,8 +202,8 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
     [
         (
             "echo 'git@edge: Permission denied (publickey).' >&2",
-            "git@edge: Permission denied (publickey); give git credentials for it: a credential "
-            "helper, ~/.netrc or an SSH key",
+            "git@edge: Permission denied (publickey); git needs credentials for this address: a "
+            "credential helper, ~/.netrc or an SSH key",
         ),
         (  # the server ends in the middle of its answer, and git complains of that last
             "printf '000eversion 2\\n'\n"
@@ -214,12 +214,12 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
         (  # the server could not read the reference from its disk, and names a null id
             f"echo 'fatal: git upload-pack: not our ref {'0' * 40}' >&2",
             f"fatal: git upload-pack: not our ref {'0' * 40}; the server cannot read the branch: "
-            "check its disk, and who may read its files",
+            "check the server's disk, and who may read the repository's files",
         ),
         (
             "echo \"fatal: detected dubious ownership in repository at '/srv/state.git'\" >&2",
             "fatal: detected dubious ownership in repository at '/srv/state.git'; check the path "
-            "in the address, and whose files they are",
+            "in the address, and who owns the repository's files",
         ),
     ],
     ids=["credentials", "cut off", "no reference", "owner"],

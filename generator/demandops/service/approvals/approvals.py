@@ -57,7 +57,7 @@ from demandops.staterepo.write.proposal_branch import (
 log = logging.getLogger("demandops")
 
 _LONGEST_CHECK_S = 0.5
-"""After how many seconds a check, which may push many branches, pauses if a demand waits."""
+"""How many seconds a check of all proposals may take before it pauses for a waiting demand."""
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -128,7 +128,7 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw the demands in ``earlier`` that need approval and that ``by`` releases.
+        """If ``by`` releases demands in ``earlier`` that need approval, withdraw these demands.
 
         Args:
             earlier: the demands of the batch that are evaluated already, with their results. For a
@@ -193,7 +193,7 @@ class Approvals:
     # ---- after main was read ----
 
     def is_due(self, tip: str) -> bool:
-        """Return whether to check the proposals now, with main at ``tip``."""
+        """Return whether to check the proposals now; ``tip`` is the newest commit of main."""
         if not self._proposals:
             return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)

@@ -9,14 +9,14 @@ CHECK_LOCAL_S = 1.0
 CHECK_REMOTE_S = 5.0
 """The seconds between two checks of a remote's branches; only a check detects a deleted branch."""
 _PAUSE_FACTOR = 9
-"""After main has moved, the next check waits this many times as long as the last check took.
+"""The pause before a check of a new main, as a multiple of the time that the last check took.
 
-It waits no longer than the interval between two checks.
+The pause is at most the interval between two checks.
 """
 
 
 class CheckTimer:
-    """Decides when the next check is due; after a failed check, only after the interval."""
+    """Decides when the next check is due. A failed check is retried when the interval is over."""
 
     def __init__(self, runtime: Runtime, *, local: bool) -> None:
         self._runtime = runtime
@@ -25,7 +25,7 @@ class CheckTimer:
         self._began = self._rest_until = self._next = 0.0
 
     def is_due(self, tip: str, *, has_news: bool) -> bool:
-        """Return whether to check now, with main at ``tip``.
+        """Return whether to check now; ``tip`` is the newest commit of main.
 
         If ``has_news`` is true, because a proposal has changed, a check is due at once, unless the
         last check failed.

@@ -20,7 +20,7 @@ from demandops.settings import MAIN_BRANCH
 log = logging.getLogger("demandops")
 
 POLL_S = 30.0
-"""The seconds between queries of the forge, which alone knows that a pull request was closed."""
+"""The seconds between queries of the forge: only the forge knows which pull requests are closed."""
 
 _REST_S = 60.0
 """How long to pause after a forge has answered that it got too many requests."""

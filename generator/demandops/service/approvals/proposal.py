@@ -70,9 +70,10 @@ class Proposal:
         return self.record.branch
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Return whether nothing changed since the last check, with main at ``tip``.
+        """Return whether nothing has changed since the last check.
 
-        ``branches`` maps the name of each branch to its newest commit.
+        ``tip`` is the newest commit of main. ``branches`` maps the name of each branch to its
+        newest commit.
         """
         head = branches.get(self.branch)
         all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
@@ -127,12 +128,12 @@ class Proposal:
         return verdict
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
-        """Remove the demands of ``answered`` from the proposal."""
+        """Remove the answered demands from the proposal."""
         gone = [ticket for ticket, _ in answered]
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
     def wait_for(self, left: Decided) -> None:
-        """Keep only the demands of ``left``, which still need approval."""
+        """Remove all demands except those in ``left``, which still need approval."""
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
@@ -163,7 +164,7 @@ def key_of(request: DemandRequest) -> Key:
 
 
 def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
-    """Decide each demand on the state after the previous one; leases start at the approval.
+    """Decide each demand on the state after the previous one, with leases that start at approval.
 
     Returns:
         The accepted demands with their new decisions, and the refused demands with their errors.

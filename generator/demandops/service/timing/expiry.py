@@ -34,7 +34,7 @@ _RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
 class LeaseExpiry:
-    """Decides which leases have ended, and makes a demand to release the claims of each."""
+    """Decides which leases have ended, and makes tickets to release the claims of these leases."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -73,7 +73,7 @@ class LeaseExpiry:
         return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the current time, and the claims whose lease has ended, sorted by their ends.
+        """Return the current time, and the claims whose lease has ended, earliest end first.
 
         A demand's ended claims are released together. If one of them gets more time after a jump of
         the clock, none of them is returned.
@@ -86,9 +86,9 @@ class LeaseExpiry:
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
         """Return the seconds until the next check: at least one, at most ``longest``.
 
-        The minimum lets the worker wait although a lease has ended. The ledger keeps a lease that
-        has ended if the release of its claim failed, or if it gets more time after a jump of the
-        clock.
+        Without the minimum, the worker would never wait while the ledger keeps a lease that has
+        ended. The ledger keeps such a lease if the release of the claim failed, or if the lease
+        gets more time after a jump of the clock.
         """
         first = ledger.first_to_end()
         if first is not self._first:  # a search is slow if many leases end at one time

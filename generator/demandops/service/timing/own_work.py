@@ -37,7 +37,7 @@ class OwnWork:
         self._scale_down.postpone(self._runtime.now())
 
     def is_due(self, state: State) -> bool:
-        """Return whether any such work is due now."""
+        """Return whether any of the generator's own work is due now."""
         now = self._runtime.now()
         return (
             self._override_expiry.is_due(state, now)

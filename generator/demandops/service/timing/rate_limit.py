@@ -41,7 +41,7 @@ class RateLimit:
                     message = (
                         f"'{requester}' sent more than the {most} demands in a minute that "
                         f"quotas.demandsPerMinute of access domain '{domain.name}' allows; send "
-                        "it again later"
+                        "the demand again later"
                     )
                     yield fault("", message, code="quota")
 

@@ -1,7 +1,7 @@
-"""Finds the files that a commit of the generator changed, but may not change.
+"""Finds the files that a commit of the generator changed, but was not allowed to change.
 
-Such a commit may change generated files, reports, and the claims that its message names. Some
-operations may change further files.
+A commit of the generator may change generated files, reports, and the claims that its message
+names. Some operations may change further files.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ _ENDING = ("follow", "upgrade", "expire-override")
 
 
 def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
-    """Yield the files that a commit of the generator changed, but may not change.
+    """Yield the files that a commit of the generator changed, but was not allowed to change.
 
     These are files that people write, claims of demands that the message does not name, claims in
-    another format than the generator's, and records that the operation may not change.
+    another format than the generator's, and records that the operation must not change.
     """
     if not commit.parents:
         return

@@ -49,8 +49,9 @@ class Verdict:
     ``holds`` is true if no fault was found. ``skipped`` is the reason why the commit was not
     verified, or empty. ``fault`` is the error of rendering the commit again, or empty.
     ``differing`` lists the generated files that differ from the rendered ones. ``touched`` lists
-    the files that the commit changed, but may not change. ``signature`` is the reason why a
-    required signature is not valid, or empty. ``signer`` names who signed the commit, or is empty.
+    the files that the commit changed, but was not allowed to change. ``signature`` is the reason
+    why a required signature is not valid, or empty. ``signer`` names who signed the commit, or is
+    empty.
     """
 
     commit: str
@@ -88,8 +89,8 @@ class _Proof:
     def can_advance_to(self, commit: Commit) -> bool:
         """Return whether :meth:`advance` may be called with a later commit.
 
-        The later commit needs a new proof instead if the configuration, the markers of ended
-        overrides or the problem report differ.
+        It must not be called if the later commit has another configuration, other markers of ended
+        overrides or another problem report. Such a commit needs a new proof.
         """
         roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
         return not trees.differ(self._commit.tree, commit.tree, roots)

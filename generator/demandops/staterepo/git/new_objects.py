@@ -1,8 +1,8 @@
 """New objects of a state repo: kept in memory, then written to the disk as one pack.
 
 A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each. The
-pack has every new object that the commits need, even if the repository already has the object as a
-loose object. The loose object may not be on the disk yet, or git may soon prune it.
+pack has every object in memory that the commits need, even if the repository already has the object
+as a loose object. The loose object may not be on the disk yet, or git may soon prune it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from demandops.staterepo.git.pack_file import write_pack
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 _LAST = 0
-"""The priority of this source of objects: the lowest, because most reads need other sources."""
+"""The priority of this source: the lowest, because most objects are read from other sources."""
 
 UNFINISHED = "demandops-pack-"
 """The prefix of the folders in which packs are built."""
@@ -68,7 +68,7 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository. The writer must keep it open, because this object does not."""
+        """The repository. The writer must keep a reference: this object's reference is weak."""
         repo = self._repo()
         assert repo is not None  # noqa: S101 - its writer has a strong reference
         return repo

@@ -49,8 +49,9 @@ def connect(
         address: the folder of a bare repository, or a URL.
         folder: the folder in which the clone of a URL is made.
         notify: called with a text before work that takes a while.
-        allow_offline: use an existing clone if its remote cannot be reached.
-        only_read: the address may also be the folder of a checkout.
+        allow_offline: whether an existing clone may be used if its remote cannot be reached.
+        only_read: whether the caller only reads. If so, the address may also be the folder of a
+            checkout.
 
     Raises:
         StateRepoError: the address is not usable, or the remote cannot be reached.

@@ -62,19 +62,20 @@ _REMEDIES = (
             r"could not read (username|password)|host key verification failed",
             re.IGNORECASE,
         ),
-        "give git credentials for it: a credential helper, ~/.netrc or an SSH key",
+        "git needs credentials for this address: a credential helper, ~/.netrc or an SSH key",
     ),
     (
         re.compile(r"not found|returned error: 404|does not appear to be a git", re.IGNORECASE),
-        "check the path in the address, and whether you may read it",
+        "check the path in the address, and whether you may read the repository",
     ),
     (
         re.compile(r"detected dubious ownership"),
-        "check the path in the address, and whose files they are",
+        "check the path in the address, and who owns the repository's files",
     ),
     (
         re.compile(r"not our ref 0{40}"),
-        "the server cannot read the branch: check its disk, and who may read its files",
+        "the server cannot read the branch: check the server's disk, and who may read the "
+        "repository's files",
     ),
     (
         re.compile(r"refused|timed out|unreachable|couldn't connect", re.IGNORECASE),
@@ -335,7 +336,7 @@ class RemoteRepository(StateRepository):
     def _unreadable(self) -> Unavailable:
         return Unavailable(
             f"{self.address} cannot be fetched or pushed: its clone {self._folder} cannot be read; "
-            "check its owner and its disk, then start again: a damaged clone is made anew"
+            "check the clone's owner and disk, then start again; a damaged clone is made anew"
         )
 
     def _disk_full(self) -> DiskFull:
@@ -431,6 +432,6 @@ def _reason(text: str) -> str:
 
 
 def _without_open_quote(line: str) -> str:
-    """Return a line without the quote that GitPython puts at the end of git's output."""
+    """Return a line without the quotation mark that GitPython puts at the end of git's output."""
     line = line.strip(' "')
     return line.removesuffix("'") if line.count("'") % 2 else line

@@ -77,8 +77,8 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
         return DiskFull(f"{address} cannot be written: its disk has no room ({what}); free some")
     if number in _NOT_ALLOWED:
         return PushDenied(
-            f"{address} cannot be written: {what}; let the generator's user write "
-            "all files and folders there"
+            f"{address} cannot be written: {what}; give the generator's user the "
+            "right to write all files and folders there"
         )
     if number in _BROKEN:
         return Unsound(f"{address} cannot be written: {what}; check its disk, then start again")
@@ -200,7 +200,7 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git join the packs in the background, unless an earlier run of git still does."""
+        """Have git join the packs in the background, unless git is still joining them."""
         if self._tidying is not None and self._tidying.poll() is None:
             return
         self._tidying = subprocess.Popen(

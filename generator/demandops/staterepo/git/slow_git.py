@@ -38,7 +38,7 @@ class SlowGit:
     def ends(self) -> None:
         """Report that git has ended.
 
-        A listener that was called for this run is called with an empty text, to clear its output.
+        If this run called the listener, call it again with an empty text, to clear its output.
         """
         for listener in _listeners if self._told else ():
             listener("")

@@ -37,7 +37,7 @@ def commit_of(repo: Repository, revision: str | Oid) -> Commit:
                 "its clone, then try again"
             ) from None
         raise StateRepoError(
-            f"'{revision}' is not a commit of the state repo; `demandops log` lists them"
+            f"'{revision}' is not a commit of the state repo; `demandops log` lists the commits"
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""Authors: who made the commits by people, and who runs this program.
+"""Authors: which person made a commit or caused a follow commit, and who runs this program.
 
 A follow commit is made by the generator, and renders what people committed. Its trailers name
 people's commits, and its author names these people. A commit is by a person if no generator on any
@@ -84,9 +84,10 @@ def author_of(commit: Commit) -> Person:
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return a trailer ``Caused-By: <commit> <name> <email>`` for each cause, oldest first.
+    """Return trailers ``Caused-By: <commit> <name> <email>`` for the newest of ``causes``.
 
-    ``causes`` are listed newest first. Only the newest :data:`_MOST_NAMED` get a trailer.
+    ``causes`` has the newest commit first; the trailers have the oldest commit first. At most
+    :data:`_MOST_NAMED` commits get a trailer.
     """
     return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
 

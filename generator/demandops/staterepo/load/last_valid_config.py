@@ -38,7 +38,7 @@ Replacements = Mapping[str, Oid | None]
 
 @dataclass(frozen=True, slots=True)
 class ConfigSource:
-    """The source of the configuration in effect: a commit, with some files in another version."""
+    """The commit whose configuration is in effect, except for the files in ``replacements``."""
 
     commit: Oid
     replacements: Replacements = field(default_factory=dict)

@@ -45,7 +45,7 @@ class Problem:
 
 
 Origin = Callable[[str], tuple[str, str] | None]
-"""Maps a path to the commit and the author that last changed the path; None if unknown."""
+"""Path of a file → id and author of the commit that caused the file's fault; None if unknown."""
 
 
 def with_origins(
@@ -54,8 +54,8 @@ def with_origins(
     """Return a problem for each fault.
 
     A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds them.
-    A problem that :func:`write` leaves out of the report has neither, because the report cannot
-    keep them, and each demand would search the history for them again.
+    A problem that :func:`write` leaves out of the report gets neither. The report could not
+    keep them, so the generator would search the history again for each demand.
     """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     found = sorted({(fault.file, fault.field, fault.message) for fault in faults})

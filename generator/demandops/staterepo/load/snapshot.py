@@ -46,7 +46,7 @@ class Snapshot:
     ``problems``: the faults of invalid files; their last valid versions are in effect.
     ``last_valid_commit``: the newest commit without problems.
     ``quarantined_files``: ledger files whose content at this commit is not in effect.
-    ``other_config_source``: where the configuration in effect is from, if not from this commit.
+    ``other_config_source``: the source of the configuration in effect; None means this commit.
     """
 
     commit: Oid
@@ -75,7 +75,7 @@ class Advance:
     """A later snapshot, and the changes since an earlier one.
 
     ``subjects`` are the subjects whose claims changed. ``config_changed`` is true if all releases
-    must be rendered again.
+    must be rendered again, usually because the configuration changed.
     """
 
     snapshot: Snapshot
@@ -134,7 +134,7 @@ def advance(
         repo: the repository.
         before: the earlier snapshot.
         to: the later commit.
-        recorded: where the configuration in effect at ``to`` is from, if this is known.
+        recorded: the source of the configuration in effect at ``to``, if it is known.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
     state, known = before.state, LastValidConfig(None, before.config_source, ())

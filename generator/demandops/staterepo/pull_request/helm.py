@@ -1,4 +1,4 @@
-"""Runs the program ``helm`` on charts, and reads kinds of objects or faults from its output.
+"""Runs ``helm`` on charts, and reads the rendered objects' kinds, or faults, from its output.
 
 Helm gets a home folder of its own, and has no access to a cluster or to chart repositories.
 """

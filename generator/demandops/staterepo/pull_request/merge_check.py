@@ -186,7 +186,7 @@ class _Edit:
 
     @property
     def before(self) -> Mapping[str, str]:
-        """The files before the edit, or the edited files if nothing can be compared."""
+        """The files before the edit, or the edited files if the files before it are not known."""
         return self.start.files if self.start else self.files
 
     @property

@@ -1,4 +1,4 @@
-"""Lints and renders the charts of a checkout with helm, with the values of the planned releases.
+"""Has helm lint the charts of a checkout, and render them with the values of planned releases.
 
 Each chart is also rendered for an example demand of each application. The kinds of the rendered
 objects are compared with those that the access domain allows. If an edit does not change a chart,

@@ -1,8 +1,8 @@
 """The commits of one batch, made on top of a snapshot and published together.
 
 Each demand becomes one commit with the changed ledger and rendered files. :class:`CommitBatch`
-holds the commits until they are published. If the remote has moved, the batch is dropped and its
-demands are evaluated again on the new tip.
+holds the commits until they are published. If another writer publishes first, the batch is
+dropped and its demands are evaluated again on the new tip.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class CommitBatch:
         """Record the outcome of a demand that changed nothing, in the message of the next commit.
 
         The process may die before it answers the demand. After a restart, the generator must not
-        evaluate the demand again, because a later release could change the outcome.
+        evaluate the demand again, because later demands could change the outcome.
         """
         self._settled.append((commit_log.settled_trailer(outcome), operation))
 

@@ -46,9 +46,9 @@ class ProposalRecord:
     """The journal's record of a proposal: what a restarted process needs to continue it.
 
     ``commits`` lists the commits at which the branch may be, newest last. ``base`` is the commit of
-    main on which the newest of them was made. ``pushed`` is true if the branch has ever existed.
-    ``link`` is the address of its merge request. ``withdrawn`` is the reason to delete the branch,
-    or empty.
+    main on which the newest of them was made. ``pushed`` is true if the branch was pushed. If
+    such a branch is missing, somebody has deleted it. ``link`` is the address of the branch's merge
+    request. ``withdrawn`` is the reason why the demand was withdrawn, or empty.
     """
 
     branch: str
@@ -120,9 +120,9 @@ class Journal:
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
-        If ``durably``, the removal is fsynced; a failure raises StateRepoError and keeps the
-        demands. Otherwise the next :meth:`append` makes the removal durable. If the process dies
-        before that, the demands are evaluated again after a restart, which is harmless.
+        If ``durably`` is true, the removal is fsynced; a failure raises StateRepoError and keeps
+        the demands. Otherwise the next :meth:`append` makes the removal durable. If the process
+        dies before that, the demands are evaluated again after a restart, which is harmless.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]
         records = [{"done": operation} for operation in done]

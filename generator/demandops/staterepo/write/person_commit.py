@@ -65,8 +65,8 @@ def commit_to_main(
 
     Args:
         repository: the state repo.
-        make: returns the files to commit. It gets a function that reads the files on main, and is
-            called again if main has moved.
+        make: gets a function that reads the files on main, and returns the files to commit. It is
+            called again if main gets other commits meanwhile.
         author: the person, the time and the message.
 
     Raises:
@@ -109,14 +109,14 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
         base = objects.merge_base(tip.id, head.id)
         if base is None:
             raise StateRepoError(
-                f"{proposal.branch} and {MAIN_BRANCH} have no commit in common; reject it with "
-                "`demandops reject`, and send the demand again"
+                f"{proposal.branch} and {MAIN_BRANCH} have no commit in common; reject the "
+                "proposal with `demandops reject`, and send the demand again"
             )
         start = trees.commit_of(objects, base).tree
         proposed = [path for path, _ in trees.differences(start, head.tree)]
         if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):
             raise StateRepoError(
-                f"{MAIN_BRANCH} has changed files that {proposal.branch} changes too; wait until "
+                f"{MAIN_BRANCH} and {proposal.branch} change the same files; wait until "
                 "a running generator has made the branch anew, then try again"
             )
         read = _reader(head.tree)
@@ -158,7 +158,7 @@ def _commit(
 
 
 def _faults(tree: Tree) -> set[Fault]:
-    """Return the faults of a tree's configuration; a commit must not add faults to main."""
+    """Return the faults of the configuration in a tree."""
     try:
         last_valid_config.config_at(tree)
     except InvalidInput as error:

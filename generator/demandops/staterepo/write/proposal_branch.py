@@ -1,4 +1,4 @@
-"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve.
+"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve the demands.
 
 The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
 branch in the end. It does neither if somebody else has moved the branch. This module knows nothing
@@ -42,8 +42,8 @@ class BranchMoved(StateRepoError):
 def branch_name(name: str, operation: str) -> str:
     """Return the branch name for a demand: a slug of ``name``, and a digest of the operation id.
 
-    Because of the digest, no other accepted goal gets the same branch name. A slug without any
-    character is left out.
+    Because of the digest, no other accepted goal gets the same branch name. The slug is left out
+    if ``name`` has no ASCII letter or digit.
     """
     slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
     digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
@@ -52,7 +52,7 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The commit at the head of main, and those of the proposals' branches by branch name."""
+    """The newest commit of main, and the newest commit of each proposal's branch, by its name."""
 
     main: str
     branches: dict[str, str]

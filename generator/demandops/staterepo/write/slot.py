@@ -90,7 +90,7 @@ class FoundJournal:
 def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:
     """Yield the journals in a data folder that have demands or are damaged.
 
-    If ``set_aside``, each damaged journal is renamed, unless a running process uses it.
+    If ``set_aside`` is true, each damaged journal is renamed, unless a running process uses it.
     """
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:
