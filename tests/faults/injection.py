@@ -92,8 +92,8 @@ The generator cannot see this loss. docs/reliability.md describes it under "Know
 class Site:
     """The n-th call of a kind in a thread or process, and the class of file that it touches.
 
-    ``role`` is the thread or the program. ``which`` is the number of the process among those of its
-    git command, from 1 on; it is 0 for a thread.
+    ``role`` is the thread or the program. If a process of git makes the call, ``which`` is its
+    number among the processes of the same git command, counted from 1. For a thread it is 0.
     """
 
     role: str
@@ -231,10 +231,12 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    With ``short``, return only some of these faults. Only the last call of each class gets faults;
-    of a class of syncs, the first call gets them too if there is no remote. A call that only reads
-    gets EIO without a remote, and no fault with a remote. Any other call gets only
-    those of its faults that ``_SHORT`` lists.
+    With ``short``, return only some of these faults:
+
+    - Only the last call of each class gets faults. Without a remote, the first call of each class
+      of syncs gets faults as well.
+    - A call that only reads gets only EIO. With a remote, it gets no fault.
+    - Any other call gets only those of its faults that ``_SHORT`` lists.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:

@@ -35,10 +35,10 @@ Instance = tuple[str, str]
 
 @dataclass
 class Instances(Places):
-    """The model of places, with instances.
+    """Extends the model of places by separate instances and by kept replicas.
 
-    ``testing`` is the version of the channel ``testing``. ``kept`` has the instances with more
-    replicas than they need, with the time until which each number of replicas is kept.
+    ``testing`` is the version of the channel ``testing``. ``kept`` has an entry for each instance
+    that keeps more replicas than it needs: until when it keeps each number of replicas.
     """
 
     testing: str = NEXT
@@ -92,7 +92,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep the replicas that were needed ``before`` and no longer are, for ``KEPT_FOR``."""
+        """Keep the replicas that were needed only ``before``, from ``now`` on for ``KEPT_FOR``."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))

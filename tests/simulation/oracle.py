@@ -238,10 +238,10 @@ class Oracle:
         assert moved or gone or let_in, "a generator acted without a reason"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
-        """Return the operations of a commit and of all commits that it merges.
+        """Return the ids of the operations of a commit and of all commits that it merges.
 
-        The second value of each pair is true if a proposal contained the operation. The lease of a
-        proposed demand starts at the merge.
+        Each id comes with a flag, which is true if a proposal contained the operation. The flag
+        matters because the lease of a proposed demand starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:
