@@ -51,9 +51,10 @@ _MISSED = "not reached"
 _TRIES = 8
 """How often to count again and to repeat a fault that missed its call, because counts vary."""
 _TRIES_ON_JOURNAL = 40
-"""How often to repeat a fault that missed a call on the journal, in one thread and the other.
+"""How often to repeat a fault that missed a call on the journal, in the two threads by turns.
 
-Either thread may journal a demand. Only calls on the journal are counted then (:func:`_counted`).
+Either thread may journal a demand. For these faults, strace counts only calls on the journal
+(:func:`_counted`).
 """
 _OTHER_THREAD = {
     "demandops-journal": "demandops-writer",

@@ -164,7 +164,7 @@ class Books:
         if not joining:
             return
         if connection.get("type", 0) != MQTT:
-            yield "the inventory lets nothing but MQTT be carried"  # the inventory has no bridges
+            yield "the inventory allows only MQTT connections"  # the inventory has no bridges
         if not sources:
             yield "a connection without topics"
         ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")

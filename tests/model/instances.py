@@ -16,7 +16,8 @@ from tests.model.leases import Goal
 from tests.model.places import Outcome, Places
 
 TALLY = "tally"
-"""The type of the applications with separate instances; a topic needs a replica, up to ``MOST``."""
+"""The type of the applications with separate instances; they need a replica per topic, but no
+more than ``MOST``."""
 DEFAULT, NEXT = "1.0.0", "1.1.0"
 HALL, FIRST, FURTHER = "hall", "hall@perception", "hall@city"
 """A node in two access domains, its name in the first one, and its name in the further one."""
