@@ -121,7 +121,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return, for each number of replicas above ``least``, until when at least so many are kept."""
+    """Return until when at least so many replicas are kept, for each number above ``least``."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)

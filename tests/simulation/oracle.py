@@ -37,9 +37,10 @@ VISITOR = "visitor"
 
 @dataclass(eq=False)
 class Asked:
-    """A demand that was sent to a machine, with its ``time``.
+    """A demand that was sent to a machine.
 
-    ``place`` is the number of commits on main before the demand.
+    ``time`` is when it was sent: by the monotonic clock for a demand in our own format, by the wall
+    clock for a goal of the reference. ``place`` is the number of commits on main before the demand.
     """
 
     goal: Goal
