@@ -133,7 +133,7 @@ def savings(outcome: Outcome) -> list[Saving]:
 
 
 def _payload(outcome: Outcome) -> dict[str, int]:
-    """Return how many bytes of each topic were carried to the edge, by the topic's source name."""
+    """Return how many bytes of each topic were carried to the edge, by its name at the source."""
     found: defaultdict[str, int] = defaultdict(int)
     for topic, size in outcome.carried.items():
         if not topic.startswith(("mqtt_client/", "$SYS/")):

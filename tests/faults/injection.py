@@ -51,7 +51,7 @@ _MISSED = "not reached"
 _TRIES = 8
 """How often to count again and to repeat a fault that missed its call, because counts vary."""
 _TRIES_ON_JOURNAL = 40
-"""How often to repeat a fault that missed a call on the journal, in the two threads by turns.
+"""How often to repeat a fault that missed a call on the journal, in the two threads in turn.
 
 Either thread may journal a demand. For these faults, strace counts only calls on the journal
 (:func:`_counted`).

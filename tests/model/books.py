@@ -178,7 +178,8 @@ class Books:
         """Return the broker of an item, or an empty text if the item names none.
 
         A broker is named by its node. If the inventory has only one broker, the item gets that
-        one. Otherwise it gets the first broker on: the node that it names, its target, its source.
+        one. Otherwise the item gets the first broker that is found on the named node, on the
+        target or on the source.
         """
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))

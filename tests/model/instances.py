@@ -121,7 +121,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return until when at least so many replicas are kept, for each number above ``least``."""
+    """Map each number above ``least`` to the time until which at least as many replicas stay."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)

@@ -320,5 +320,5 @@ class World:
             self.last_jump = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
-        """Return a wall-clock time as a number of seconds; only differences have a meaning."""
+        """Return a wall-clock time as a number of seconds; only differences of results count."""
         return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)
