@@ -59,7 +59,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three workers for two processors, because tests often wait for other processes."""
+    """Return three workers for every two processors, because tests often wait for processes."""
     return (os.cpu_count() or 1) * 3 // 2
 
 

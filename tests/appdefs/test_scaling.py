@@ -1,4 +1,4 @@
-"""The number of replicas follows the demands, a size or an autoscaler, as docs/appdef.md says."""
+"""Demands, a parameter or an autoscaler decide the number of replicas, as docs/appdef.md says."""
 
 from __future__ import annotations
 

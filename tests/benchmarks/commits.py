@@ -68,7 +68,7 @@ class Floor:
 def measure(
     folder: Path, releases: int, edges_per_cluster: int, progress: Progress
 ) -> dict[str, float]:
-    """Return the figures for one size, in milliseconds."""
+    """Return the figures for a fleet of about ``releases`` releases; times are in milliseconds."""
     task = progress.add_task(f"{releases} releases: laying down the fleet", total=None)
     laid = fleet.lay_down(folder / "state-repo.git", releases, edges_per_cluster)
     progress.update(task, description=f"{releases} releases: reading the ledger")

@@ -111,9 +111,10 @@ def lay_down(
 
 
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
-    """Make a bare state repo in which ``vehicles`` hold one application; return its path.
+    """Make a bare state repo with one application that many vehicles hold; return its path.
 
-    The inventory has ``further`` more vehicles, which demand nothing yet.
+    ``vehicles`` is the number of these vehicles. The inventory has ``further`` more vehicles, which
+    demand nothing yet.
     """
     _lay_down(path, 1, 1, vehicles, further)
     return path

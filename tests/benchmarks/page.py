@@ -47,7 +47,7 @@ Row = dict[str, float]
 
 
 def _on_server(url: str) -> tuple[float, int]:
-    """Return the server's seconds for a view that it has served before, and the view's bytes."""
+    """Return how many seconds the server takes to serve a view again, and the view's bytes."""
     for _ in range(2):
         start = time.perf_counter()
         with urllib.request.urlopen(url) as answer:  # noqa: S310 - the page on this machine

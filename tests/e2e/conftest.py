@@ -18,7 +18,7 @@ pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.ste
 
 @pytest.fixture(autouse=True)
 def limited() -> None:
-    """Set no limit on a test, because each wait in these tests has a limit of its own."""
+    """Switch the tests' time limit off, because each wait in these tests has its own time-out."""
 
 
 @pytest.fixture(scope="session")

@@ -37,7 +37,8 @@ def checks(outcome: Outcome) -> list[Check]:
         Check("after each demand the requesters of every service and connection are right",
               "; ".join(_requesters(outcome))),
         *_as_in_the_paper(outcome),
-        Check("the fusion subscribed to exactly these topics after each demand, without a restart",
+        Check("the fusion subscribed to exactly the right topics after each demand, "
+              "without a restart",
               "; ".join(_inputs(outcome))),
         Check("every vehicle's data arrived on the edge while it was near, and only then",
               "; ".join(_arrivals(outcome))),

@@ -95,7 +95,7 @@ class Experiment:
             self._stack.callback(observer.close)
 
     def _deploy_initially(self) -> None:
-        """Deploy connections for the vehicles' poses to the cloud; start the detector there."""
+        """Let connections carry the vehicles' poses to the cloud, and start the detector there."""
         record = self._folder / "poses.jsonl"
         plan = Plan(
             self._routes,

@@ -84,7 +84,7 @@ def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | 
 
 @dataclass(frozen=True)
 class Saving:
-    """The mean of a quantity during the drive, with services on demand and always on."""
+    """The mean of a quantity during the drive, for services on demand and services always on."""
 
     name: str
     unit: str
@@ -98,7 +98,7 @@ class Saving:
 
 
 def savings(outcome: Outcome) -> list[Saving]:
-    """Return what the drive took on demand, and what it would take if services were always on.
+    """Return what the services took during the drive, and what they would take if always on.
 
     "Always on" means: each service that ran at all runs during the whole drive, and each topic that
     was carried to the edge is carried with all its messages.
@@ -133,7 +133,7 @@ def savings(outcome: Outcome) -> list[Saving]:
 
 
 def _payload(outcome: Outcome) -> dict[str, int]:
-    """Return the bytes that were carried to the edge, by the ROS topic at the source."""
+    """Return how many bytes of each topic were carried to the edge, by its name at the source."""
     found: defaultdict[str, int] = defaultdict(int)
     for topic, size in outcome.carried.items():
         if not topic.startswith(("mqtt_client/", "$SYS/")):

@@ -52,9 +52,9 @@ class Plan:
     """What the program plays.
 
     `routes` has each vehicle's way, `origin` the position of the intersection on the map, and
-    `domains` the ROS domain of each node. The program writes all poses that it sends to the file
-    `record`. `station_cloud` is the topic of the station's point cloud. With `poses_only`, one ROS
-    node in the cloud's domain sends all poses, and nothing else is sent.
+    `domains` the ROS domain of each node. The program records all poses that it sends; `record` is
+    the file for them. `station_cloud` is the topic of the station's point cloud. With `poses_only`,
+    one ROS node in the cloud's domain sends all poses, and nothing else is sent.
     """
 
     routes: tuple[Route | Track, ...]

@@ -114,7 +114,7 @@ def _line(x1: float, y1: float, x2: float, y2: float, color: str = "#ccc") -> st
 
 
 def _map(outcome: Outcome) -> str:
-    """Return an SVG of the poses that the vehicles sent and the rules' distances."""
+    """Return an SVG map of the poses that were sent, with circles at the distances of the rules."""
     middles = [near.point for near in outcome.crossings or (outcome.near,)]
     west, north = min(x for x, _ in middles) - 1.1 * FAR_M, max(y for _, y in middles) + 1.1 * FAR_M
     wide = max(x for x, _ in middles) + 1.1 * FAR_M - west

@@ -86,8 +86,8 @@ def predicted(ways: Iterable[Way], near: Near, until: float) -> list[Pose]:
 def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
     """Return the times of the poses that cause events, in order.
 
-    The pose at the time of an event causes it. If a vehicle leaves because it is silent, its last
-    pose is the cause.
+    The cause of an event is the vehicle's pose at the time of the event. If a vehicle leaves
+    because it is silent, the cause is its last pose.
     """
     poses = list(poses)
     sent = {(pose.at, pose.vehicle) for pose in poses}

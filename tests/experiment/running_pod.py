@@ -59,7 +59,7 @@ def program_of(image: str) -> str:
 
 
 def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
-    """Replace each path below a mount in a text by a path of this machine."""
+    """Return a text in which a path of this machine replaces each path below a mount."""
     if not mounts:
         return text
     longest_first = sorted(mounts, key=len, reverse=True)

@@ -45,7 +45,7 @@ _FOLDER, _SHORT = Path(), True
 
 @dataclass(frozen=True)
 class _Task:
-    """A part of the work; ``what`` has the arguments of the function that does it."""
+    """A part of the work; ``what`` has the arguments of the function that does this part."""
 
     part: str
     remote: bool
@@ -84,7 +84,7 @@ def main() -> int:
 
 
 def _prepare(folder: Path) -> None:
-    """Import all modules, and compile templates and schemas, so that no forked process must."""
+    """Import all modules, and compile templates and schemas, so that forked processes need not."""
     for module in walk_packages(demandops.__path__, "demandops."):
         import_module(module.name)
     rig = Rig(folder / "first", remote=False)

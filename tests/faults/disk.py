@@ -1,4 +1,4 @@
-"""Two kinds of faults: a full disk for the state repo or the journal's folder; a damaged file."""
+"""Two kinds of faults: the disk of the state repo or of the journal is full; a file is damaged."""
 
 from __future__ import annotations
 

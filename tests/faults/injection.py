@@ -51,9 +51,10 @@ _MISSED = "not reached"
 _TRIES = 8
 """How often to count again and to repeat a fault that missed its call, because counts vary."""
 _TRIES_ON_JOURNAL = 40
-"""How often to repeat a fault that missed a call on the journal, in one thread and the other.
+"""How often to repeat a fault that missed a call on the journal, in the two threads in turn.
 
-Either thread may journal a demand. Only calls on the journal are counted then (:func:`_counted`).
+Either thread may journal a demand. For these faults, strace counts only calls on the journal
+(:func:`_counted`).
 """
 _OTHER_THREAD = {
     "demandops-journal": "demandops-writer",
@@ -92,8 +93,8 @@ The generator cannot see this loss. docs/reliability.md describes it under "Know
 class Site:
     """The n-th call of a kind in a thread or process, and the class of file that it touches.
 
-    ``role`` is the thread or the program. ``which`` is the number of the process among those of its
-    git command, from 1 on; it is 0 for a thread.
+    ``role`` is the thread or the program. If a process of git makes the call, ``which`` is its
+    number among the processes of the same git command, counted from 1. For a thread it is 0.
     """
 
     role: str
@@ -231,10 +232,12 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    With ``short``, return only some of these faults. Only the last call of each class gets faults;
-    of a class of syncs, the first call gets them too if there is no remote. A call that only reads
-    gets EIO without a remote, and no fault with a remote. Any other call gets only
-    those of its faults that ``_SHORT`` lists.
+    With ``short``, return only some of these faults:
+
+    - Only the last call of each class gets faults. Without a remote, the first call of each class
+      of syncs gets faults as well.
+    - A call that only reads gets only EIO. With a remote, it gets no fault.
+    - Any other call gets only those of its faults that ``_SHORT`` lists.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:

@@ -19,7 +19,7 @@ _TELL_EVERY_S = 30.0
 
 
 class Tried:
-    """The tasks of an interrupted run that broke no promise, in a file with a line for each task.
+    """The tasks that broke no promise in an interrupted run; a file has a line for each of them.
 
     ``sound`` has the results of these tasks, by the task's text. The first line of the file has a
     digest of the program that was tried. If the program has changed since, the file's tasks do not

@@ -167,7 +167,7 @@ class Rig:
         self.save()
 
     def _wrap_git(self) -> None:
-        """Replace git's programs by a script that can trace them, also where git starts them."""
+        """Replace git's programs, even those that git starts, by a script that can trace them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
         wrapper.write_text(_GIT)
         wrapper.chmod(0o755)
@@ -198,8 +198,9 @@ class Rig:
     def save(self) -> None:
         """Copy all files, for :meth:`restore`.
 
-        Set their times one second apart, in the order of their names. Git opens the newest pack
-        first, so packs of one age would be opened in another order in another rig.
+        Set the times of the copies one second apart, in the order of the files' names. Git opens
+        the newest pack first, so packs of the same age could be opened in a different order in
+        each rig.
         """
         shutil.rmtree(self._template, ignore_errors=True)
         shutil.copytree(self.folder, self._template, symlinks=True)
@@ -216,7 +217,7 @@ class Rig:
         self._runs = self._runs_of_template
 
     def fingerprint(self) -> str:
-        """Return a digest of all that the next process can find: the files and its clock."""
+        """Return a digest of what the next process will find: the files and the clock's time."""
         told = sha256(str(self._runs).encode())
         for path in sorted(self.folder.rglob("*")):
             told.update(f"\0{_CHANCE.sub('*', str(path))}\0{path.lstat().st_mode}\0".encode())

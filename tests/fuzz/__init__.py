@@ -1,9 +1,9 @@
 """Fuzzing: the program accepts any input from outside, or refuses it with an expected exception.
 
-``make fuzz`` gives each target ``FUZZ_S`` seconds. Atheris drives the targets of bytes: it searches
-for inputs that reach new lines of our code. Hypothesis drives the targets of values. An input is a
-finding if it causes any other exception, takes over a second of processor time, or needs too much
-memory. Its bytes and the traceback are in ``build/fuzz/<target>/``.
+``make fuzz`` gives each target ``FUZZ_S`` seconds. Atheris drives the targets that take bytes: it
+searches for inputs that reach new lines of our code. Hypothesis drives the targets that take other
+values. An input is a finding if it causes an unexpected exception, takes over a second of processor
+time, or needs too much memory. The input and the traceback are in ``build/fuzz/<target>/``.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 class Target:
     """A check of any input; an exception that is not ``expected`` makes the input a finding.
 
-    A target of bytes has ``seeds``, which are sample inputs. A target of values has ``values``
-    instead.
+    A target that takes bytes has ``seeds``, which are sample inputs. Any other target has
+    ``values`` instead, a strategy that generates its inputs.
     """
 
     check: Callable[[Any], object]
@@ -31,5 +31,5 @@ class Target:
 
     @property
     def name(self) -> str:
-        """The name of the target; it is the name of its check."""
+        """The name of the target: the name of its check function, with ``-`` in place of ``_``."""
         return self.check.__name__.strip("_").replace("_", "-")

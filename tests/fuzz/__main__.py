@@ -197,7 +197,7 @@ def run(one: Run) -> list[str]:
 
 
 def main(names: list[str]) -> int:
-    """Run the named targets, as many at once as processors; return 1 after a finding, else 0."""
+    """Run the named targets, one per processor at a time; return 1 after a finding, else 0."""
     ours = ["demandops", "demandops_ros"]
     instrumented = atheris.instrument_imports(include=ours) if atheris else nullcontext()
     with instrumented, redirect_stderr(StringIO()):  # atheris prints each module's name

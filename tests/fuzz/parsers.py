@@ -149,7 +149,10 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
 
 
 def file_of_the_reference(data: bytes) -> None:
-    """Check that a readable file of the reference leads to a map, and that the map gives goals."""
+    """Check that a file of the reference, if it can be read, can also be imported.
+
+    The import proposes a map for the file; with this map, it must form goals.
+    """
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)
     joins, _ = imported_goals.remaining_joins(files)

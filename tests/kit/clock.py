@@ -13,8 +13,8 @@ _LONGEST_WAIT_S = 0.05
 class Clock(Runtime):
     """A runtime whose clocks a test moves.
 
-    With a ``start``, only the test moves the clocks, and ``uniform`` always returns ``high``.
-    Without a ``start``, real time passes as well.
+    With a ``start``, only the test moves the clocks, and ``uniform`` always returns its upper
+    bound. Without a ``start``, real time passes as well.
     """
 
     def __init__(self, start: datetime | None = None) -> None:
@@ -32,7 +32,7 @@ class Clock(Runtime):
         return high if self._start else super().uniform(low, high)
 
     def condition(self) -> threading.Condition:
-        """Return a condition whose waits soon end, so that its users notice a moved clock."""
+        """Return a condition variable whose waits end early, so that users notice a moved clock."""
         return _Impatient()
 
     @property
@@ -45,7 +45,7 @@ class Clock(Runtime):
         self._passed += seconds
 
     def set_by(self, seconds: float) -> None:
-        """Set the wall clock and not the monotonic clock, as a person does."""
+        """Set the wall clock forward or back; the monotonic clock stays as it is."""
         self._set += seconds
 
 

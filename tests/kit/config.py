@@ -33,7 +33,7 @@ def edited(path: str, old: str, new: str) -> dict[str, str]:
 
 
 def brokers(*nodes: str) -> dict[str, str]:
-    """Return the path and the text of an ``inventory/brokers.yaml`` with a broker on each node."""
+    """Return path and text of an ``inventory/brokers.yaml`` with a broker on each given node."""
     entries = [{"node": node, "host": f"broker-{node}"} for node in nodes]
     head = {"apiVersion": "demandops/v1", "kind": "Brokers"}
     return {"inventory/brokers.yaml": yaml.safe_dump(head | {"brokers": entries})}

@@ -50,10 +50,10 @@ class Dialogue:
     def end(self) -> int:
         """Read until the command ends; return its exit code.
 
-        After some seconds of silence, this types the last text again, as people do, because Python
-        can miss a signal that arrives just before it begins to read. If the command has printed
-        something since the text was typed, this does not type it again, because a second Ctrl-C
-        would kill the command while it ends.
+        If the command prints nothing for some seconds, type the last text again, as people do:
+        Python can miss the signal of a Ctrl-C that arrives just before Python begins to read. If
+        the command has printed something since the text was typed, do not type the text again,
+        because a second Ctrl-C would kill the command while it ends.
         """
         end = time.monotonic() + PATIENCE_S
         while self._read(_SILENCE_S) or self._runs_silently():

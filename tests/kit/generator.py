@@ -42,7 +42,7 @@ def book(generator: Generator, *goals: Goal) -> list[Receipt]:
 
 
 class Gate:
-    """A listener that stops the worker at a stage of a demand until a test sets ``open``."""
+    """A listener that blocks the worker at a stage of a demand until a test sets ``open``."""
 
     def __init__(self, stage: str = "admitted") -> None:
         self._stage = stage

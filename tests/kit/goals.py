@@ -104,9 +104,9 @@ def numbered(
 ) -> Goal:
     """Return demand ``number``.
 
-    Its requester ``user<number>`` belongs to this demand alone. Its other requester belongs to all
-    demands; with ``alone``, it has none. It shares its application and its connection with other
-    demands.
+    Its requester ``user<number>`` requests no other demand. ``station00`` is a requester of every
+    demand, but ``alone`` leaves it out. Some other numbers give the same application, and some the
+    same connection.
     """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
     who = [f"user{number}", *([] if alone else ["station00"])]

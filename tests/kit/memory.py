@@ -81,7 +81,7 @@ class MemoryRepo:
         return decision
 
     def scale_down(self, now: datetime) -> list[str]:
-        """Remove replicas whose time to be kept ends at ``now``, as the generator does.
+        """Remove replicas that need not be kept any more at ``now``, as the generator does.
 
         Return the names of the changed releases.
         """
@@ -176,7 +176,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_booked(path: str) -> bool:
-    """Return whether the file is a claim, shutdowns, kept replicas or a waiting demand."""
+    """Return whether a file contains a claim, shutdowns, kept replicas or a waiting demand."""
     roots = (
         recent_shutdowns.SHUTDOWNS_ROOT,
         kept_replicas.REPLICAS_ROOT,
@@ -186,7 +186,7 @@ def is_booked(path: str) -> bool:
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
-    """Return the ledger that ``files`` describe; files of other folders are ignored."""
+    """Return the ledger in ``files``; files that do not belong to a ledger are ignored."""
     booked = {path: text for path, text in files.items() if is_booked(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)

@@ -89,7 +89,7 @@ class Story:
     def settle(self, *, mended: bool = False) -> None:
         """Make the API server report that the cluster has applied the newest commit.
 
-        It reports the release ``FAILING`` as failed unless ``mended`` is true.
+        The server reports the release ``FAILING`` as failed unless ``mended`` is true.
         """
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")

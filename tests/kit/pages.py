@@ -111,7 +111,7 @@ def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
 def _ran(
     command: str, state: Path, environment: Mapping[str, str]
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command; it starts with the folder and the exports that the previous one left."""
+    """Run a command; it starts with the folder and the exports that the previous command left."""
     script = (
         f"set -e\n. {state}\n"
         f'trap \'{{ printf "cd %q\\n" "$PWD"; export -p; }} >{state}\' EXIT\n{command}\n'

@@ -18,7 +18,7 @@ LEASES = (None, 10, 60, 90)
 
 
 class Maker:
-    """Makes random requests; they often overlap because they name few demands and subjects."""
+    """Makes random requests about few demands and subjects, so that requests often overlap."""
 
     def __init__(self, random: Random) -> None:
         self._random = random

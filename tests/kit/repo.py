@@ -76,7 +76,10 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
 def write_tree(
     repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.Oid:
-    """Write ``base`` with ``files`` changed, by the program's code; return the new tree's id."""
+    """Write a copy of the tree ``base`` in which ``files`` are changed; return the new tree's id.
+
+    The copy is written with the program's own code.
+    """
     objects = NewObjects(repo)
     tree = trees.write(objects, base, files)
     with objects.packed(tree):
@@ -90,7 +93,7 @@ def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:
 
 
 class GitRepo:
-    """A bare state repo of a test; pygit2 reads it, not the program."""
+    """A bare state repo of a test; its content is read with pygit2, not with the program's code."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -108,7 +111,7 @@ class GitRepo:
         return [commit.message for commit in repo.walk(self.tip)]
 
     def files(self, under: str = "", revision: str = "main") -> dict[str, str]:
-        """Return the text of each file at a revision whose path starts with ``under``, by path."""
+        """Return the texts, by path, of a revision's files whose paths start with ``under``."""
         repo, index = _index(self.path, revision)
         return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
 

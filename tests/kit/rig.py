@@ -1,4 +1,4 @@
-"""All that tests of generators on real state repos import, gathered in one module."""
+"""Everything that tests of generators on real state repos need, gathered in one module."""
 # ruff: noqa: F401
 
 from tests.kit.generator import (

@@ -110,7 +110,7 @@ class _Event:
 
 
 class _Condition:
-    """A condition that needs no lock: a thread keeps its turn until it waits."""
+    """A condition variable that needs no lock, because a thread keeps its turn until it waits."""
 
     def __init__(self, turns: Turns) -> None:
         self._turns, self._changes = turns, 0

@@ -1,8 +1,8 @@
 """A pytest plugin that keeps the tests of the core from importing Git.
 
 Load it with ``-p tests.kit.without_git``. The scenarios use the timers of ``demandops.service``,
-which need no Git. The plugin replaces that package by an empty one with the same modules, because
-the package itself imports Git.
+which need no Git, but the ``__init__`` of that package imports Git. So the plugin replaces the
+package by one with an empty ``__init__``; its modules can still be imported.
 """
 
 from __future__ import annotations

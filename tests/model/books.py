@@ -1,7 +1,7 @@
 """A second bookkeeping, written only from docs/demand.md and decision 23.
 
-It uses plain dicts and sets over goals as they come in YAML. It imports nothing of the program and
-shares no idea with it, so a mistake stays unnoticed only if both make it. Where the design leaves
+It takes goals as the plain dicts that YAML gives. It imports nothing of the program and shares no
+idea with the program, so a mistake stays unnoticed only if both make it. Where the design leaves
 something open, a comment says what this model does.
 """
 
@@ -164,7 +164,7 @@ class Books:
         if not joining:
             return
         if connection.get("type", 0) != MQTT:
-            yield "the inventory lets nothing but MQTT be carried"  # the inventory has no bridges
+            yield "the inventory allows only MQTT connections"  # the inventory has no bridges
         if not sources:
             yield "a connection without topics"
         ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")
@@ -177,8 +177,9 @@ class Books:
     def _broker(self, item: Item) -> str:
         """Return the broker of an item, or an empty text if the item names none.
 
-        With one broker in the inventory, it is that broker. Otherwise it is the first of the named
-        node, the target and the source that has a broker.
+        A broker is named by its node. If the inventory has only one broker, the item gets that
+        one. Otherwise the item gets the first broker that is found on the named node, on the
+        target or on the source.
         """
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))

@@ -1,7 +1,8 @@
 """Random requests in the form of the reference's action.
 
-The same maker serves Hypothesis, which can shrink its ``randoms()``, and plain seeds. It uses few
-subjects, requesters and topics, so that requests often concern the same ones.
+A maker draws its random numbers from Hypothesis's ``randoms()``, with which Hypothesis can shrink a
+failed example, or from a plain seed. It uses few subjects, requesters and topics, so that requests
+often concern the same ones.
 """
 
 from __future__ import annotations
@@ -261,7 +262,10 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Give the items fewer requesters, other requesters, or their own and others."""
+        """Change the requesters of the items.
+
+        Keep only the first one, take others instead, or add others.
+        """
         people = self._people()
         for kind in ("apps", "connections"):
             named = [one for item in made[kind] for one in requesters(item)]

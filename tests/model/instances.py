@@ -16,7 +16,8 @@ from tests.model.leases import Goal
 from tests.model.places import Outcome, Places
 
 TALLY = "tally"
-"""The type of the applications with separate instances; a topic needs a replica, up to ``MOST``."""
+"""The type of the applications with separate instances; they need a replica per topic, but no
+more than ``MOST``."""
 DEFAULT, NEXT = "1.0.0", "1.1.0"
 HALL, FIRST, FURTHER = "hall", "hall@perception", "hall@city"
 """A node in two access domains, its name in the first one, and its name in the further one."""
@@ -35,10 +36,10 @@ Instance = tuple[str, str]
 
 @dataclass
 class Instances(Places):
-    """The model of places, with instances.
+    """Extends the model of places by separate instances and by kept replicas.
 
-    ``testing`` is the version of the channel ``testing``. ``kept`` has the instances with more
-    replicas than they need, with the time until which each number of replicas is kept.
+    ``testing`` is the version of the channel ``testing``. ``kept`` has an entry for each instance
+    that keeps more replicas than it needs: until when it keeps each number of replicas.
     """
 
     testing: str = NEXT
@@ -92,7 +93,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep the replicas that were needed ``before`` and no longer are, for ``KEPT_FOR``."""
+        """Keep the replicas that were needed only ``before``, from ``now`` on for ``KEPT_FOR``."""
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -120,7 +121,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Return, for each number of replicas above ``least``, until when at least so many are kept."""
+    """Map each number above ``least`` to the time until which at least as many replicas stay."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)

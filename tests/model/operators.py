@@ -1,4 +1,4 @@
-"""A model of the bookkeeping of the reference's operators, over goals as they come in YAML.
+"""A model of the bookkeeping of the reference's operators; it takes goals as YAML gives them.
 
 It is written from `tests/fixtures/reference-run.yaml`, which records what the operators do, and
 imports nothing of the program. The operators count the requesters of each topic of a fusion. They

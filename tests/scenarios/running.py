@@ -243,7 +243,7 @@ class World(MemoryRepo):
         return [one.demand for one in in_turn(self.state.ledger.waiting)]
 
     def runs(self) -> dict[str, list[str]]:
-        """Return the requesters by service, named like `driver for vehicle00 /points on edge`."""
+        """Return requesters by service; a key is like `driver for vehicle00 /points on edge`."""
         return {
             f"{entry['service']} for {_purpose(entry)} on {entry['node']}": entry["requesters"]
             for entry in self.books()["services"].values()

@@ -37,9 +37,10 @@ VISITOR = "visitor"
 
 @dataclass(eq=False)
 class Asked:
-    """A demand that was sent to a machine, with its ``time``.
+    """A demand that was sent to a machine.
 
-    ``place`` is the number of commits on main before the demand.
+    ``time`` is when it was sent: by the monotonic clock for a demand in our own format, by the wall
+    clock for a goal of the reference. ``place`` is the number of commits on main before the demand.
     """
 
     goal: Goal
@@ -238,10 +239,10 @@ class Oracle:
         assert moved or gone or let_in, "a generator acted without a reason"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
-        """Return the operations of a commit and of all commits that it merges.
+        """Return the ids of the operations of a commit and of all commits that it merges.
 
-        The second value of each pair is true if a proposal contained the operation. The lease of a
-        proposed demand starts at the merge.
+        Each id comes with a flag, which is true if a proposal contained the operation. The flag
+        matters because the lease of a proposed demand starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:

@@ -134,7 +134,7 @@ class Disk:
         self._machine.may_crash()
 
     def sync_all(self, folder: Path) -> None:
-        """Record that the journal and the names in a folder are durable."""
+        """Record that a folder's journal, and the names of the files in the folder, are durable."""
         for path in (*folder.glob(_JOURNAL), folder):
             self.sync(path)
 
@@ -160,7 +160,7 @@ class Disk:
 
 
 class Clone(RemoteRepository):
-    """A clone whose git commands are simulated, on a network that fails."""
+    """A clone whose git commands are simulated, on a network that may fail."""
 
     def __init__(self, machine: Machine, folder: Path, allow_offline: bool) -> None:
         self._machine = machine
@@ -320,5 +320,5 @@ class World:
             self.last_jump = self.turns.monotonic()
 
     def time_of(self, moment: datetime) -> float:
-        """Return a time of the wall clock in seconds, to compare it with other such results."""
+        """Return a wall-clock time as a number of seconds; only differences of results count."""
         return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)

@@ -32,7 +32,7 @@ def make_world(
 ) -> Iterator[MakeWorld]:
     """Return a function that creates a state repo, which no cluster follows yet.
 
-    The end of the module removes all these state repos.
+    The fixture removes these state repos after the module's last test.
     """
     folder = tmp_path_factory.mktemp
     with worlds(lambda: World(rig, folder("world"), ros_domain, client)) as make:

@@ -50,7 +50,7 @@ def neighbour(rig: Rig) -> Iterator[None]:
 def slip_in(world: World) -> Iterator[SlipIn]:
     """Return a function that commits a manifest to the domain's folder.
 
-    The end of the test removes the manifest.
+    The fixture removes the manifest after the test.
     """
 
     def push(manifest: Manifest) -> None:

@@ -77,7 +77,10 @@ def from_flux(domain: flux_view.Domain) -> None:
 
 
 def upgrade(world: FluxWorld, gitops: str) -> str:
-    """Render the state repo for a controller while the generator runs; return the only commit."""
+    """Render the state repo for a controller while the generator runs; return the commit.
+
+    Fail unless this makes exactly one commit.
+    """
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
     output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)

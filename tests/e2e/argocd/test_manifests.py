@@ -1,4 +1,4 @@
-"""The API server accepts all golden manifests in a dry run with Argo CD's own definitions."""
+"""The API server, with Argo CD's own CRDs, accepts all golden manifests in a dry run."""
 
 from tests.e2e.common.steps import (
     test_the_dry_run_refuses_an_unknown_field,

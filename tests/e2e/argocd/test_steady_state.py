@@ -1,4 +1,4 @@
-"""Another requester or a manual change in the cluster leaves releases as they were."""
+"""Another requester changes no release, and the controller undoes manual changes in the cluster."""
 
 from tests.e2e.common.steps import (
     test_another_requester_changes_no_object_of_a_release,

@@ -1,4 +1,4 @@
-"""All services run on when the state repo moves to Flux while the cluster still runs Argo CD."""
+"""The state repo moves to Flux while the cluster still runs Argo CD: all services keep running."""
 
 from tests.e2e.common.steps import test_a_controller_that_was_not_retired_fails_and_changes_no_pod
 

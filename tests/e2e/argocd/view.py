@@ -25,7 +25,7 @@ class Domain(Namespace):
     # --- reading ----------------------------------------------------------------------------
 
     def fetched(self) -> str:
-        """Return the commit that Argo CD compared the folder with last; empty if none."""
+        """Return the commit with which Argo CD last compared the folder; empty if none."""
         return str(self._sync().get("revision", ""))
 
     def applied(self) -> str:

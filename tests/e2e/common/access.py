@@ -17,7 +17,7 @@ _STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
 
 
 def access_file(folder: Path, cluster: str, **connection: object) -> Path:
-    """Write a clusters file with an operator's access to one cluster; return its path."""
+    """Write the file for ``--clusters`` with access to one cluster; return the file's path."""
     file = folder / "clusters.yaml"
     clusters = {cluster: {key: str(value) for key, value in connection.items()}}
     content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}

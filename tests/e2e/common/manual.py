@@ -8,7 +8,7 @@ from .namespace import Namespace
 
 
 def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of a goal whose requesters are this vehicle and station00."""
+    """Copy a goal; return the copy, in which this vehicle and station00 are the requesters."""
     requesters = {"requester_ids": [vehicle, "station00"]}
     apps = [
         app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}

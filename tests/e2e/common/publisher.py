@@ -13,7 +13,7 @@ OUTPUTS = ("object_list_topic", "fused_object_lists_topic", "fused_trajectories_
 
 
 def main(launch: str, package: str, file: str, *arguments: str) -> None:
-    """Publish the node's name on its outputs until it is killed."""
+    """Publish the ROS node's name on each given output until this process is killed."""
     given = dict(argument.split(":=", 1) for argument in arguments)
     rclpy.init(args=[])
     node = Node(given["node_name"])

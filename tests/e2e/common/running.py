@@ -32,7 +32,7 @@ def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
 def worlds(make: Callable[[], World]) -> Iterator[Callable[[], World]]:
     """Yield a function that creates state repos, which no cluster follows yet.
 
-    The end of the block removes these state repos.
+    The context manager removes these state repos after the block.
     """
     made: list[World] = []
 

@@ -186,7 +186,7 @@ class StateRepo(Generic[Domain]):
     def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
         """Wait until the only cluster has exactly these lines after a goal that succeeded.
 
-        Return when the goal reached each stage. With `wake` the test triggers the controller.
+        Return when the goal reached each stage. With `wake`, trigger the controller first.
         """
         domain = self.domain
         if wake:

@@ -155,7 +155,10 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Set replicas as an autoscaler does, change an image, and wait for the former image."""
+        """Scale Deployments as an autoscaler does, and change their images.
+
+        Return once the controller has restored each former image.
+        """
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)
@@ -244,9 +247,9 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
 
 
 def _controller(rig: Rig) -> list[str]:
-    """Make the namespace of the golden manifests.
+    """Create the namespace of the golden manifests; return kinds that the manifests must have.
 
-    Return a list of kinds: those that the controller itself defines, and Deployment.
+    These are the kinds that the controller itself defines, and Deployment.
     """
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
     return [*PARTS[rig.gitops].KINDS, "Deployment"]

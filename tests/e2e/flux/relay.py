@@ -1,4 +1,4 @@
-"""A link from a cluster to the Git server; a test can cut it, as a vehicle's radio link breaks."""
+"""A link from a cluster to the Git server, which a test cuts to simulate a lost radio link."""
 
 from __future__ import annotations
 

@@ -91,8 +91,9 @@ def generator_without_git(world: World, goal: dict[str, Any]) -> None:
 def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
     """Kill the generator in a `git push`, then start it again and send the goal again.
 
-    The push survives the generator and may succeed, which the next generator must notice. The goal
-    must be a join, because a repeated shutdown could never make a second commit.
+    The push survives the generator and may succeed. The next generator must notice this, so that
+    the repeated goal makes no second commit. The goal must be a join: a repeated shutdown never
+    makes a second commit, so it would prove nothing.
     """
     world.rig.pause("git")
     try:

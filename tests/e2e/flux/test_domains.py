@@ -44,8 +44,8 @@ SlipIn = Callable[..., None]
 def slip_in(world: World, neighbour: Domain) -> Iterator[SlipIn]:
     """Return a function that commits manifests to the domain's folder.
 
-    The function waits until Flux has tried to apply the manifests. The end of the test removes
-    them.
+    The function waits until Flux has tried to apply the manifests. The fixture removes the
+    manifests after the test.
     """
 
     def push(*manifests: dict[str, Any], file: str = FILE) -> None:
@@ -70,7 +70,7 @@ def remove_committed(world: World) -> None:
 def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applied(
     world: World, neighbour: Domain, slip_in: SlipIn
 ) -> None:
-    """Services run on, and the generator removes the foreign file with the next demand."""
+    """The services keep running; the generator removes the foreign file with the next demand."""
     domain, untouched = world.domain, neighbour.inventory()
     world.step(1, expected.after(1))
     slip_in(config("foreign", NEIGHBOUR), config("own", domain.namespace))
@@ -184,7 +184,7 @@ def test_what_the_cluster_refuses_of_a_commit_is_reported(world: World, slip_in:
 
 
 def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
-    """The policy no longer allows host-network; the operator applies the new bootstrap file."""
+    """The operator applies the bootstrap file of a policy that no longer allows host-network."""
     domain = world.domain
     nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
     policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")

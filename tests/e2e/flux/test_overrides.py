@@ -1,4 +1,4 @@
-"""Merged overrides reach the cluster, stay in effect during demands, and end when removed."""
+"""Merged overrides reach the cluster, stay in effect while demands come, and end when removed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An application has services on three nodes; each needed topic is carried once, no other at all.
+"""An application has services on three nodes; only the needed topics are carried, each once.
 
 Each vehicle has a driver, which all applications share. At the edge are a detection for each
 driver, a fusion, and a planner. The plan is delivered to the vehicles.
@@ -58,7 +58,7 @@ def test_four_services_on_three_nodes_serve_two_vehicles(
 
 
 def definitions(world: World) -> dict[str, str | None]:
-    """Return the files of an appdef that reads the example's shared driver and has a planner."""
+    """Return the example's appdefs with a planner added, and registry and nodes that fit them."""
     files = {
         path.relative_to(EXAMPLE).as_posix(): path.read_text()
         for path in (EXAMPLE / "appdefs").rglob("*")

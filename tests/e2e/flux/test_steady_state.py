@@ -1,4 +1,4 @@
-"""Another requester or a manual change in the cluster leaves releases as they were."""
+"""Another requester changes no release, and the controller undoes manual changes in the cluster."""
 
 from __future__ import annotations
 

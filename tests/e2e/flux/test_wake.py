@@ -70,7 +70,10 @@ def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
 
 @contextmanager
 def wakes(domain: Domain) -> Iterator[list[bool]]:
-    """Yield a list that gets one entry per request to fetch: whether Flux was idle just before."""
+    """Yield a list that gets an entry for each request to Flux to fetch.
+
+    The entry is true if Flux was idle just before the request.
+    """
     found: list[bool] = []
     over = threading.Event()
 

@@ -39,8 +39,9 @@ PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
 class Rig:
     """A cluster; several can run at once, each with its own ports and folder.
 
-    `nodes` are the ids of its nodes. `gitops` is its GitOps controller, and `beside` a second one.
-    `git_of` is another rig whose Git server it uses, so that two clusters read one state repo.
+    `nodes` are the ids of its nodes. `gitops` is its GitOps controller; `beside`, if given, is a
+    second one. `git_of` is another rig, whose Git server this rig uses, so that two clusters read
+    one state repo.
     `credentials` are a user and a password, which the Git server then requires. `arguments` has
     further arguments for controllers, by the controller's name. `folder` gets data and logs. By
     default it is a temporary folder, which the rig removes at the end unless E2E_KEEP is set; after

@@ -2,7 +2,7 @@
 
 The server runs as its own process (`python githttp.py --root DIR --port N`), so that tests can kill
 or pause it like any other part of the rig. It needs only Python and Git. A push to a repository
-that does not exist creates the repository. If its environment has GIT_HTTP_USER and
+that does not exist creates the repository. If the server's environment has GIT_HTTP_USER and
 GIT_HTTP_PASSWORD, the server requires that user and password by basic authentication.
 """
 

@@ -173,9 +173,8 @@ def _watched(
 ) -> str:
     """Run a command and return its standard output.
 
-    Each line of its standard error goes to `line`, which returns whether the line reports only
-    progress.
-    `tick` is called while there is no line.
+    The function `line` gets each line of the command's standard error, and returns whether the line
+    reports only progress. The function `tick` is called while no line comes.
     """
     folder = workspace.module
     process = subprocess.Popen(

@@ -69,7 +69,7 @@ class Kube:
         self.api.close()
 
     def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
-        """Apply manifests on the server's side; text may contain several YAML documents.
+        """Apply manifests by server-side apply; a text may contain several YAML documents.
 
         In a dry run the server checks everything, admission included, and stores nothing.
         """

@@ -40,7 +40,10 @@ def url(port: int, scheme: str = "http") -> str:
 
 
 def answers(port: int, path: str, authority: Path | None = None) -> Probe:
-    """Return a probe that checks that `path` answers 200; with an authority it uses HTTPS."""
+    """Return a probe that checks that a GET of `path` is answered with status 200.
+
+    The probe uses HTTPS if `authority` names the file of a certificate authority, otherwise HTTP.
+    """
     context = ssl.create_default_context(cafile=str(authority)) if authority else None
 
     def probe() -> str | None:

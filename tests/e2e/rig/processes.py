@@ -90,7 +90,10 @@ class Processes:
         self.check(name)  # another server may have answered on the port
 
     def check(self, *names: str) -> None:
-        """Raise RigError if one of these components ended by itself; without names check all."""
+        """Raise RigError if one of these components has ended by itself.
+
+        If no name is given, check all components.
+        """
         for name in names or list(self._running):
             process = self._running.get(name)
             if process is not None and (code := _exit_code(process)) is not None:
