@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import pygit2
 import pytest
 import yaml
 
@@ -139,3 +140,14 @@ def test_verify_and_log_take_a_merged_proposal(demandops: Run, send: Send, stric
     assert "merged by a person" in ran.out
     [entry] = demandops("log", "-n", "1", "--output", "json", "--state-repo", strict.path).json()
     assert entry["commit"] == strict.tip
+
+
+def test_a_branch_of_a_time_that_no_calendar_has_is_listed(demandops: Run, state: GitRepo) -> None:
+    repo = pygit2.Repository(str(state.path))
+    tip = repo[state.tip].peel(pygit2.Commit)
+    author = pygit2.Signature("x", "x@example.org", 99_999_999_999_999, 0)
+    message = "Odd\n\nProposal: demand/odd\n"
+    branch = "refs/heads/demand/odd"
+    repo.create_commit(branch, author, tip.committer, message, tip.tree.id, [tip.id])
+    listed = demandops("get", "proposals", "--state-repo", state.path, "--output", "json")
+    assert [row["branch"] for row in listed.json()["items"]] == ["demand/odd"]

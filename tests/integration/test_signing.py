@@ -342,6 +342,20 @@ class TestVerify:
         repo.references["refs/heads/main"].set_target(made)
         (row,) = self.rows(demandops, state, since, 1)
         assert row["signature"] == "has a signature of another commit"
+        # git, unlike libgit2, would check the signed commit in place of the forged one
+        git(state.path, "update-ref", f"refs/replace/{made}", str(signed.id))
+        (row,) = self.rows(demandops, state, since, 1)
+        assert row["signature"] == "has a signature of another commit"
+
+    @pytest.mark.parametrize("separator", ["\u2028", "\u0085", "\x0b", "\x1c"])
+    def test_a_signer_whose_name_has_an_odd_character(
+        self, demandops: Run, book: Run, state: Any, key: Path, separator: str
+    ) -> None:
+        state.commit({SIGNERS: listed(key).replace("@", f"{separator}@")})
+        since = state.tip
+        book("a", "--signing-key", key)
+        book("b", "--signing-key", key)
+        assert [row["holds"] for row in self.rows(demandops, state, since, 0)] == [True, True]
 
     def test_keys_may_change(
         self, demandops: Run, book: Run, state: Any, key: Path, tmp_path: Path

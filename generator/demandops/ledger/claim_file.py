@@ -36,12 +36,13 @@ RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
 """Folders that only newer generators write; their files record the node of each service."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
-_VERSION = re.compile(r"^demandops\.ledger/v(\d+)$")
+_VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
 
 
 def segment(exact: str) -> str:
     """Return a path segment for an id: readable, safe on every file system, and unique."""
-    digest = hashlib.sha256(exact.encode()).hexdigest()[:16]
+    # no id has half a character, but a trailer of a forged commit may
+    digest = hashlib.sha256(exact.encode(errors="surrogatepass")).hexdigest()[:16]
     slug = re.sub(r"[^a-z0-9]+", "-", exact.lower()).strip("-")[:40].rstrip("-")
     return f"{slug}-{digest}" if slug else digest
 

@@ -170,7 +170,7 @@ def text_of(shutdown: RecentShutdown) -> str:
 class _ShutdownFile(FrozenModel):
     apiVersion: Literal["demandops.ledger/v2"]
     kind: Literal["Shutdown"]
-    digest: str
+    digest: str = Field(pattern=r"^[0-9a-f]{20}$")
     request: str
     requesters: tuple[str, ...] = Field(min_length=1, strict=False)
     at: Timestamp
@@ -182,7 +182,8 @@ def read(text: str, path: str) -> RecentShutdown | None:
         file = parse_file(_ShutdownFile, text, path)
     except InvalidInput:
         return None
-    found = RecentShutdown(file.digest, file.request, file.requesters, parse_timestamp(file.at))
+    requesters = tuple(sorted(set(file.requesters)))  # a person may have listed one twice
+    found = RecentShutdown(file.digest, file.request, requesters, parse_timestamp(file.at))
     return found if path == path_of(file.digest) else None
 
 

@@ -24,7 +24,7 @@ from jinja2 import (
 )
 from jinja2.bccache import Bucket
 from jinja2.environment import Template
-from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
+from jinja2.exceptions import TemplateNotFound, TemplateRuntimeError, TemplateSyntaxError
 from jinja2.runtime import Undefined
 
 from demandops import naming, strict_yaml
@@ -185,11 +185,7 @@ class Engine:
         """
         text = ""
         try:
-            with budget():
-                compiled: Template = self._config.get_template(template)
-            # a new budget, so that it does not matter whether the template was compiled before
-            with budget():
-                text = compiled.render(**context)
+            text = self._rendered(template, context)
             values = _mapping(text, template)
             check(values)
         except InvalidInput as error:
@@ -204,6 +200,20 @@ class Engine:
         else:
             return values
         raise InvalidInput([fault("", f"{problem}; fix the template", line=line).within(template)])
+
+    def _rendered(self, template: str, context: dict[str, object]) -> str:
+        """Return the text that a values template renders to, or raise one of _TEMPLATE_FAULTS."""
+        try:
+            with budget():
+                compiled: Template = self._config.get_template(template)
+            # a new budget, so that it does not matter whether the template was compiled before
+            with budget():
+                return compiled.render(**context)
+        except _TEMPLATE_FAULTS:
+            raise
+        except Exception as error:  # a filter of Jinja may raise any other error
+            problem = f"{type(error).__name__}: {error}"
+            raise TemplateRuntimeError(problem).with_traceback(error.__traceback__) from None
 
 
 def _mapping(text: str, template: str) -> dict[str, Any]:

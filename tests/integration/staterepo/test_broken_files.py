@@ -22,6 +22,7 @@ from demandops.staterepo.load import snapshot, state_in_effect
 
 from tests.kit import rig
 from tests.kit.config import override
+from tests.kit.repo import FORGER
 from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
@@ -350,3 +351,64 @@ def test_a_broken_file_is_judged_once_and_not_on_each_demand(
         rig.book(generator, goal(5))
         assert len(parsed) == judged
     rig.assert_sound(bare)
+
+
+def shutdown_record(digest: str) -> dict[str, str]:
+    """Return a file that records an old shutdown and names its requester twice."""
+    return {
+        f"ledger/shutdowns/{digest[:2]}/{digest}.yaml": f"""\
+apiVersion: demandops.ledger/v2
+kind: Shutdown
+digest: "{digest}"
+request: x
+requesters: [user1, user1]
+at: "2020-01-01T00:00:00Z"
+"""
+    }
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"ledger/applications/00/x/y.yaml": f"apiVersion: demandops.ledger/v{'9' * 5000}\n"},
+        shutdown_record("aaaa"),
+        shutdown_record("a" * 20),
+        {"appdefs": "{{ cycler() }}"},
+        {"appdefs": "{{ 'x'|truncate(-1) }}"},
+        {"appdefs": "{{ 1|dictsort }}"},
+        {"appdefs": f"{{{{ '{'9' * 400}.0'|float|int }}}}"},
+    ],
+)
+def test_no_file_that_a_person_writes_stops_the_demands(
+    bare: Path, person: Person, files: dict[str, str]
+) -> None:
+    person.fetch()
+    if "appdefs" in files:
+        (path,) = person.folder.glob("appdefs/*/values/object-detection.yaml.j2")
+        name = str(path.relative_to(person.folder))
+        files = {name: f"{path.read_text()}\nodd: {files['appdefs']}\n"}
+    person.change(files)
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1), goal(2))
+    with rig.running(bare) as generator:
+        rig.book(generator, leave(1), goal(3))
+    outcomes = [dict(commit.trailers).get("Operation") for commit in rig.commits(bare)]
+    assert [one for one in outcomes if one in ("join", "shutdown")] == [
+        *("join", "join", "shutdown", "join")
+    ]
+
+
+@pytest.mark.parametrize("stands_in", ["1" * 40, "abc", "HEAD", "main"])
+def test_a_forged_record_of_the_files_in_effect_stops_no_start(
+    bare: Path, person: Person, stands_in: str
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+    tip = rig.tip(bare)
+    message = (
+        f"x\n\nWhy: x\n\nOperation: follow\nIn-Force: {tip}\nConfiguration: {tip}\n"
+        f"Stands-In: demandops.yaml {stands_in}\nRender-Version: 2\n"
+    )
+    person.change({}, message, FORGER)
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(2))

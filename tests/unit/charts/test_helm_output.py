@@ -62,3 +62,8 @@ def test_lint_gives_errors_and_warnings_and_no_advice() -> None:
         "helm says 'values.yaml: - at '/replicas': got string, want integer - at '/image': missing "
         "property 'tag''; fix the chart or its values"
     )
+
+
+def test_a_line_number_that_a_template_made_up_is_not_one() -> None:
+    err = f"Error: camera/templates/x.yaml:{'9' * 5000}: made up"
+    assert parsed_error(err, "camera").line is None

@@ -250,3 +250,7 @@ def test_a_topic_names_requesters_of_the_claim_only() -> None:
             "x is not among the requesters of the claim; add this name to the claim's requesters, "
             "or remove the name from this topic"
         )
+
+
+def test_half_a_character_in_a_forged_trailer_has_a_path_segment() -> None:
+    assert claim_file.segment("\ud800") != claim_file.segment("\ud801")

@@ -74,7 +74,9 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
     if len(_good) > _MOST_KNOWN:
         _good.clear()
     for allowed, ids in lists.items():
-        for id, state, signer in _check_with_git(repo, allowed, ids):
+        states = _check_with_git(repo, allowed, ids)
+        for id in ids:
+            state, signer = states.get(id, ("", ""))
             fault = _fault(signatures[id], state)
             found[id] = Check("" if fault else signer, fault)
             if not fault:
@@ -98,8 +100,8 @@ def _fault(signature: str, state: str) -> str:
 
 def _check_with_git(
     repo: Repository, allowed: str, commits: list[str]
-) -> Iterable[tuple[str, str, str]]:
-    """Return (id, git's letter for the signature, signer) for each commit.
+) -> dict[str, tuple[str, str]]:
+    """Return a map from commit to git's letter for its signature, and the signer.
 
     ``allowed`` is the text of the list of keys.
     """
@@ -114,9 +116,9 @@ def _check_with_git(
                     *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
                     *("-c", f"gpg.ssh.allowedSignersFile={file}"),
                     *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
-                    "--format=%H %G? %GS",
+                    *("-z", "--format=%H %G? %GS"),
                 ],
                 istream=lines,
             )
-    rows = (line.split(" ", 2) for line in str(output).splitlines())
-    return [(row[0], row[1], row[2] if len(row) > 2 else "") for row in rows]
+    rows = (row.split(" ", 2) for row in str(output).split("\0") if row)
+    return {id: (state, signer) for id, state, signer in rows}

@@ -17,6 +17,7 @@ import pygit2
 from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
+from demandops.errors import StateRepoError
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
@@ -294,5 +295,8 @@ def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{after}"] if after else [])]
     with git.Repo(repo.path) as opened:
-        output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
+        try:
+            output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
+        except git.GitCommandError as error:
+            raise StateRepoError(f"git cannot read the history of {path}: {error.stderr}") from None
     return [found for found in output.split("\0") if found]

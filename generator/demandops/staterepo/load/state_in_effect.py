@@ -19,7 +19,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from urllib.parse import quote, unquote
 
-from pygit2 import Oid, Repository, Tree
+from pygit2 import Blob, GitError, Oid, Repository, Tree
 
 from demandops.decision import State, changeset_of_edit, faults_of_edit, rendered_files
 from demandops.errors import Fault, InvalidInput, StateRepoError
@@ -157,7 +157,7 @@ def recorded_state(
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)
     last_valid = snapshots.load(repo, record.first("In-Force"), progress)
-    source = _source(record)
+    source = _source(repo, record)
     advance = snapshots.advance(repo, last_valid, commit.id, source)
     held_back = record.trailers.get(_HELD_BACK, ())
     judgement = judge(repo, advance, last_valid, commit.tree, held_back)
@@ -166,15 +166,15 @@ def recorded_state(
     return replace(snapshot, last_valid_commit=last_valid.commit, problems=problems)
 
 
-def _source(record: LogEntry) -> ConfigSource:
+def _source(repo: Repository, record: LogEntry) -> ConfigSource:
     commit = record.first("Configuration") or record.first("In-Force")
     replacements: dict[str, Oid | None] = {}
     try:
         for line in record.trailers.get("Stands-In", ()):
             path, _, blob = line.rpartition(" ")
-            replacements[unquote(path)] = None if blob == _NONE else Oid(hex=blob)
+            replacements[unquote(path)] = None if blob == _NONE else repo[blob].peel(Blob).id
         return ConfigSource(Oid(hex=commit), replacements)
-    except ValueError:
+    except (ValueError, KeyError, GitError):
         raise StateRepoError(
             f"commit {record.commit} has unreadable trailers about invalid files; revert it, or "
             "merge valid files"

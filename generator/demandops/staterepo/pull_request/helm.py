@@ -25,7 +25,7 @@ _API = re.compile(r"(?m)^apiVersion: *[\"']?([^\s\"']+)")
 _KIND = re.compile(r"(?m)^kind: *[\"']?([^\s\"']+)")
 _LINT = re.compile(r"\[(?P<level>ERROR|WARNING)\] (?P<text>.*)")
 _PLACE = re.compile(
-    r"(?P<path>[A-Za-z0-9][\w.-]*/(?:charts/[\w.-]+/)*templates/[\w./-]+?)(?::(?P<line>\d+))?(?=[:)\s])"
+    r"(?P<path>[A-Za-z0-9][\w.-]*/(?:charts/[\w.-]+/)*templates/[\w./-]+?)(?::(?P<line>\d{1,9}))?(?=[:)\s])"
 )
 
 

@@ -11,7 +11,7 @@ import hashlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime
 
 import git
 import pygit2
@@ -214,12 +214,12 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
         proposed = [pair for pair in found if commit_log.PROPOSAL in pair[1].trailers]
         if not proposed:
             continue
-        entries, first = [entry for _, entry in proposed], proposed[-1][0]
+        entries = [entry for _, entry in proposed]
         yield PendingProposal(
             branch=f"{PREFIX}{name.removeprefix(space)}",
             commit=entries[0].commit,
             summary=entries[0].summary,
-            since=datetime.fromtimestamp(first.author.time, tz=timezone.utc),
+            since=entries[-1].authored or entries[-1].time,
             requesters=_all_of(entries, "Requester"),
             demands=_all_of(entries, "Demand-Id"),
             operations=_all_of(entries, "Operation-Id"),
