@@ -86,6 +86,13 @@ class Story:
     def url(self) -> str:
         return self.server.url.rstrip("/")
 
+    def wait_followed(self) -> None:
+        """Wait until the page has the newest commit."""
+        commit = str(self.generator.snapshot.commit)
+        wait_until(
+            lambda: self.follower.newest.commit_state.commit == commit, "the page has the commit"
+        )
+
     def settle(self, *, mended: bool = False) -> None:
         """Make the API server report that the cluster has applied the newest commit.
 

@@ -16,7 +16,7 @@ from axe_playwright_python.sync_playwright import Axe
 from demandops.staterepo.reader import Reader
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.kit.browser import Visit
 from tests.kit.generator import book
@@ -171,6 +171,20 @@ def test_health_is_live(visit: Visits, fleet: Story) -> None:
     expect(page.locator(".cause.bad").first).to_contain_text("manifest unknown")
 
 
+def test_what_changes_between_the_page_and_its_first_event_is_shown(
+    visit: Visits, fleet: Story
+) -> None:
+    def change_first(route: Route) -> None:
+        book(fleet.generator, leased("just-now", "vehicle03"))
+        fleet.wait_followed()
+        route.continue_()
+
+    opened = visit()
+    opened.page.route("**/events", change_first, times=1)
+    page = opened.open("/demands")
+    expect(page.locator("main")).to_contain_text("just-now")
+
+
 class _Away(BaseHTTPRequestHandler):
     """Answers 502 to each request, as a reverse proxy does while its server is down."""
 
@@ -208,6 +222,7 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
 
 def test_a_demand_that_ended_is_not_shown_any_longer(browser: Browser, fleet: Story) -> None:
     book(fleet.generator, leased("short", "vehicle03"))
+    fleet.wait_followed()
     visit = Visit(browser, fleet.url)
     page = visit.open("/demand?id=short")
     expect(page.locator("h1")).to_have_text("Demand short")

@@ -130,9 +130,10 @@ class Site:
 
     def _render(self, view: View, request: Request) -> Response:
         try:
+            version = self._follower.version  # before the data, so that no later change is missed
             asked = ViewRequest(self._follower, request)
             template, data = view(asked)
-            return self._page(asked, template, data)
+            return self._page(asked, template, {**data, "version": version})
         except DemandOpsError as error:
             return self._message(request, "Nothing to show", str(error), 404)
         except Exception:  # a fault here must not stop the ROS node in the same process

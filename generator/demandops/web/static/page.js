@@ -73,20 +73,26 @@ function age() {
   }
 }
 
-function follow(isAgain) {
+// Each event names the version of the data. The page may have been made from an earlier version, also
+// if the event is the first one.
+let version = live?.dataset.version;
+
+function follow() {
   const events = new EventSource("/events");
-  let first = !isAgain;
-  events.addEventListener("change", () => {
-    // The first event after the page was loaded brings no news. After a lost connection it may.
-    if (!first) show(location.href, false).catch(() => say("not current: the server does not answer"));
-    first = false;
+  events.addEventListener("change", ({ data }) => {
+    if (data !== version) {
+      show(location.href, false)
+        .then(() => { version = data; })
+        .catch(() => say("not current: the server does not answer"));
+    }
     if (!live.textContent.startsWith("updated")) say("live");
   });
   events.addEventListener("error", () => {
     say("not current: waiting for the server");
+    version = ""; // another server counts anew
     // The browser reconnects by itself, except after an answer that is no stream of events, such as
     // a proxy's error page.
-    if (events.readyState === EventSource.CLOSED) setTimeout(follow, 2000, true);
+    if (events.readyState === EventSource.CLOSED) setTimeout(follow, 2000);
   });
 }
 
@@ -111,6 +117,6 @@ if (field) {
     }
   });
 }
-if (live?.dataset.live === "yes") follow(false);
+if (live?.dataset.live === "yes") follow();
 else say("an earlier state");
 setInterval(age, 5000);
