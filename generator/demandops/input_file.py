@@ -18,10 +18,10 @@ def read_input(file: str | Path) -> tuple[str, str]:
     try:
         data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
         return name, data.decode("utf-8")
-    except OSError as error:
-        problem = f"cannot be read: {error.strerror or error}; check the path"
     except UnicodeDecodeError:
         problem = "is not UTF-8 text; save it as UTF-8"
+    except (OSError, ValueError) as error:  # a ValueError if the path has the character NUL
+        problem = f"cannot be read: {getattr(error, 'strerror', None) or error}; check the path"
     raise InvalidInput.at("", problem, file=name)
 
 
@@ -42,8 +42,9 @@ def read_secret(path: Path, *, private: bool = False) -> bytes:
         else:
             secret = path.read_bytes().rstrip(b"\r\n")
             problem = "is empty; write the secret into this file"
-    except OSError as error:
-        problem = f"cannot be read: {error.strerror or error}; write the secret into this file"
+    except (OSError, ValueError) as error:  # a ValueError if the path has the character NUL
+        why = getattr(error, "strerror", None) or error
+        problem = f"cannot be read: {why}; write the secret into this file"
     if not secret.strip():
         raise InvalidInput.at("", problem, file=str(path))
     return secret

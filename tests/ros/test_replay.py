@@ -145,6 +145,11 @@ def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
     ran = demandops("detect", RULES, "--replay", tmp_path)
     assert ran.code == 1
     assert ran.err.startswith(f"error: {tmp_path}: is not a bag that can be read: ")
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"\x89MCAP0\r\n\x01" + b"\xff" * 40)
+    ran = demandops("detect", RULES, "--replay", broken)
+    assert ran.code == 1
+    assert ran.err.startswith(f"error: {broken}: is not a bag that can be read: ")
     record(tmp_path / "bag", [(0.0, "vehicle00", 0.0, 0.0)], StoragePlugin.MCAP)
     rules = tmp_path / "rules.yaml"
     rules.write_text(RULES.read_text().replace("/vehicles/{", "/cars/{"))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any
@@ -185,10 +186,14 @@ class ReconcileTrigger:
         if cache is None or cache.why_unknown(_followed(wake.domains)):
             return False
         objects = cache.objects()
-        return not all(
-            Flux().is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
-            for domain in wake.domains
-        )
+        try:
+            return not all(
+                Flux().is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
+                for domain in wake.domains
+            )
+        except Exception as error:  # an odd object must not keep other clusters from being woken
+            log.debug("the objects of cluster '%s' cannot be read: %r", wake.cluster, error)
+            return False
 
     def _try(self, wake: _Wake) -> None:
         """Make the call. If it fails, plan another attempt; give up after about a minute.
@@ -197,11 +202,12 @@ class ReconcileTrigger:
         """
         assert self._config is not None  # noqa: S101 - without a push there is no wake
         objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}
-        wake.handled = {
-            domain.name: Flux().handled_request(_on_cluster(wake, domain), objects)
-            for domain in wake.domains
-        }
-        wake.idle_from = inf
+        wake.idle_from, wake.handled = inf, {}
+        with suppress(Exception):  # an odd object must not keep its cluster from being woken
+            wake.handled = {
+                domain.name: Flux().handled_request(_on_cluster(wake, domain), objects)
+                for domain in wake.domains
+            }
         try:
             self._call(wake, self._clusters[wake.cluster], self._config)
             wake.pushed = None

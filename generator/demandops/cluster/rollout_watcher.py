@@ -142,7 +142,11 @@ class RolloutWatcher:
         for rollout in rollouts:
             if rollout.busy and not last:
                 continue
-            health = self._health(rollout, objects)
+            try:
+                health = self._health(rollout, objects)
+            except Exception as error:  # an odd object must not keep other rollouts from an answer
+                log.debug("a status cannot be read: %r", error)
+                health = Health("waiting", "the status on the cluster cannot be read", failing=True)
             if health.reaches("healthy") and not (rollout.confirmed or last):
                 self._in_background(rollout, self._confirm)
                 continue

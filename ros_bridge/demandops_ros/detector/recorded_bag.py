@@ -11,9 +11,8 @@ from demandops.detection.rules.rule_file import RuleFile
 from demandops.detection.rules.topic_pattern import entity_in
 from demandops.errors import InvalidInput
 from demandops.quoting import one_line
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import ReaderError
 from rosbags.typesys import Stores, get_typestore
 
 
@@ -34,7 +33,7 @@ class RecordedBag:
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
-        except (AnyReaderError, ReaderError, OSError) as error:
+        except Exception as error:  # a damaged bag makes the library raise errors of any kind
             message = f"is not a bag that can be read: {one_line(str(error))}"
             raise InvalidInput.at("", message, file=str(path)) from None
         self._readers = {name: MessageReader(file, name) for name in file.sources}
@@ -71,7 +70,15 @@ class RecordedBag:
     def observations(self) -> Iterator[Observation]:
         """Yield an observation for each readable message, in the order of recording."""
         chosen = [one for one in self._reader.connections if one.id in self._sources]
-        for connection, nanoseconds, data in self._reader.messages(connections=chosen):
+        messages = self._reader.messages(connections=chosen)
+        while True:
+            try:
+                connection, nanoseconds, data = next(messages)
+            except StopIteration:
+                return
+            except Exception as error:  # the rest of a damaged bag
+                self._leave_out("the rest of the bag", f"cannot be read: {error!r}")
+                return
             yield from self._read(connection, nanoseconds / 1e9, data)
 
     def _read(self, connection: Connection, at: float, data: bytes) -> Iterator[Observation]:

@@ -190,6 +190,15 @@ def test_what_argo_cd_leaves_out_or_writes_out_makes_no_other_source() -> None:
     assert ARGOCD.release_health(SERVICE, "b", objects, COMMITS).state == "healthy"
 
 
+def test_a_source_that_is_nested_very_deeply_is_another_source() -> None:
+    deep: Any = "x"
+    for _ in range(900):
+        deep = [deep]
+    child = application(source(), sync="Synced", at="b", compared=source(image=deep))
+    objects = {OVER: over(sync="Synced", at="b"), CHILD: child}
+    assert ARGOCD.release_health(SERVICE, "b", objects, COMMITS).state != "healthy"
+
+
 @pytest.mark.parametrize(
     ("at", "changing", "state"),
     [

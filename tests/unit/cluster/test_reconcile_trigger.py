@@ -58,6 +58,8 @@ OPEN = "SECRET may be read by everybody on this machine; run chmod o= on it"
         (SIGNED, "", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
         (SIGNED, " \r\n", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
         (SIGNED, "x", 0o644, f"clusters.a.secret_file: {OPEN}"),
+        ('clusters: {a: {receiver: "http://h/hook", secret_file: "/\\0"}}\n', None, 0,
+         f"clusters.a.secret_file: /\\x00 cannot be read: embedded null byte; {FILL}"),
         ("clusters: {a: {kubeconfig: /k, secret_file: /s}}\n", None, 0,
          "clusters.a: has a secret_file but no URL; add a receiver or a webhook"),
     ],
@@ -203,3 +205,15 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
     assert heard
     assert "cluster 'away' was not woken ([Errno 111] Connection refused; check that" in caplog.text
     assert "secret" not in caplog.text
+
+
+def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path: Path) -> None:
+    state, _ = start("experiment")
+    fetch(api, "a")
+    spec = {"sourceRef": {"name": "demandops"}}
+    odd = {"lastAttemptedRevision": "main@sha1:a", "conditions": [None]}
+    api.put("kustomizations", "perception", "perception", odd, spec=spec)
+    waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None))
+    waker(state.config)
+    wait_until(lambda: len(api.patches) == 1, "the call")
+    waker.close()

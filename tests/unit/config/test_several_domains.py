@@ -124,8 +124,9 @@ def test_data_crosses_only_by_a_connection_that_both_allow() -> None:
     demanded = put("d", "both", node="edge@city")
     refused = MemoryRepo(SEVERAL).faults(demanded)
     assert refused == [
-        "requesters[0]: rule 'city' of access domain 'city' does not let 'both' connect its nodes "
-        "to nodes of 'fleet' (peers); request what is allowed, or ask for a change of policy/"
+        "requesters[0]: rule 'city' of access domain 'city' does not let 'both' connect the "
+        "domain's nodes to nodes of 'fleet' (peers); request what is allowed, or ask for a change "
+        "of policy/"
     ]
     repo = MemoryRepo(FREE)
     repo.send(demanded)

@@ -52,6 +52,11 @@ def faults(text: str) -> list[str]:
             "pose.position.x or ranges[0]",
         ),
         (
+            rule("a", near=NEAR, count=None, threshold={"source": "cars", "field": f"x[{10**9}]"}),
+            "rules.yaml:31: rules[0].threshold.field: 'x[1000000000]' is not a field; write it "
+            "like pose.position.x or ranges[0]",
+        ),
+        (
             rule("a"),
             "rules.yaml:16: rules[0]: needs one of near, together, count, threshold, schedule",
         ),

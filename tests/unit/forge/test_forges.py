@@ -223,7 +223,10 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
         ),
         ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
         ("{forge: none, api: 'https://x.org/a'}", "api: is not used with forge: none"),
-        ("{forge: gitea, url: 'https://x.org/a/b', labels: [x]}", "labels: only GitLab's push"),
+        (
+            "{forge: gitea, url: 'https://x.org/a/b', labels: [x]}",
+            "labels: are used only with forge: gitlab",
+        ),
         ('{forge: gitlab, labels: ["a\\nb"]}', "proposals.labels[0]: "),
         ("{forge: bitbucket}", "proposals.forge: "),
     ],

@@ -122,6 +122,14 @@ def test_a_damaged_journal_is_refused_with_the_line_and_the_remedy(path: Path, t
     assert path.read_bytes() != text, "the damaged file must stay as it is"
 
 
+def test_a_line_of_the_first_version_whose_ids_are_no_texts_is_damage(path: Path) -> None:
+    entry = {"operation": "o", "goal": None, "received": "2026-01-01T00:00:00+00:00", "base": ""}
+    for wrong in ({"operation": 5}, {"base": 5}):
+        path.write_text(json.dumps(entry | wrong) + "\n")
+        with pytest.raises(DamagedJournal):
+            Journal(path)
+
+
 @pytest.mark.parametrize("waiting", [0, 1000])
 def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int) -> None:
     """The file must also stay small while many demands wait for approval."""

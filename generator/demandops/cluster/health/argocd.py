@@ -230,7 +230,10 @@ def _same(source: object, other: object) -> bool:
 
     Argo CD may omit an empty field or write it.
     """
-    return _without_empty(source) == _without_empty(other)
+    try:
+        return _without_empty(source) == _without_empty(other)
+    except RecursionError:  # nothing that the generator renders is nested so deeply
+        return False
 
 
 def _without_empty(value: object) -> object:

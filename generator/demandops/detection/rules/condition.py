@@ -19,7 +19,7 @@ from demandops.detection.rules.area import Area
 from demandops.detection.rules.schedule import DAYS, Schedule
 from demandops.quoting import quoted
 
-_FIELD = re.compile(r"[A-Za-z]\w*(\[\d+\])*(\.[A-Za-z]\w*(\[\d+\])*)*")
+_FIELD = re.compile(r"[A-Za-z]\w*(\[[0-9]{1,9}\])*(\.[A-Za-z]\w*(\[[0-9]{1,9}\])*)*")
 
 
 def _field_problem(path: str) -> str:

@@ -303,6 +303,8 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         if (proposal := record.pop("proposal", None)) is not None:
             proposal = ProposalRecord(**{**proposal, "commits": tuple(proposal["commits"])})
         entry = JournalEntry(**record, proposal=proposal)
+        if not isinstance(entry.operation, str) or not isinstance(entry.base, str):
+            raise ValueError("an id is no text")
         received = datetime.fromisoformat(entry.received)
         if received.tzinfo is None or not 1970 <= received.year < UNSTARTED.year:
             raise ValueError("the time has no zone, or a year that no generator writes")

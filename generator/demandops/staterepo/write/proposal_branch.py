@@ -8,14 +8,16 @@ of forges except GitLab's push options.
 from __future__ import annotations
 
 import hashlib
+import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 
 import git
 import pygit2
-from pygit2 import Oid, Repository
+from pygit2 import GitError, Oid, Repository
 
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
@@ -24,6 +26,8 @@ from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
+
+log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
@@ -210,7 +214,11 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     repo = Repository(repository.objects.path)
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
-        found = commit_log.commits(repo, repo.references[name].resolve().target, main)
+        try:
+            found = list(commit_log.commits(repo, repo.references[name].resolve().target, main))
+        except (KeyError, ValueError, TypeError, GitError, StateRepoError):
+            _warn_of_unreadable(name)
+            continue
         proposed = [pair for pair in found if commit_log.PROPOSAL in pair[1].trailers]
         if not proposed:
             continue
@@ -224,6 +232,11 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
             demands=_all_of(entries, "Demand-Id"),
             operations=_all_of(entries, "Operation-Id"),
         )
+
+
+@lru_cache(maxsize=100)  # a page lists the proposals again and again
+def _warn_of_unreadable(name: str) -> None:
+    log.warning("%s names no commit that can be read; delete this branch", name)
 
 
 def _all_of(entries: Iterable[commit_log.LogEntry], key: str) -> tuple[str, ...]:

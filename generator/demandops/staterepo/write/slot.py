@@ -97,6 +97,9 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
             demands = list(read(file).values())
             if demands:
                 yield FoundJournal(file, demands)
+        except OSError as error:
+            message = f"{file} cannot be read: {error.strerror}; check this path, then try again"
+            raise StateRepoError(message) from None
         except DamagedJournal as damage:
             moved = None
             lock = _lock(file.parent) if set_aside else None

@@ -32,9 +32,10 @@ def word_of(status: ReleaseStatus) -> str:
 def since_of(status: ReleaseStatus) -> datetime | None:
     """Return when a release's state last changed; None if the cluster does not report it."""
     try:
-        return datetime.fromisoformat(status.since.replace("Z", "+00:00"))
+        since = datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
         return None
+    return since if since.tzinfo else None
 
 
 def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
