@@ -132,4 +132,4 @@ PATTERN_WORDS = {
         "a topic that begins with '/', such as /{instance}_objects"
     ),
 }
-"""Which texts match the regular expression of a field, in words for messages."""
+"""For each regular expression of a field: the texts that match it, in words for messages."""

@@ -346,7 +346,7 @@ def _subject(item: Item) -> Subject:
 def _fixed(item: Item) -> dict[str, Any]:
     """Return the fields that all claims on a subject share: the node or the ends, and the type.
 
-    A node that a shutdown leaves out is an empty text.
+    If a shutdown does not name a node, the field of the node is an empty text.
     """
     if "header" in item:
         return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}

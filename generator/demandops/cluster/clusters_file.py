@@ -19,7 +19,10 @@ from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
-    """Raised when the files do not say how to wake a controller; no message contains a secret."""
+    """Raised when the configuration does not say how to wake a controller.
+
+    Its message contains no secret.
+    """
 
 
 class ClusterAccess(FrozenModel):

@@ -142,7 +142,7 @@ class RosEnd(End):
     port: int
 
     def facts(self) -> list[str]:
-        """Return one line for each topic, and one for the listening address."""
+        """Return the lines that describe this end: each topic, and the listening address."""
         return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
 
     def configuration(self) -> dict[str, Any]:

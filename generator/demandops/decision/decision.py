@@ -173,7 +173,7 @@ def decide(
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
 )
-"""The codes of faults that a demand may avoid on another node."""
+"""The codes of faults that might not occur if other nodes were chosen for the demand."""
 
 
 def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:

@@ -23,8 +23,9 @@ from demandops.demand.demand_request import AnyRequest, DemandRequest
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
     """Return the request with separate instances for versions other than the default.
 
-    Only appdefs with ``versions: separate`` have separate instances. In their applications, the
-    version replaces the channel that the request names.
+    This concerns only applications whose appdef has ``versions: separate``. If such an application
+    names a channel, the channel is replaced by the version that it stands for, even if that is the
+    default version.
     """
     demanded = (
         replace(one, held=_separated(one.held, config))

@@ -58,7 +58,7 @@ subjects: st.SearchStrategy[Subject] = st.one_of(
 
 
 def rivals(subject: Subject, name: str) -> Iterator[Subject]:
-    """Yield other subjects that would get ``name``, or a similar name, if names only joined ids."""
+    """Yield subjects whose names would be like ``name`` if a name were the ids joined by "-"."""
     prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
     yield ("of", rest)
     yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")

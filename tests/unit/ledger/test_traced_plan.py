@@ -1,4 +1,4 @@
-"""A traced plan follows the changes of the ledger, and always equals a plan from scratch."""
+"""A traced plan follows the changes of the ledger, and always equals a plan computed anew."""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that a domain has applied; empty if it is not known."""
+        """Return the commit up to which a domain's folder is applied; empty if it is not known."""
 
     def key(self, target: Target) -> Key:
         """Return the key of the object that represents a release."""

@@ -371,7 +371,7 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
 
 
 def _versions_for(override: Override, config: Config) -> set[str]:
-    """Return the versions and channels of every chart that an override selects."""
+    """Return the versions and channels of the charts of all services that an override selects."""
     charts = {
         service.chart
         for appdef, services in config.services.items()

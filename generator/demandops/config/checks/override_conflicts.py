@@ -77,7 +77,7 @@ def patches_commute(one: object, other: object) -> bool:
 def may_select_same_release(
     one: Iterable[Selector], other: Iterable[Selector], config: Config
 ) -> bool:
-    """Return whether one release, now or later, may match a selector of each override."""
+    """Return whether some release, now or later, may match selectors of both overrides."""
     others = list(other)
     return any(_may_match_same_release(left, right, config) for left in one for right in others)
 
