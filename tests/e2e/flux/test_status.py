@@ -52,5 +52,6 @@ def orphans(world: World) -> list[dict[str, str]]:
         command, env=environment(world.folder), capture_output=True, text=True, check=False
     )
     found: list[dict[str, str]] = json.loads(done.stdout)["orphans"]
-    assert done.returncode == (1 if found else 0), done.stderr
+    # without orphans the exit code depends on the releases, which may not be healthy yet
+    assert done.returncode == 1 or not found, done.stderr
     return found
