@@ -139,10 +139,15 @@ class ReconcileTrigger:
                 self._note_idle(wake)
                 if wake.due <= self._runtime.monotonic():
                     self._try(wake)
-            if self._ends < inf and not any(wake.is_untried for wake in self._wakes.values()):
+            if self._ends < inf and not self._is_call_left:
                 return
             if self._ends <= self._runtime.monotonic():
                 return
+
+    @property
+    def _is_call_left(self) -> bool:
+        # A push may have come during the last call, and is not noted yet.
+        return self._pushed or any(wake.is_untried for wake in self._wakes.values())
 
     def _seconds_until_due(self) -> float | None:
         """Return the seconds until the next call or the thread's end; None if none is planned."""

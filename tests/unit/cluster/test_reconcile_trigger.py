@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Event, Timer
 
 import pytest
 from demandops.cluster import clusters_file
@@ -183,6 +184,27 @@ def test_a_last_push_is_told_at_the_end_once_flux_is_idle(api: KubeApi, tmp_path
     apply(api, "b")
     waker.close()
     assert len(api.patches) == 2
+
+
+def test_a_push_during_the_last_call_is_told_at_the_end_too() -> None:
+    state, _ = start("experiment")
+    is_closing, calls = Event(), 0
+
+    def answer(call: Call) -> Answer:
+        nonlocal calls
+        calls += 1
+        is_closing.wait(10)
+        return Answer()
+
+    with serving(answer) as server:
+        reached = clusters_file.ClusterAccess(receiver=f"{server.url}/hook/abc")
+        waker = ReconcileTrigger({"c-its": reached}, lambda since: ("", None))
+        waker(state.config)
+        wait_until(lambda: calls == 1, "the first call")
+        waker(state.config)
+        Timer(_LONG_ENOUGH_S, is_closing.set).start()
+        waker.close()
+    assert calls == 2
 
 
 def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
