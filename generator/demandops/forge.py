@@ -77,9 +77,9 @@ class Forge(ABC):
         """
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the branch's pull request, open or not; open one if there is none.
+        """Return the branch's pull request, and create it if the branch never had one.
 
-        A branch gets only one pull request: if that is closed, this method opens no other.
+        A branch gets only one pull request, so a closed one is returned as it is.
         """
         existing = self.find(branch, target)
         if existing is not None:

@@ -29,5 +29,5 @@ class Subject:
     id: str
 
     def __str__(self) -> str:
-        """Return ``application 'edge/fusion'``."""
+        """Return the kind and the id, for example ``application 'edge/fusion'``."""
         return f"{self.kind.value[:-1]} '{self.id}'"

@@ -360,9 +360,9 @@ def test_the_check_of_another_render_version_says_so(
 ) -> None:
     monkeypatch.setattr(checking, "RENDER_VERSION", 3)
     assert check()[2] == (
-        "error: demandops.yaml:15: renderVersion: is 2, but this program renders version 3; check "
-        "with the generator's version of the program, or run `demandops upgrade` to render "
-        "everything again\n"
+        "error: demandops.yaml:15: renderVersion: is 2, but this program renders version 3; run "
+        "this check with the same program version as the generator, or run `demandops upgrade` to "
+        "render everything again\n"
     )
 
 
@@ -413,7 +413,7 @@ def test_without_a_remote_main_is_compared_with(
 
 SHALLOW = (
     "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
-    "git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
+    "git fetch --unshallow origin (in a pipeline, set fetch-depth: 0 or GIT_DEPTH: 0)"
 )
 
 

@@ -51,10 +51,7 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 
 def files_of_library(folder: str) -> dict[str, str]:
-    """Return the files of the library chart that ``init`` puts into ``folder``, as path → text.
-
-    Other charts depend on a library chart.
-    """
+    """Return the files of the library chart that ``init`` puts into ``folder``, as path → text."""
     appdefs = _read(data_folder("appdefs"), "appdefs/")
     return {path: text for path, text in appdefs.items() if path.startswith(f"{folder}/")}
 

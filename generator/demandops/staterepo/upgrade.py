@@ -63,7 +63,7 @@ class UpgradeRequest:
 class Upgrade:
     """The files that an upgrade changes, and the configuration before and after it.
 
-    ``commit`` is the commit of the upgrade. If the upgrade made no commit, it is the tip.
+    ``commit`` is the commit of the upgrade. If no commit was made, ``commit`` is the tip.
     """
 
     commit: str
@@ -93,7 +93,7 @@ def plan(
     now: datetime,
     progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return the files that an upgrade would change; write nothing.
+    """Return what :func:`upgrade` would do; write nothing.
 
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
@@ -110,7 +110,7 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again, publish the files that change as one commit, and return the result.
+    """Render everything again, publish all changed files in one commit, and return the result.
 
     Args:
         address: a folder with a bare repository, or a URL that git clones.

@@ -1,1 +1,1 @@
-"""The audit: checks the signature of each commit, and the files that the commit changed."""
+"""Audits commits: checks their signatures, their generated files, and which files they changed."""

@@ -14,7 +14,7 @@ from demandops.staterepo.history.commit_log import entry_of
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts, each with what the check of the commit's signature found.
+    """Check the commits' signatures, and return the verdicts with the results of the check.
 
     If a required signature is missing or not valid, ``holds`` becomes false.
     """

@@ -47,7 +47,7 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     """Yield the files that a commit of the generator changed, but was not allowed to change.
 
     These are files that people write, claims of demands that the message does not name, claims in
-    another format than the generator's, and records that the operation must not change.
+    another format than the generator's, and records that the commit's operation must not change.
     """
     if not commit.parents:
         return

@@ -8,7 +8,7 @@ To verify a commit by differences, the program starts from the commit that it ve
 assumes that equal object ids mean equal files, and that plans and rendered files depend only on
 their input. It does not rely on the generator's choice of the affected releases. Instead, it plans
 and renders a release again if any input of the release's plan changed
-(:mod:`demandops.plan.views.traced_plan`), and compares every file that differs in Git.
+(:mod:`demandops.plan.views.traced_plan`). Then it compares the ids of all generated files.
 """
 
 from __future__ import annotations
@@ -87,10 +87,9 @@ class _Proof:
         self._render(())
 
     def can_advance_to(self, commit: Commit) -> bool:
-        """Return whether :meth:`advance` may be called with a later commit.
+        """Return whether :meth:`advance` can go to a later commit.
 
-        It must not be called if the later commit has another configuration, other markers of ended
-        overrides or another problem report. Such a commit needs a new proof.
+        It cannot if the configuration, the problem report or a marker of an ended override differs.
         """
         roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
         return not trees.differ(self._commit.tree, commit.tree, roots)
@@ -122,10 +121,10 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Plan and render the affected releases, and those with an override that sets ``hold``.
+        """Plan and render the releases that ``changes`` or ``kept`` affect.
 
-        The affected releases are those of the claims in ``changes``, and those of the service
-        instances in ``kept``, whose kept replicas changed.
+        ``kept`` lists the service instances whose kept replicas changed. Releases with an override
+        that sets ``hold`` are always rendered again.
         """
         for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
             self._planned.pop(key, None)
@@ -143,7 +142,6 @@ class _Proof:
         return path, _blob(release_file.release_text(release, state.config, state.engine, current))
 
     def differing(self) -> tuple[str, ...]:
-        """Return the paths at which committed and rendered files differ, sorted."""
         wanted = self._undemanded | dict(self._planned.values())
         before = trees.parent_tree(self._commit)
         if before is not None and _holds(self.state):
@@ -209,7 +207,7 @@ def _loaded(repo: Repository, entry: LogEntry) -> State:
 
 
 def _differing_whole(commit: Commit, state: State) -> tuple[str, ...]:
-    """Render all files of a commit; return the paths at which committed files differ, sorted."""
+    """Render all generated files of a commit, and return the paths at which the commit differs."""
     before = trees.parent_tree(commit) if _holds(state) else None
     held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
     wanted = {path: _blob(text) for path, text in rendered_files(state, held).items()}

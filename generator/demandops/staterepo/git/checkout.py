@@ -21,7 +21,7 @@ def is_checkout(folder: Path) -> bool:
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the checkout of a state repo that is or contains ``folder``, or None."""
+    """Return the nearest checkout of a state repo, from ``folder`` upwards, or None."""
     return next((one for one in (folder, *folder.parents) if is_checkout(one)), None)
 
 

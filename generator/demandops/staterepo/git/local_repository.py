@@ -147,9 +147,9 @@ class LocalRepository(StateRepository):
             raise reason from None
 
     def _break_stale_lock(self) -> None:
-        """Remove the branch's lock if a killed process left it.
+        """Remove the branch's lock if it is so old that a killed process must have left it.
 
-        The age of the lock counts from when this process first saw it, by the monotonic clock.
+        The age counts from the time when this process first saw the lock, by the monotonic clock.
         """
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:

@@ -1,8 +1,8 @@
 """New objects of a state repo: kept in memory, then written to the disk as one pack.
 
-A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each. The
-pack has every object in memory that the commits need, even if the repository already has the object
-as a loose object. The loose object may not be on the disk yet, or git may soon prune it.
+A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each. Every
+new object that the commits need goes into the pack, even if the repository already has a loose copy
+of the object. The copy may not be on the disk yet, or git may soon prune it.
 """
 
 from __future__ import annotations
@@ -68,7 +68,10 @@ class NewObjects(pygit2.OdbBackend):
 
     @property
     def repo(self) -> Repository:
-        """The repository. The writer must keep a reference: this object's reference is weak."""
+        """The repository.
+
+        The writer must keep a reference to the repository, because this object has only a weak one.
+        """
         repo = self._repo()
         assert repo is not None  # noqa: S101 - its writer has a strong reference
         return repo
@@ -172,7 +175,7 @@ class NewObjects(pygit2.OdbBackend):
                     keep.unlink()
 
     def _copy_to_pack(self, folder: str, revisions: str) -> Path:
-        """Have git write the objects that ``revisions`` selects to a synced pack in ``folder``.
+        """Let git write a synced pack into ``folder``, with the objects that ``revisions`` selects.
 
         Return the pack's path. Git packs each object anew, so it reads and checks each object.
         """
@@ -211,7 +214,6 @@ class NewObjects(pygit2.OdbBackend):
     # ---- called by libgit2 ----
 
     def __iter__(self) -> Iterator[Oid]:
-        """Iterate over the ids of the new objects."""
         return iter(self._known)
 
     def exists_cb(self, oid: Oid) -> bool:

@@ -26,7 +26,7 @@ _SHORT_OFFSETS = 1 << 31
 
 
 class Packed(NamedTuple):
-    """An object in a pack: its id, the checksum of its packed bytes, and their offset."""
+    """An object in a pack: its id, and the checksum and the offset of its packed bytes."""
 
     oid: bytes
     crc: int
@@ -54,11 +54,7 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
 
 
 def _header(kind: int, size: int) -> bytes:
-    """Return the header of an object in a pack: its type and size.
-
-    The first byte has the type and four bits of the size. Each further byte has seven bits of the
-    size.
-    """
+    """Return the header of an object in a pack: the object's type and size."""
     first, size = kind << 4 | size & 0xF, size >> 4
     header = bytearray()
     while size:

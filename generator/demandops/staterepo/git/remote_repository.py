@@ -336,7 +336,7 @@ class RemoteRepository(StateRepository):
     def _unreadable(self) -> Unavailable:
         return Unavailable(
             f"{self.address} cannot be fetched or pushed: its clone {self._folder} cannot be read; "
-            "check the clone's owner and disk, then start again; a damaged clone is made anew"
+            "check the clone's owner and disk, then start again, which replaces a damaged clone"
         )
 
     def _disk_full(self) -> DiskFull:

@@ -166,12 +166,10 @@ def is_readme(path: str) -> bool:
 
 
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Write a changed tree, and return the new tree's id.
+    """Write the tree ``base`` with the changes in ``files``, and return the new tree's id.
 
-    The new tree is ``base``, but each path in ``files`` has the text that ``files`` maps it to, or
-    no file if the text is None.
-    Only the folders above a changed file are written again. A folder that becomes empty is
-    removed, because Git has no empty folders.
+    ``files`` maps paths to new texts; None removes the file. Only the folders above a changed file
+    are written again. A folder that becomes empty is removed, because Git has no empty folders.
     """
     return _write(objects, base.id if base is not None else None, files) or objects.add_folder({})
 

@@ -101,7 +101,7 @@ def _fault(signature: str, state: str) -> str:
 def _check_with_git(
     repo: Repository, allowed: str, commits: list[str]
 ) -> dict[str, tuple[str, str]]:
-    """Return a map from commit to git's letter for its signature, and the signer.
+    """Return a map from commit to (git's letter for the signature, name of the signer).
 
     ``allowed`` is the text of the list of keys.
     """

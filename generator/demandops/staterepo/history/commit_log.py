@@ -269,7 +269,7 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
     """Return the path of the file of the release ``name``.
 
-    If the release was stopped, return its last path. Return None if it never existed.
+    If the release was stopped, return its last path. If it never existed, return None.
     """
     if not _NAME.fullmatch(name):
         return None

@@ -115,7 +115,6 @@ def _demands(decision: Decision) -> Iterable[str]:
 
 
 def _list(head: str, items: Iterable[object]) -> list[str]:
-    """Return ``head`` and a line for each item; without items, return no lines."""
     lines = [f"  {item}" for item in items]
     return [head, *lines] if lines else []
 
@@ -195,10 +194,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
 
 
 def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
-    """Return the further trailers of a rollback, a drain or a decommission.
-
-    Any other operation has none.
-    """
+    """Return the further trailers of a rollback, a drain or a decommission."""
     request = decision.request
     if isinstance(request, Restoration):
         return [("Restores", request.to), ("Reason", request.reason)]

@@ -115,7 +115,7 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
 ) -> list[ClaimChange]:
-    """Return people's changes to claims, compared with the claims that the generator last wrote.
+    """Return the claims that people added or edited, each with what the generator last wrote.
 
     Args:
         repo: the repository.
@@ -139,8 +139,8 @@ def claims_by_people(
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     """Return the request to roll back to the ledger of the commit ``to``.
 
-    ``more`` are the other fields of the request. Raises InvalidInput if claim files of the commit
-    are not valid, with all their faults.
+    ``more`` are the other fields of the request. If claim files of the commit are not valid, raises
+    InvalidInput with all their faults.
     """
     commit = trees.commit_of(repo, to)
     found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())

@@ -45,7 +45,7 @@ class Problem:
 
 
 Origin = Callable[[str], tuple[str, str] | None]
-"""Path of a file → id and author of the commit that caused the file's fault; None if unknown."""
+"""Gets a file's path; returns id and author of the commit that caused the file's fault, or None."""
 
 
 def with_origins(
@@ -54,8 +54,8 @@ def with_origins(
     """Return a problem for each fault.
 
     A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds them.
-    A problem that :func:`write` leaves out of the report gets neither. The report could not
-    keep them, so the generator would search the history again for each demand.
+    If :func:`write` leaves a problem out of the report, the problem gets no commit and no author:
+    the report could not keep them, so the generator would search for them again at each demand.
     """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     found = sorted({(fault.file, fault.field, fault.message) for fault in faults})

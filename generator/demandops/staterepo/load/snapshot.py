@@ -227,15 +227,14 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
 
 
 _judged: dict[object, LastValidConfig] = {}
-"""Arguments → result of the newest calls of :func:`_last_valid_config`.
+"""The results of the newest calls of :func:`_last_valid_config`, by their arguments.
 
-With these results, an invalid file is judged only once, and not again for each demand.
+So an invalid file is judged only once, and not again for each demand.
 """
 _MOST_JUDGED = 8
 
 
 def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
-    """Return the configuration of a commit, with the last valid versions of invalid files."""
     key = (
         frozenset(before.config_source.files(repo).items()),
         frozenset(ConfigSource(to).files(repo).items()),

@@ -1,1 +1,1 @@
-"""Checks pull requests: reads a checkout of a state repo before a person merges the edit."""
+"""Checks pull requests: whether the edits in a checkout of a state repo can be merged."""

@@ -25,7 +25,7 @@ _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
     "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
-    "git fetch --unshallow origin (in a pipeline fetch-depth: 0, or GIT_DEPTH: 0)"
+    "git fetch --unshallow origin (in a pipeline, set fetch-depth: 0 or GIT_DEPTH: 0)"
 )
 
 

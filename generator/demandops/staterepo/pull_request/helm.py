@@ -1,4 +1,4 @@
-"""Runs ``helm`` on charts, and reads the rendered objects' kinds, or faults, from its output.
+"""Runs ``helm`` on charts, and parses its output: kinds of rendered objects, or faults.
 
 Helm gets a home folder of its own, and has no access to a cluster or to chart repositories.
 """

@@ -178,8 +178,6 @@ def _generated(path: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Edit:
-    """The files of an edit, the commit that it started from, and the time of the check."""
-
     files: Mapping[str, str]
     start: Base | None
     now: datetime
@@ -191,7 +189,6 @@ class _Edit:
 
     @property
     def changed(self) -> list[str]:
-        """The paths that the edit changed, sorted."""
         before, after = self.before, self.files
         return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
 
@@ -207,9 +204,9 @@ class _Edit:
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
         """Return the generated files before the merge, as path → text.
 
-        These are the files before the edit, with one exception. At a path where the merge target
-        already equals ``wanted``, the result equals ``wanted`` too, because the merge changes
-        nothing at this path.
+        ``wanted`` has the generated files after the merge. The result has the files before the
+        edit. But if the merge target already equals ``wanted`` at a path, the merge changes nothing
+        at this path, so the result equals ``wanted`` too.
         """
         found, there = self.generated, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
@@ -228,9 +225,9 @@ class _Edit:
         version = config.repo_settings.render_version
         if version < RENDER_VERSION:
             message = (
-                f"is {version}, but this program renders version {RENDER_VERSION}; check with the "
-                "generator's version of the program, or run `demandops upgrade` to render "
-                "everything again"
+                f"is {version}, but this program renders version {RENDER_VERSION}; run this "
+                "check with the same program version as the generator, or run `demandops upgrade` "
+                "to render everything again"
             )
             raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
         return config

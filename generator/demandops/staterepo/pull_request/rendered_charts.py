@@ -1,6 +1,6 @@
-"""Has helm lint the charts of a checkout, and render them with the values of planned releases.
+"""Lints the charts of a checkout with helm, and renders them with the values of planned releases.
 
-Each chart is also rendered for an example demand of each application. The kinds of the rendered
+The charts of each application are also rendered for an example demand. The kinds of the rendered
 objects are compared with those that the access domain allows. If an edit does not change a chart,
 the chart is rendered only for the examples, and for the releases whose values the edit changes.
 """
@@ -110,7 +110,6 @@ class _Run:
         self._warnings: dict[Fault, None] = {}
 
     def result(self) -> RenderedCharts:
-        """Return the results that are collected so far."""
         return RenderedCharts(
             tuple(sorted(self._rendered)),
             self._counts[False],
@@ -229,6 +228,6 @@ class _Run:
                 message = (
                     f"renders a {kind}, which is not among the kinds of access domain "
                     f"'{domain.name}', so the domain's cluster would refuse the object; add the "
-                    f"kind to kinds in {file}, or leave the object out"
+                    f"kind to the domain's `kinds` in {file}, or leave the object out"
                 )
                 yield fault("", message).within(str(release.chart.folder))

@@ -183,7 +183,6 @@ class CommitBatch:
         return self._rendered_subjects(accepted, before, now)
 
     def _rendered_whole(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Render everything with the changed configuration, and return the effect."""
         marked = last_valid_config.end_markers_at(self._tree)
         state = accepted.snapshot.state
         applied = update_ledger(before.state, state, accepted.subjects, marked, now)

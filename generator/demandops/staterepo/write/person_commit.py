@@ -158,7 +158,6 @@ def _commit(
 
 
 def _faults(tree: Tree) -> set[Fault]:
-    """Return the faults of the configuration in a tree."""
     try:
         last_valid_config.config_at(tree)
     except InvalidInput as error:

@@ -37,7 +37,7 @@ _MAX_SLUG = 40
 
 
 class BranchMoved(StateRepoError):
-    """Raised when a branch is not at the commit that the generator put there."""
+    """Raised when a branch is not at the commit where the generator left it."""
 
     def __init__(self, branch: str) -> None:
         super().__init__(f"{branch} was changed by someone other than the generator")
@@ -236,7 +236,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
 
 @lru_cache(maxsize=100)  # a page lists the proposals again and again
 def _warn_of_unreadable(name: str) -> None:
-    log.warning("%s names no commit that can be read; delete this branch", name)
+    log.warning("the branch %s points to no commit that can be read; delete the branch", name)
 
 
 def _all_of(entries: Iterable[commit_log.LogEntry], key: str) -> tuple[str, ...]:
