@@ -262,7 +262,7 @@ class RemoteRepository(StateRepository):
     def fetch_branches(self, prefix: str) -> None:
         """Fetch the branches whose names begin with ``prefix``, or raise RemoteAway.
 
-        Branches that the remote has deleted are removed here too.
+        If the remote has deleted such a branch, this clone deletes its copy of the branch.
         """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         self._read(self._git, ("fetch", "--no-tags", "--prune"), spec)

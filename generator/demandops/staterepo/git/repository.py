@@ -105,7 +105,7 @@ class StateRepository(ABC):
     """The objects that were written since the last publication."""
     address: str
     signer: Signer | None = None
-    """Signs the commits that this process makes. If it is None, they are not signed."""
+    """Signs the commits that this process makes. If None, the commits are not signed."""
     runtime: Runtime = REAL
     """The clock, randomness and threads of the code that writes to the state repo."""
     always_current: bool
@@ -200,7 +200,7 @@ class StateRepository(ABC):
         """End the running transfer with a remote, if any."""
 
     def tidy(self) -> None:
-        """Have git join the packs in the background, unless git is still joining them."""
+        """Start git in the background to join the packs, unless it is still joining them."""
         if self._tidying is not None and self._tidying.poll() is None:
             return
         self._tidying = subprocess.Popen(

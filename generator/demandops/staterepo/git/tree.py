@@ -22,7 +22,7 @@ MAX_DEPTH = 64
 
 
 def commit_of(repo: Repository, revision: str | Oid) -> Commit:
-    """Return the commit of a revision that Git knows, or raise StateRepoError."""
+    """Return the commit that ``revision`` names, or raise StateRepoError."""
     try:
         found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
         return found.peel(Commit)

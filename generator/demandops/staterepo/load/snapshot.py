@@ -43,7 +43,7 @@ ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
 class Snapshot:
     """A commit and its state: configuration and ledger.
 
-    ``problems``: the faults of invalid files; their last valid versions are in effect.
+    ``problems``: the faults of invalid files. The last valid versions of the files are in effect.
     ``last_valid_commit``: the newest commit without problems.
     ``quarantined_files``: ledger files whose content at this commit is not in effect.
     ``other_config_source``: the source of the configuration in effect; None means this commit.

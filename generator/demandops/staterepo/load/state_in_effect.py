@@ -186,7 +186,7 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """Changes by people, and their faults with the new and with the old configuration.
+    """People's changes, and the faults of the changes with the new and with the old configuration.
 
     If a subject can be planned with neither configuration, its claims are at fault. If it can be
     planned with the old configuration but not with the new one, the new configuration is at fault.

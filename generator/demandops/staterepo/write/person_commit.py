@@ -65,8 +65,8 @@ def commit_to_main(
 
     Args:
         repository: the state repo.
-        make: gets a function that reads the files on main, and returns the files to commit. It is
-            called again if main gets other commits meanwhile.
+        make: returns the files to commit. Its argument is a function that reads a file on main. If
+            main gets other commits meanwhile, ``make`` is called again.
         author: the person, the time and the message.
 
     Raises:

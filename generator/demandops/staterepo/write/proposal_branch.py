@@ -56,7 +56,7 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The newest commit of main, and the newest commit of each proposal's branch, by its name."""
+    """The newest commit of main, and the newest commit of each proposal's branch."""
 
     main: str
     branches: dict[str, str]
