@@ -106,7 +106,7 @@ class TestInit:
         folder = tmp_path / "state"
         ran = demandops("init", folder)
         assert "kubectl" not in ran.out
-        assert "no cluster can follow it yet: set the url" in ran.out
+        assert "no cluster can follow the state repo yet: set the url" in ran.out
         assert not (folder / "bootstrap").exists()
         root = folder / "demandops.yaml"
         root.write_text(
@@ -788,7 +788,7 @@ class TestUsage:
         assert (ran.code, ran.out) == (3, "")
         assert ran.err == (
             "error: a fault of demandops itself: RuntimeError: boom\n"
-            "please report it, with what the same command prints if it is run as `demandops -v …`\n"
+            "please report this error, and what the same command prints with -v: `demandops -v …`\n"
         )
 
     def test_the_process_ends_with_the_code(self, state: Any, data_home: Path) -> None:

@@ -66,7 +66,7 @@ def test_the_views_show_the_running_and_the_demanded_version(
     assert send("second", "testing").code == 0
     where = ("--state-repo", state.path)
     told = demandops("bookkeeping", *where).out
-    assert told.count("  1.1.0, testing asked by second  ") == 2
+    assert told.count("  1.1.0, testing requested by second  ") == 2
     versions = {
         "version": "0.1.0",
         "application_version": "1.1.0",
@@ -76,7 +76,7 @@ def test_the_views_show_the_running_and_the_demanded_version(
     rows = demandops("status", *where, "--output", "json").json()["releases"]
     (row,) = [each for each in rows if each["name"] == DETECTION]
     assert {key: books[key] for key in versions} == {key: row[key] for key in versions} == versions
-    assert "testing asked by second" in demandops("status", *where).out
+    assert "testing requested by second" in demandops("status", *where).out
     why = demandops("why", DETECTION, *where).out
     assert "    demand second, request 'second', version testing\n" in why
     assert "  registry/versions.yaml applications.object-detection-fusion.versions.1.1.0:" in why

@@ -89,7 +89,7 @@ def print_json(data: object) -> None:
 
 
 def faults_of(error: DemandOpsError) -> list[Json]:
-    """Return an error's faults as JSON data; an error without a list of faults counts as one."""
+    """Return an error's faults as JSON data; an error without a list counts as one fault."""
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
     return [asdict(each) for each in dict.fromkeys(faults)]
 
@@ -179,10 +179,7 @@ def override_data(override: Override, effects: Iterable[str] | None = None) -> J
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return the value of an effect as plain data, as the override's file has it.
-
-    A patch keeps its null values.
-    """
+    """Return an effect's value as the override's file has it, including the nulls of a patch."""
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value

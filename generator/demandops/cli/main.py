@@ -58,7 +58,7 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Name of a command → the package that has the command's module, and the command's short help."""
+"""Maps a command's name to the package of the command's module and to the short help."""
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
@@ -102,7 +102,6 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Import the named command; return its name, the command, and its other arguments."""
         name, command, rest = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             slow_git.listen(show_slow)
@@ -163,7 +162,7 @@ def run(args: list[str] | None = None) -> int:
         logging.getLogger("demandops").debug("a fault of the program", exc_info=True)
         errors.print(
             f"error: a fault of demandops itself: {type(error).__name__}: {error}\n"
-            "please report it, with what the same command prints if it is run as `demandops -v …`"
+            "please report this error, and what the same command prints with -v: `demandops -v …`"
         )
         if logging.getLogger().isEnabledFor(logging.INFO):
             logging.exception("traceback")

@@ -133,7 +133,7 @@ def version_lines(data: Mapping[str, Any]) -> list[str]:
     asked = data["versions_asked"].items()
     return [
         data["application_version"] or data["version"] or "",
-        *(f"{version} asked by {', '.join(requesters)}" for version, requesters in asked),
+        *(f"{version} requested by {', '.join(requesters)}" for version, requesters in asked),
     ]
 
 

@@ -156,7 +156,6 @@ def _wrapped(lines: Iterable[str], width: int) -> list[str]:
 def _laid_out(
     cells: Sequence[Sequence[str]], widths: Sequence[int], paint: Callable[[str], str] = str
 ) -> Iterator[str]:
-    """Yield the printed lines of one row, given the lines and the width of each cell."""
     for number in range(max(len(cell) for cell in cells)):
         parts = [cell[number] if number < len(cell) else "" for cell in cells]
         padded = (

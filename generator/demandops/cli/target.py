@@ -30,8 +30,8 @@ _NAME = "demandops.context-name"
 _CONTEXT = "demandops.context"
 _BEHIND = "demandops.checkout-behind"
 _NO_STATE_REPO = (
-    "Which state repo? Give --state-repo, run the command in a checkout of one, or name it once: "
-    "demandops config set NAME --state-repo URL_OR_DIR"
+    "Which state repo? Give --state-repo, run the command in a checkout, or name a state repo "
+    "once: demandops config set NAME --state-repo URL_OR_DIR"
 )
 
 

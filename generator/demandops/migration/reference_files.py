@@ -2,8 +2,8 @@
 
 Each operator keeps two files. The bookkeeping file maps a resource to the list of requesters that
 hold the resource. A requester is listed as often as it joined. A fusion has such a list for each
-topic. The versioning file maps a resource to its requests, each under the version of the resource
-that the request led to.
+topic. The versioning file maps a resource to its requests. The key of each request is the version
+that the resource got by this request.
 
 A file is recognized by its content, so it may have any name. Only a bookkeeping file without
 entries (``{}``) is recognized by its name.
@@ -200,7 +200,7 @@ class ReferenceFiles:
 
 
 def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
-    """Return the content of all documents. Each pair is a file's name and a document of it.
+    """Return the content of all documents. Each document is paired with the name of its file.
 
     Raises:
         InvalidInput: with the faults of all files.

@@ -1,8 +1,8 @@
 """A new application: its definition, values, chart, registry entries, README and example demand.
 
 The application's services form a chain: the first service reads the application's inputs, and each
-further service reads the outputs of the service before it. Launch files of one image start all
-services. Pure.
+further service reads the outputs of the service before it. One image contains the launch files
+of all services. Pure.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _role(name: str) -> str:
 
 
 def _prefixes(plan: ApplicationPlan, config: Config) -> dict[str, str]:
-    """Return a free prefix of release names for each service."""
+    """Return for each service a prefix of release names that nothing else uses."""
     taken = {kind.word for kind in CONNECTION_TYPES}
     taken |= {one.prefix for found in config.services.values() for one in found.values()}
     taken |= {one.prefix for one in config.definitions.values()}
@@ -241,7 +241,7 @@ def _chart_values(plan: ApplicationPlan) -> str:
     first = plan.services[0]
     return f"""\
 # Values of this chart, besides those of {LIBRARY_FOLDER}: probes, resources, rights and more.
-# The templates in ../../values/ write those of a release.
+# The templates in ../../values/ write the values of each release.
 
 image:
   # -- Name of the image, with its registry, without tag or digest.
@@ -276,7 +276,8 @@ def _readme(plan: ApplicationPlan) -> str:
 | --- | --- | --- |
 {rows}
 A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas) and
-`{_RESULT}_topic`. The templates in `values/` name them: change both together.
+`{_RESULT}_topic`. The templates in `values/` set these arguments. So if you rename an argument,
+change the launch file and the template.
 
     demandops check .                                            # after each edit
     demandops request --dry-run appdefs/{plan.name}/demand.yaml   # what the example would do
@@ -300,7 +301,6 @@ def _requester(plan: ApplicationPlan, config: Config) -> str:
 
 
 def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
-    """Return the rules of the example's access domain that allow the application on its node."""
     domain = config.domain_of.get(plan.node)
     return tuple(
         rule
@@ -310,7 +310,7 @@ def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
 
 
 def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
-    """Return the access domain of the example demand's node if its rules do not allow the demand.
+    """Return the access domain whose rules refuse the example demand.
 
     Return None if the rules allow the demand, or if there are no rules.
     """

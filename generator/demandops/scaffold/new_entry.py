@@ -73,5 +73,5 @@ def override(
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
     path = f"overrides/{name}.yaml"
     fields = {"reason": reason, "owner": owner, "select": [dict(select)], **effect}
-    note = "overrides/README.md lists what else an override can do, until when, and for what."
+    note = "overrides/README.md lists all effects and selectors of overrides, and when they end."
     return {path: document(path, "override", "Override", fields, note)}

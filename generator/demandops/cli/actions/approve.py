@@ -75,7 +75,7 @@ def approve(
 
     The generator then answers the demand and removes the branch. If main has changed the same
     files since the proposal was made, the command merges nothing. In this case, wait until a
-    running generator has made the branch anew, and then approve the proposal again.
+    running generator has rebuilt the branch, and then approve the proposal again.
 
     \b
     Examples:

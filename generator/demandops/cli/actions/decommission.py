@@ -71,8 +71,8 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     For a node, the command releases the applications on the node, the inputs that come from the
     node, and the connections from and to the node, for every requester. Then you can delete the
     node from the inventory. For a requester, the command releases all claims of this requester,
-    even those that other requesters share. If NAME is both a node and a requester, the command
-    does both. At a terminal, the command first shows the consequences and asks.
+    even claims that also name other requesters. If NAME is both a node and a requester, the
+    command does both. At a terminal, the command first shows the consequences and asks.
 
     \b
     Examples:
@@ -131,7 +131,6 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
-    """Return whether ``error`` says only that no claim concerns a node of the inventory."""
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 

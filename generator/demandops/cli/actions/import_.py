@@ -41,8 +41,8 @@ from demandops.staterepo import reader
     required=True,
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The map from the reference's names to applications and connections. If this file does "
-    "not exist, the command writes a proposed map there and books nothing.",
+    help="The file that maps the reference's names to applications and connections. If the file "
+    "does not exist, the command writes a proposed map to it and books nothing.",
 )
 @dry_run_option
 @click.option(
@@ -115,7 +115,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return one pair in a list: ``cluster NAME``, and the reference's resources in the cluster."""
+    """Return the reference's resources in a cluster as one document, with a name for messages."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

@@ -50,7 +50,6 @@ def override() -> None:
 
 
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    """Return ``name``; raise BadParameter if an override cannot have this name."""
     if not is_override_name(name):
         raise click.BadParameter(
             f"{quoted(name)} is not a valid override name; use lower-case letters, digits and '-'"
@@ -215,7 +214,7 @@ def _values(file: str | None) -> dict[str, Any] | None:
 
 
 def ends_at(text: str | None) -> str | None:
-    """Return the end of an override in the format of its file, or None if ``text`` is None.
+    """Return the end of an override as the file has it, or None if ``text`` is None.
 
     ``text`` is a time, or a duration from now.
     """

@@ -114,7 +114,7 @@ class EditOptions:
 
 
 def editing(command: Command) -> Command:
-    """Return the command, to which the options of :class:`EditOptions` are added.
+    """Add the options of :class:`EditOptions` to a command; return the command.
 
     The command gets the values of these options as one argument, ``options``.
     """

@@ -179,11 +179,7 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
 
 
 def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
-    """Return a refusal for each document, as a row of the output.
-
-    The caller has found that at least one document does not parse. The refusal of a document that
-    parses says that another document does not.
-    """
+    """Return a refusal for each document, because at least one of them does not parse."""
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
     rows = []

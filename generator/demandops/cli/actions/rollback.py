@@ -65,10 +65,10 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     """Restore the claims of an earlier commit, by a new commit.
 
     Claims that were released after the earlier commit are booked again, with the current
-    configuration. Claims that were booked after it prevent the rollback, unless you give
-    --drop-newer. The lease of a restored claim starts again with its full term. REV is a commit.
-    TIME selects the newest commit at or before this time. At a terminal, the command first shows
-    the consequences and asks.
+    configuration. Claims that were booked after the earlier commit prevent the rollback, unless
+    you give --drop-newer. The lease of a restored claim starts again with its full term. REV is a
+    commit. TIME selects the newest commit at or before this time. At a terminal, the command first
+    shows the consequences and asks.
 
     \b
     Examples:
@@ -126,9 +126,8 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    ``base`` is the commit for which the caller has computed the consequences. The result contains
-    consequences only if those for ``base`` are wrong, because the rollback was refused, changed
-    nothing, or was decided on a newer commit.
+    The caller has computed the consequences on top of the commit ``base``. The result corrects
+    these consequences if the rollback is refused, changes nothing, or is decided on a newer commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:

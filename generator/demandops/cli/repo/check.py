@@ -104,10 +104,7 @@ def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return a map from path to diff, with at most ``most`` lines in all.
-
-    Also return how many lines are left out.
-    """
+    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines."""
     shown: dict[str, str] = {}
     left = 0
     for file in files:

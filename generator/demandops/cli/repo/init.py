@@ -91,19 +91,22 @@ def init(
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
-        lines.append("no cluster can follow it yet: set the url for the clusters in demandops.yaml")
+        lines.append(
+            "no cluster can follow the state repo yet: "
+            "set the url for the clusters in demandops.yaml"
+        )
     else:
         cluster = "c-its" if example == "experiment" else "CLUSTER"
         lines.append(
-            f"to make a cluster follow it: git -C {directory} show main:bootstrap/{cluster}.yaml | "
-            "kubectl apply -f -"
+            f"to make a cluster follow the state repo: git -C {directory} show "
+            f"main:bootstrap/{cluster}.yaml | kubectl apply -f -"
         )
     if bare:
         lines.append(f"to see or edit the files of the state repo: git clone {directory}")
     if example == "none":
         where = ", in the clone" if bare else ""
         lines += [
-            f"to fill it{where}: run demandops new node, edit inventory/brokers.yaml, and run",
+            f"to add a fleet{where}: run demandops new node, edit inventory/brokers.yaml, and run",
             "      demandops new application (--help has examples); then check, commit and push",
         ]
     if bare:

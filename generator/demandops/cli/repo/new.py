@@ -121,7 +121,7 @@ def application(  # noqa: PLR0913 - as many as options
         return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
 
     then = [
-        "to try the application once the files are on main: demandops request --dry-run "
+        "when the files are on main, try the application: demandops request --dry-run "
         f"{directory / 'appdefs' / name / 'demand.yaml'}",
     ]
     _lay_down(directory, made, output, then)
@@ -177,8 +177,8 @@ def policy(
     """Write a new access domain: who may demand what on which nodes.
 
     A node may match the patterns of only one access domain. A new state repo has one domain,
-    whose pattern "*" matches every node. So first narrow, in policy/access-domains.yaml,
-    the patterns that match the nodes of the new domain.
+    whose pattern "*" matches every node. So first edit the patterns in
+    policy/access-domains.yaml: none of them may match a node of the new domain.
 
     \b
     Examples:
@@ -383,11 +383,11 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     ),
     "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
 }
-"""For each option the arguments of :func:`_asked`: question, check, highest number of words."""
+"""Maps an option to the arguments of :func:`_asked` that ask for the option's values."""
 
 
 def _example_node(config: Config) -> str:
-    """Return the id of a node for the example demand; an edge server comes before other nodes."""
+    """Return the id of a node for the example demand: an edge server if there is one."""
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not nodes:
         raise StateRepoError(
@@ -405,7 +405,6 @@ def _lay_down(
     Args:
         directory: the checkout of the state repo.
         made: returns the new files for the current configuration.
-        output: the output format.
         then: further hints to print after the names of the files.
     """
     with busy("reading the state repo"):

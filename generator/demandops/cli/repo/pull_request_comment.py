@@ -60,7 +60,7 @@ def code(text: str) -> str:
 
 
 def fence(text: str, language: str) -> str:
-    """Return text as a fenced block of code in a language."""
+    """Return text as a fenced code block; ``language`` is the name for syntax highlighting."""
     text = lines(text)
     marks = _longer_than_any(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
@@ -98,7 +98,8 @@ def _suggestions(checked: CheckResult) -> Iterator[str]:
         if suggestion.not_covered:
             body += f"\nNo override can change {', '.join(map(code, suggestion.not_covered))}.\n"
         if suggestion.other_releases:
-            body += f"\nIt also applies to {', '.join(map(code, suggestion.other_releases))}.\n"
+            others = ", ".join(map(code, suggestion.other_releases))
+            body += f"\nThis override also applies to {others}.\n"
         yield _folded(f"Instead of editing {_plain(suggestion.instead_of)}", body)
 
 
@@ -165,7 +166,7 @@ def _plain(path: str) -> str:
 def _bounded(parts: list[str], longest: int) -> str:
     """Return the parts joined, in at most ``longest`` characters.
 
-    Leave out each part that does not fit in the remaining room, and append their number.
+    Parts that do not fit in the remaining room are left out, and a note says how many.
     """
     room = longest - _ROOM_FOR_NOTE
     taken, left = list[str](), 0

@@ -22,15 +22,15 @@ from demandops.staterepo.audit.verification import Verdict
 @click.option(
     "--whole",
     is_flag=True,
-    help="Load and render each commit completely. Without this option, the commits between the "
-    "first and the last are each verified by the differences from the commit before it.",
+    help="Load and render each commit completely. Without this option, each commit between the "
+    "first and the last is verified by its differences from the commit before it.",
 )
 @output_option
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
     """Render commits again from their ledger and compare the bytes.
 
     Once the state repo has policy/allowed-signers, each further commit of the generator must have a
-    good signature. The version of this file in the commit's parent must list the key
+    good signature. The version of this file in the commit's parent must list the signing key
     (docs/audit.md). REV, A and B are commits or times.
 
     \b

@@ -45,7 +45,6 @@ _COLORS = {
 
 
 def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
-    """Return the kind that ``value`` names in the singular or plural, as a key of ``KINDS``."""
     if value is None:
         raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
     for name in (value, f"{value}s"):

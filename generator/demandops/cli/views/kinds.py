@@ -48,8 +48,8 @@ class Kind:
     """A kind of thing: its items, each with a ``name``, and how they are shown.
 
     ``cells`` returns an item's cells, first for ``columns`` and then for ``wide``. Only ``-o wide``
-    shows the columns in ``wide``. ``filters`` maps the name of an option to a function that returns
-    the values of an item to compare with the option.
+    shows the columns in ``wide``. ``filters`` maps an option to a function from an item to
+    values. An item is listed if the option matches one of the values.
     """
 
     items: Callable[[Source], list[Json]]
@@ -73,7 +73,6 @@ def _demands(source: Source) -> list[Json]:
 
 
 def _now(state: str, lease: Lease | None, now: datetime) -> str:
-    """Return ``overdue`` if ``state`` is ``held`` and the lease has ended, else ``state``."""
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 
@@ -179,8 +178,6 @@ def _override_targets(item: Json) -> list[str]:
 
 
 def _key(name: str) -> Values:
-    """Return a function that returns an item's field ``name`` as a list."""
-
     def values(item: Json) -> Iterable[str]:
         found = item[name]
         return [found] if isinstance(found, str) else found or ()

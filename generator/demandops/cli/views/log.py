@@ -53,7 +53,6 @@ _TRAILERS = {
 
 
 def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
-    """Parse the option --since or --until; return its time, or None if it is not given."""
     if text is None:
         return None
     time = revisions.parse_time(text, REAL.now(), end=param.name == "until")
@@ -205,7 +204,7 @@ def _matching(
 ) -> Iterable[LogEntry]:
     """Return the commits that match every given filter.
 
-    ``trailers`` are values of commit trailers; their names are the keys of ``_TRAILERS``.
+    ``trailers`` maps keys of ``_TRAILERS`` to the values to match.
     """
     wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 

@@ -79,10 +79,10 @@ def status(
     """Show the state of each release on its cluster.
 
     The state is the commit that the cluster has applied, and the health of the release. The exit
-    code is 1 if a file is invalid, or if a generator has yet to write one. It is also 1 if a
-    cluster with a kubeconfig in --clusters does not answer, or has an old bootstrap file, an object
-    that belongs to no release, or a release that is not healthy. The state of a cluster without a
-    kubeconfig is unknown, which is no fault.
+    code is 1 if a file is invalid, or if a generator has yet to write or remove a file. It is also
+    1 if a cluster with a kubeconfig in --clusters does not answer, or has an old bootstrap file, an
+    object that belongs to no release, or a release that is not healthy. The state of a cluster
+    without a kubeconfig is unknown, which is no fault.
 
     \b
     Examples:
@@ -126,7 +126,7 @@ def _wait_until_healthy(
 ) -> Status:
     """Wait until nothing is wrong or ``timeout`` seconds have passed; return the last status.
 
-    ``patience_s`` is how many seconds each cluster has to answer.
+    A cluster may take ``patience_s`` seconds to answer.
     """
     end, told = REAL.monotonic() + timeout, ""
     while (amiss := found.amiss(clusters)) and REAL.monotonic() < end:

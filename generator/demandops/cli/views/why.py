@@ -96,7 +96,7 @@ def why(
 def _answer(
     repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int
 ) -> dict[str, Any]:
-    """Return the explanation as JSON data, with at most ``most`` of the object's changes."""
+    """Return the explanation as JSON data; ``most`` limits the list of changes."""
     answer: dict[str, Any] = {
         "commit": str(snapshot.commit),
         "kind": match.kind,
@@ -117,7 +117,7 @@ def _answer(
 
 
 def _missing(world: World, answer: dict[str, Any]) -> list[str]:
-    """Return why topics do not arrive, for all topics that the claims in ``answer`` need."""
+    """Return the reasons why inputs of the applications in ``answer`` do not arrive."""
     files = {one["file"] for one in answer.get("claims", ())}
     found = (one for one in missing_inputs(world) if one.file in files)
     return list(dict.fromkeys(f"application '{one.application}': {one.reason}" for one in found))
@@ -152,9 +152,9 @@ def _of_release(world: World, running: Release) -> dict[str, Any]:
 
 
 def _denied(world: World, match: Match) -> dict[str, Any]:
-    """Return JSON data on the override that denies a release, and on where the release would run.
+    """Return as JSON data which override denies a release, and where the release would run.
 
-    Return an empty mapping if ``match`` is not a release that an override denies.
+    Return an empty mapping if no override denies it.
     """
     if match.kind != "release":
         return {}
@@ -205,10 +205,7 @@ def _of_override(world: World, name: str) -> dict[str, Any]:
 
 
 def _held(world: World, what: str, held: Iterable[Claim]) -> dict[str, Any]:
-    """Return JSON data on the claims in ``held``, and on the releases that these claims need.
-
-    ``what`` is the text that describes the subject of the answer.
-    """
+    """Return JSON data on claims, and on the releases that these claims need."""
     claims = sorted(held, key=lambda claim: (str(claim.subject), claim.demand))
     needed = {
         one.name: one for claim in claims for one in release_causes.releases(world, claim.subject)
@@ -285,10 +282,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
 
 
 def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
-    """Return commits as JSON data.
-
-    For a commit that carries out commits of people, the data list these commits of people.
-    """
+    """Return commits as JSON data, each with the people's commits that it carries out."""
 
     def row(entry: LogEntry | None) -> dict[str, Any] | None:
         if entry is None:

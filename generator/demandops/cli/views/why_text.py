@@ -77,7 +77,7 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
         yield f"    {claim['file']}"
         if claim["place"] is not None:
             required = ", ".join(f"{name} {value}" for name, value in claim["place"].items())
-            yield f"    the application's node was chosen for {required or 'no requirement'}"
+            yield f"    the demand requires of the application's node: {required or 'nothing'}"
         if claim["services"]:
             nodes = ", ".join(f"{name} on {node}" for name, node in claim["services"].items())
             yield f"    services on nodes of their own: {nodes}"
@@ -87,7 +87,10 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
             yield f"    kept by {_override_text(claim['kept_by'])}"
             yield f"    to release it: {claim['release_by']} by pull request"
         else:
-            yield f"    to release it: {claim['release_by']}, or delete that file by pull request"
+            yield (
+                f"    to release it: {claim['release_by']}, or delete the claim's file by pull "
+                "request"
+            )
 
 
 def _override_text(override: Json) -> str:
@@ -107,8 +110,8 @@ def _history_lines(answer: Json) -> Iterator[str]:
         for entry in answer["changes"]:
             yield from _commit_lines(entry, why=False)
     if answer["more_changes"]:
-        git_log = f", or git log -- {answer['file']}" if answer["file"] else ""
-        yield f"  and {answer['more_changes']} earlier commits; to see them: -n{git_log}"
+        git_log = f", or run git log -- {answer['file']}" if answer["file"] else ""
+        yield f"  and {answer['more_changes']} earlier commits; to see them, raise -n{git_log}"
     if answer["started"]:
         yield "started by"
         yield from _commit_lines(answer["started"], why=True)
