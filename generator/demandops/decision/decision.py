@@ -177,7 +177,6 @@ _BY_NODE = frozenset(
 
 
 def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:
-    """Return whether a request whose nodes are chosen can be booked."""
     request, config = completed(request, state), state.config
     if any((*admission.faults(request, config), *permission.faults(request, config))):
         return False
@@ -195,7 +194,6 @@ def _decided(
     read: FileReader,
     on_stage: Callable[[Stage], None],
 ) -> Decision:
-    """Return the decision on an admitted request; see :func:`decide`."""
     config = state.config
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage())
@@ -291,10 +289,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return how much more the services request, as a map from (node, resource) to the amount.
-
-    The map is empty if no node has a capacity.
-    """
+    """Return the growth of the services' requests; empty if no node has a capacity."""
     return (
         capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
     )
