@@ -63,7 +63,7 @@ _OUTCOMES: dict[str, Outcome] = {
     "rollback": "restored",
     "wait": "waiting",
 }
-"""Operation → its outcome in the receipt.
+"""The outcome in the receipt, by operation.
 
 The outcome of an operation that is not listed is ``released``.
 """
@@ -162,8 +162,8 @@ def decide(
         by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
         if not by_node or not leaves_nodes_open(state, goal):
             raise
-        # Look for nodes on which the demand is not refused. Booking it on many nodes on trial takes
-        # time, but only a demand that is refused on the nodes chosen first takes this time.
+        # Look for nodes on which the demand is not refused. To try many nodes takes time, but only
+        # a demand that is refused on the nodes chosen first takes this time.
         with suppress(Refused):
             request = admit(state, goal, throttle, partial(_can_be_booked, state, now))
             return _decided(state, request, now, read, once)

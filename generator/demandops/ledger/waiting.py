@@ -119,7 +119,7 @@ def read(text: str, path: str) -> WaitingDemand | None:
         return None
     if not demand_goal.is_demand_goal(file.goal):
         return None
-    put, _ = demand_goal.parse(file.goal)  # its faults are told when it is booked
+    put, _ = demand_goal.parse(file.goal)  # the booking reports the goal's faults
     if not isinstance(put, Put) or put.demand != file.demand:
         return None
     since = parse_timestamp(file.since)

@@ -116,7 +116,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
     """Yield the faults of restored claims that are not valid in the current configuration."""
     for change in _changes(world.ledger, request):
         after = change.after
-        if after is None or after.keeping_override is not None:  # only demands' claims are checked
+        if after is None or after.keeping_override is not None:  # kept claims are not checked
             continue
         booking = request_for(after)
         for found in (
