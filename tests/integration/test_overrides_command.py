@@ -222,4 +222,4 @@ def test_why_names_the_override_that_keeps_a_claim(
     assert (claim["requesters"], claim["kept_by"]["file"]) == (["petra"], "overrides/lasting.yaml")
     told = demandops("why", "od-edge-vehicle00", *where).out.splitlines()
     assert "    kept by overrides/lasting.yaml: keep (priority 0), of petra: why" in told
-    assert "    to release it: remove keep from overrides/lasting.yaml by pull request" in told
+    assert "    to release it: remove 'keep' from overrides/lasting.yaml by pull request" in told

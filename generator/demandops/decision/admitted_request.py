@@ -40,7 +40,7 @@ def admitted(
 ) -> DemandRequest:
     """Return the request that a goal becomes.
 
-    If nothing but room on a node is lacking, the result is a request to wait for room.
+    If the demand lacks only room on a node and may wait, the result is a request to wait for room.
 
     Raises:
         Refused: if the demand can neither be booked nor wait. A demand that already holds claims
@@ -82,8 +82,8 @@ def admit(
     this node.
 
     Raises:
-        Refused: with every fault in the form and in the content of the goal. ``throttle`` is called
-            only if there is no such fault. Then its faults refuse the request.
+        Refused: with every fault in the form and in the content of the goal. If there is none,
+            with every fault that ``throttle`` yields.
     """
     config, ledger = state.config, state.ledger
     not_placed: list[Fault] = []
@@ -152,7 +152,6 @@ def leaves_nodes_open(state: State, goal: object) -> bool:
 
 
 def _refuse_large(request: DemandRequest, config: Config) -> None:
-    """Raise :class:`Refused` if a request is too large for the limits of the settings."""
     faults = list(admission.size_faults(request, config.repo_settings.limits))
     if faults:
         raise Refused(faults)
@@ -166,7 +165,6 @@ def form_faults(goal: object) -> list[Fault]:
 
 
 def _with_parents(field: str) -> Iterator[str]:
-    """Yield a field and every field that contains it."""
     yield field
     for match in re.finditer(r"[.\[]", field):
         yield field[: match.start()]

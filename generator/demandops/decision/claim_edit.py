@@ -66,7 +66,6 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
 
 
 def _above_capacity(change: ClaimChange, after: State) -> Iterator[Fault]:
-    """Yield a fault for each capacity of a node that a person's change of a claim exceeds."""
     without = replace(after, ledger=after.ledger.replace(change.key, change.before))
     with suppress(Refused):  # other checks report a claim that cannot be planned
         grown = capacity.growth_by(without, after, [change])

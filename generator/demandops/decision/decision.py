@@ -63,7 +63,7 @@ _OUTCOMES: dict[str, Outcome] = {
     "rollback": "restored",
     "wait": "waiting",
 }
-"""Operation → its outcome in the receipt.
+"""The outcome in the receipt, by operation.
 
 The outcome of an operation that is not listed is ``released``.
 """
@@ -162,8 +162,8 @@ def decide(
         by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
         if not by_node or not leaves_nodes_open(state, goal):
             raise
-        # Look for nodes on which the demand is not refused. Booking it on many nodes on trial takes
-        # time, but only a demand that is refused on the nodes chosen first takes this time.
+        # Look for nodes on which the demand is not refused. To try many nodes takes time, but only
+        # a demand that is refused on the nodes chosen first takes this time.
         with suppress(Refused):
             request = admit(state, goal, throttle, partial(_can_be_booked, state, now))
             return _decided(state, request, now, read, once)
@@ -177,7 +177,6 @@ _BY_NODE = frozenset(
 
 
 def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:
-    """Return whether a request whose nodes are chosen can be booked."""
     request, config = completed(request, state), state.config
     if any((*admission.faults(request, config), *permission.faults(request, config))):
         return False
@@ -195,7 +194,6 @@ def _decided(
     read: FileReader,
     on_stage: Callable[[Stage], None],
 ) -> Decision:
-    """Return the decision on an admitted request; see :func:`decide`."""
     config = state.config
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage())
@@ -291,10 +289,7 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
 
 
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return how much more the services request, as a map from (node, resource) to the amount.
-
-    The map is empty if no node has a capacity.
-    """
+    """Return the growth of the services' requests; empty if no node has a capacity."""
     return (
         capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
     )

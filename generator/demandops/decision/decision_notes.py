@@ -69,14 +69,12 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
 
 
 def _repeat(changes: Changes) -> Iterator[str]:
-    """Yield a warning if the request repeats a shutdown that was carried out before."""
     if changes.repeats is not None:
         at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
         yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
 
 
 def _kept_replicas(changes: Changes, plans: Mapping[ReleaseKey, Release | None]) -> Iterator[str]:
-    """Yield a note for each service that has more replicas now than its demands need."""
     for release in (plans.get(ServiceKey.of(instance)) for instance in changes.kept):
         if isinstance(release, ServiceRelease) and release.keeps:
             until = format_time(release.keeps.until)

@@ -41,7 +41,7 @@ _VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
 
 def segment(exact: str) -> str:
     """Return a path segment for an id: readable, safe on every file system, and unique."""
-    # no id has half a character, but a trailer of a forged commit may
+    # only a trailer of a forged commit may have half a character
     digest = hashlib.sha256(exact.encode(errors="surrogatepass")).hexdigest()[:16]
     slug = re.sub(r"[^a-z0-9]+", "-", exact.lower()).strip("-")[:40].rstrip("-")
     return f"{slug}-{digest}" if slug else digest

@@ -238,7 +238,7 @@ class Ledger:
         return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
 
     def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
-        """Return the claims whose lease ended before ``now``, sorted by this end."""
+        """Return the claims whose lease ended before ``now``, sorted by the end of the lease."""
         over = (minute for minute in self.minutes if minute <= _minute(now))
         ended = [
             (claim.lease.expires_at, claim)
@@ -339,7 +339,6 @@ class Ledger:
             yield from claims
 
     def __len__(self) -> int:
-        """Return how many claims there are."""
         return sum(len(claims) for claims in self.claims.values())
 
 

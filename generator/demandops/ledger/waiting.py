@@ -111,7 +111,7 @@ class _WaitingFile(FrozenModel):
 def read(text: str, path: str) -> WaitingDemand | None:
     """Return the waiting demand in a file, or ``None`` if the file is not valid.
 
-    A goal of the reference's action, or of another demand, makes a file not valid.
+    The file is not valid if its goal is one of the reference's action or belongs to another demand.
     """
     try:
         file = parse_file(_WaitingFile, text, path)
@@ -119,7 +119,7 @@ def read(text: str, path: str) -> WaitingDemand | None:
         return None
     if not demand_goal.is_demand_goal(file.goal):
         return None
-    put, _ = demand_goal.parse(file.goal)  # its faults are told when it is booked
+    put, _ = demand_goal.parse(file.goal)  # the booking reports the goal's faults
     if not isinstance(put, Put) or put.demand != file.demand:
         return None
     since = parse_timestamp(file.since)

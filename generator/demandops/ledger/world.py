@@ -22,6 +22,5 @@ class World:
     overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Set ``overrides`` from the configuration and the ledger."""
         active = by_rank(still_active(self.config.overrides, self.ledger.ended))
         object.__setattr__(self, "overrides", active)

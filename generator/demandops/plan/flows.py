@@ -150,7 +150,6 @@ def flows(config: Config, app: Application) -> list[Flow]:
 
 
 def _deliveries(config: Config, app: Application) -> Iterator[Flow]:
-    """Yield the flows that deliver the application's outputs."""
     for index, delivery in enumerate(app.deliver):
         name, _, output = delivery.output.partition(".")
         service = config.services.get(app.appdef, {}).get(name)

@@ -28,11 +28,10 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
-    """Return the field that a fault of an implied connection names.
+    """Return the field of the goal to which a fault at ``path`` in an implied connection belongs.
 
-    The goal does not list the connection, so a fault at ``path`` in the connection names ``field``.
-    This is the goal's input, delivery or node because of which the connection is needed. Only a
-    fault in a requester names ``path``.
+    The goal does not list the connection, so this is ``field``: the input, delivery or node because
+    of which the connection is needed. But if the fault concerns a requester, this is ``path``.
     """
     return path if path.startswith("requesters") else field
 
@@ -114,7 +113,7 @@ def _with_topics(one: Demanded, topics: Iterable[Route]) -> Demanded:
 def without_idle_deliveries(
     before: Ledger, after: World, changes: Changes
 ) -> tuple[Ledger, Changes]:
-    """Return the ledger and the changes without deliveries of outputs that are no longer made.
+    """Return the ledger and changes, both without deliveries of outputs that are no longer made.
 
     If a node is decommissioned, a demand may lose an input, and with the input an output of its
     application. The demand may still hold the connection that delivers this output between two

@@ -117,8 +117,8 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
     """Return the ledger with ``further`` set in each input that is a further topic.
 
-    The claims are of an earlier format without ``further``. The usual topic of a source is the one
-    in the inventory or, if there is none, the one that was booked first.
+    The claims were read from files of an earlier format without ``further``. The usual topic of a
+    source is the one in the inventory or, if there is none, the one that was booked first.
     """
     first: dict[tuple[str, str], str] = {}
 

@@ -280,8 +280,6 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
 
 @dataclass(frozen=True, slots=True)
 class _ClaimedConnections:
-    """The claimed connections of one type."""
-
     world: World
     type: ConnectionType
 

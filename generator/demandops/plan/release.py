@@ -26,9 +26,9 @@ class ServiceKey:
 
     ``application`` is set if the service runs once for each application. ``source`` and ``topic``
     are set if the service runs once for each topic; then all applications with this topic share the
-    instance. If none of these is set, all applications on the node share the instance or, with
-    ``for_cluster``, all applications in the node's cluster. ``version`` is set if the instance is
-    for a separate instance of an application.
+    instance. If none of these is set, all applications on the node share the instance. With
+    ``for_cluster``, all applications in the node's cluster share the instance. ``version`` is set
+    if the service belongs to a separate instance of an application.
     """
 
     service: str

@@ -108,10 +108,10 @@ def takes(app: Application, service: Service, key: ServiceKey) -> bool:
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the service of an application that may have the instance at ``key``.
+    """Return the application's service to which the instance at ``key`` may belong.
 
-    Return ``None`` if no service of the application may have this instance, for example because
-    the application moved to another node.
+    Return ``None`` if the application has no such service, or if the instance cannot belong to it,
+    for example because the application moved to another node.
     """
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}

@@ -25,7 +25,6 @@ class Autoscaler:
     targets: Mapping[Resource, int]
 
     def __str__(self) -> str:
-        """Return the bounds and targets as text for a commit message."""
         by = ", ".join(f"{name} {percent} %" for name, percent in self.targets.items())
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
@@ -48,7 +47,7 @@ def replicas_of(
     requesters.
 
     Raises:
-        Refused: if the parameter that chooses one of ``scaling.sizes`` has any other value.
+        Refused: if the value of ``scaling.sizes.parameter`` is none of the sizes.
     """
     if scaling.autoscaler:
         return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
@@ -86,7 +85,7 @@ def with_kept(
 
 
 def overridden(replicas: int | Autoscaler, by: int) -> int | Autoscaler:
-    """Return the number of replicas ``by`` that an override sets.
+    """Return ``by``, the number of replicas that an override sets.
 
     If ``replicas`` is an autoscaler, return an autoscaler with ``by`` as both bounds.
     """

@@ -68,7 +68,7 @@ def version_of_service(
             message = (
                 f"application definitions '{best.appdef}' and '{other.appdef}' share "
                 f"{service.chart} {own[0]}, but pin different images; pin the same images, or "
-                f"another version of the chart for one of them in {file}"
+                f"give one of the definitions another version of the chart in {file}"
             )
             raise Refused.at("version", message, code="conflict")
     return best

@@ -124,8 +124,9 @@ def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     config = load(configuration(domains("ros: {domainId: 1}")))
     told = policy_warnings.warnings(State.of(config, books.state.ledger))
     assert list(map(str, told)) == [
-        f"{DOMAINS}: no rule of access domain 'fleet' has 'city' in its peers; the existing "
-        "connections between the two domains (1) stay, but cannot be demanded again"
+        f"{DOMAINS}: no rule of access domain 'fleet' has 'city' among its 'peers', so nobody "
+        "can demand a connection between the two domains; claims on such connections stay in "
+        "effect: 1"
     ]
 
 

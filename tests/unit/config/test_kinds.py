@@ -151,8 +151,8 @@ def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
     )
     assert warned({template: text}) == [
         f"{template}:3: DaemonSet is not among the kinds of access domain 'perception', so the "
-        "cluster refuses such an object if the chart renders one; add DaemonSet to kinds in "
-        f"{DOMAINS}, or remove it from the chart"
+        "cluster refuses such an object if the chart renders one; add DaemonSet to 'kinds' in "
+        f"{DOMAINS}, or remove the object from the chart"
     ]
     (told,) = warned({template: text})
     assert told.replace(CHART, "appdefs/agent/charts/agent") in PAGE
@@ -194,7 +194,7 @@ def test_what_cannot_be_known_is_said() -> None:
         "kinds",
         f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among the kinds of access "
         "domain 'perception', so the cluster refuses such an object if the chart renders one; add "
-        f"CustomResourceDefinition to kinds in {DOMAINS}, or remove it from the chart",
+        f"CustomResourceDefinition to 'kinds' in {DOMAINS}, or remove the object from the chart",
         f"{CHART}/templates/any.yaml:1: the template computes the kind '{{{{ .Values.kind }}}}'; "
         "check yourself that the access domain allows it",
     ]

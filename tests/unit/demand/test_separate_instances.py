@@ -148,8 +148,9 @@ def test_one_topic_for_both_is_refused() -> None:
         if name == "a":
             repo.send(made)
     assert repo.faults(made) == [
-        "applications[0].deliver[0].topic: /it on 'vehicle01' already carries "
-        "/edge_a_global_objectlist; choose another topic for this delivery"
+        "applications[0].deliver[0].topic: connection 'derived/edge/vehicle01' already "
+        "brings /edge_a_global_objectlist to 'vehicle01' as /it; choose another topic for this "
+        "delivery"
     ]
 
 

@@ -23,10 +23,10 @@ from demandops.subject import Subject, SubjectKind
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger after a node or requester is decommissioned, and the changes.
 
-    Waiting demands whose only requester is decommissioned stop waiting.
+    If a requester is decommissioned, waiting demands that have no other requester stop waiting.
 
     Raises:
-        Refused: if the node or requester holds nothing.
+        Refused: if there is no claim and no waiting demand to end.
     """
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)
@@ -67,7 +67,6 @@ def _reduced(claim: Claim, request: Decommission, nodes: Iterable[str]) -> Claim
 
 
 def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:
-    """Return the fault for a name without claims; the fault suggests a similar name."""
     names = [ledger.indexed_names("requester")] if "requester" in request.kinds else []
     names += (
         [ledger.indexed_names("node"), ledger.indexed_names("link")]

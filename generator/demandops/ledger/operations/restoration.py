@@ -1,8 +1,8 @@
 """A restoration books the claims of an earlier commit again.
 
 A restoration undoes newer claims only if the request says so. A restored lease runs for its full
-term from now on, because its old end may have passed. Claims that an override keeps belong to no
-demand, so :mod:`demandops.plan.overrides.claim_overrides` updates them after every change.
+term from now on, because its old end may have passed. After a restoration, as after every change,
+:mod:`demandops.plan.overrides.claim_overrides` updates the claims that overrides keep.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
     """Yield the faults of restored claims that are not valid in the current configuration."""
     for change in _changes(world.ledger, request):
         after = change.after
-        if after is None or after.keeping_override is not None:  # only demands' claims are checked
+        if after is None or after.keeping_override is not None:  # kept claims are not checked
             continue
         booking = request_for(after)
         for found in (

@@ -24,7 +24,7 @@ from demandops.subject import TopicKey
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger without the holds that a shutdown lists, and the changes.
 
-    If the ledger records the same shutdown in the last 15 minutes, nothing changes.
+    If the ledger has a record of the same shutdown from the last 15 minutes, nothing changes.
 
     Raises:
         Refused: if the requesters have none of the listed holds.
@@ -97,7 +97,6 @@ def _holds(
 
 
 def _nothing_held(ledger: Ledger, request: Shutdown) -> Fault:
-    """Return the fault for a shutdown that matches no claim; the fault lists similar claims."""
     near = [
         f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
         for subject in request.subjects()

@@ -1,8 +1,7 @@
 """Denials: a demand is refused if an override with ``deny`` selects what the demand asks for.
 
 The fault names the reason and the owner of the override. A demand that only repeats existing claims
-renews these claims. Such a demand is always allowed, but its requester gets a warning that an
-override suspends the claims.
+is never denied. If an override suspends these claims, the requester gets a warning.
 """
 
 from __future__ import annotations
@@ -51,7 +50,6 @@ def faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[F
 
 
 def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
-    """Yield the traits of the services that an application needs."""
     if not isinstance(one.held, Application):
         return
     app = traits_of(one)

@@ -1,7 +1,8 @@
 """Topic clashes: a demand is refused if a node would have two sources of one topic.
 
-Topics are named as the reference names them, so two ids may give the same name, for example ``a/b``
-and ``a-b``. A connection may also bring a topic to a node where a service publishes the same topic.
+Topics are named as the reference names them, so two ids of nodes or applications may give the same
+topic, for example ``a/b`` and ``a-b``. A connection may also bring a topic to a node where a
+service publishes the same topic.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def faults(
 ) -> Iterator[Fault]:
     """Yield a fault for each new service, route or delivery that clashes with another source.
 
-    It clashes if it would be the second source of a topic on a node.
+    A service, route or delivery clashes if it would be a topic's second source on a node.
 
     Args:
         request: the demand. If it adds no claims, there are no faults.
@@ -155,8 +156,8 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
             for topic in sorted(read - {flow.topic})[:1]:
                 yield one.fault(
                     f"deliver[{flow.delivery}].topic",
-                    f"{flow.target} on '{flow.receiver}' already carries {topic}; choose another "
-                    "topic for this delivery",
+                    f"connection '{id}' already brings {topic} to '{flow.receiver}' as "
+                    f"{flow.target}; choose another topic for this delivery",
                     code="conflict",
                 )
 
@@ -201,11 +202,11 @@ def _publishers(
 def _keys_called(
     world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances that are called ``instance`` in topic names.
+    """Yield the keys of those instances of a service that have ``instance`` in their topic names.
 
-    The instances are on ``node``. Some of them may not run. ``but`` is the key of the instance for
-    which the caller looks for clashes. The topic of that instance does not count as the usual topic
-    of its source.
+    The instances are on ``node``, and some of them may not run. ``but`` is the instance for which
+    the caller looks for clashes. If the inventory names no usual topic of its source, the topic of
+    ``but`` does not count as one.
     """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
@@ -261,10 +262,7 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return the request's field that makes a service run: an application's id or a topic.
-
-    It is empty if no field of the request does.
-    """
+    """Return the field of the request that makes a service run, or an empty text."""
     for one in request.demanded:
         if not isinstance(one.held, Application):
             continue

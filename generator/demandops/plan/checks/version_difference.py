@@ -1,7 +1,8 @@
 """Version differences: demands that share an application or a service ask for different versions.
 
-``versions`` of the application definition decides what happens. Either the demand is refused, or
-the newest version is deployed. In some cases a person must approve the newest version first.
+The field ``versions`` of the application definition decides what happens. Either the demand is
+refused, or the newest version is deployed. In some cases a person must approve the newest version
+first.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from demandops.subject import Subject
 
 _STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
 _REFUSING = ("refuse", "separate")
-"""The policies that refuse a difference.
+"""The values of ``versions`` that refuse a difference.
 
 With ``separate`` each version is an application of its own, so only shared services can differ.
 """
@@ -42,7 +43,8 @@ class Difference:
     """A difference: demands ask for different versions of one application or service.
 
     ``what`` describes this application or service. ``demanded`` is the version that the new demand
-    asks for. ``others`` is the newest version that the other demands ask for.
+    asks for. ``others`` is the newest version that the other demands ask for. ``policy`` is the
+    value of ``versions`` in the application definition.
     """
 
     what: str
@@ -53,19 +55,19 @@ class Difference:
     newer: bool
     """Whether ``demanded`` is newer than ``others``."""
     fault: Fault
-    """The fault to report if the policy refuses the difference."""
+    """The fault to report if :attr:`is_refused`."""
 
     def matters_to(self, asked: str) -> bool:
         """Return whether the difference concerns a demand that asks for version ``asked``.
 
         It does if the demand names a version, if the demanded version is the newer one, or if the
-        policy refuses the difference. ``asked`` is empty if the demand names no version.
+        difference is refused. ``asked`` is empty if the demand names no version.
         """
         return bool(asked) or self.newer or self.is_refused
 
     @property
     def is_refused(self) -> bool:
-        """Whether the policy refuses the difference."""
+        """Whether :attr:`policy` refuses the difference."""
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
@@ -121,10 +123,7 @@ def differences(
 
 
 def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
-    """Yield the difference between a claim's version and the newest one of the other claims.
-
-    Yield nothing if the versions are the same.
-    """
+    """Yield the difference between a claim's version and the newest one of the other claims."""
     app, ledger = claim.application, after.ledger
     known = after.config.application_versions[app.appdef]
     if len({known[word].rank for word in ledger.versions_asked(app.id, known)}) < 2:

@@ -1,9 +1,9 @@
 """Capacity: how much the running services request of each node, and how much the node has.
 
 Each replica of a service requests resources of the node where the replica runs. The service's
-definition says how much. A shared service counts once. Communication clients request nothing. An
-update of :class:`Usage` plans only the releases that a demand affects, so the cost of a demand
-depends on what the demand changes.
+definition says how much. A shared service counts once. Communication clients request nothing. To
+update :class:`Usage`, the generator plans only the releases that a demand affects, so the cost of a
+demand depends on what the demand changes.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return a map from (node, resource) to how much more services request when claims change.
+    """Return the growth of the services' requests when claims change, by (node, resource).
 
     A release that cannot be planned requests nothing. The map is empty if no node declares a
     capacity.

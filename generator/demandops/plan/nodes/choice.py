@@ -33,7 +33,7 @@ from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
 MOST_TRIED = 20
-"""The highest number of nodes on which a booking is tried, because each trial takes time."""
+"""The highest number of nodes on which a booking is tried; each trial takes time."""
 NO_ROOM = "no-room"
 """The code of the fault for an application that fits some nodes, of which none has room."""
 
@@ -47,7 +47,7 @@ class Chosen:
 
 
 Positions = Mapping[str, Position]
-"""The positions of nodes that a demand states; a position in the inventory has precedence."""
+"""The positions that a demand gives, by node id; a position in the inventory has precedence."""
 
 
 def requirement_of(service: Service) -> Requirement:
@@ -273,14 +273,14 @@ class Choice:
             elif not reasons and (shortage := self._shortage(node)):
                 reasons, code = shortage, NO_ROOM
             elif not reasons:
-                reasons.append("fits, but the demand would be refused on this node")
+                reasons.append("meets the requirement, but the demand would be refused there")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
         more = [f"{len(misses) - len(shown)} more do not fit"] if len(misses) > len(shown) else []
         message = f"no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
-        less = f"change place in {self.service.file}" if self.service else "ask for less"
+        less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {self.config.place_of(NODES_FILE)}"
         return self._fault(message, code)
 

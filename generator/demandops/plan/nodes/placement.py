@@ -94,7 +94,6 @@ def needs_placement(request: DemandRequest, world: World) -> bool:
 
 
 def _services_to_place(app: Application, world: World) -> list[Service]:
-    """Return the services of an application for which the generator chooses nodes."""
     services = world.config.services.get(app.appdef, {}).values()
     return [one for one in services if one.place and one.name not in app.named]
 
@@ -215,7 +214,6 @@ def _claim(request: DemandRequest, one: Demanded) -> Claim:
 
 
 def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demanded | Fault:
-    """Return a demanded application with its node, or the fault if it gets no node."""
     app = choice.app
     if app.node:
         return _named(choice) or replace(one, held=replace(app, place=None))
@@ -230,7 +228,7 @@ def _with_node(request: DemandRequest, one: Demanded, choice: Choice) -> Demande
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
-    """Return the node of a service instance that another application has and ``app`` can share.
+    """Return the node on which another application has a service instance that ``app`` can share.
 
     Return an empty text if there is no such instance. If a second instance ran on another node, the
     application's node would get the same outputs twice.
@@ -253,8 +251,8 @@ def _named_services(one: Demanded, app: Application, world: World) -> Iterator[F
         node = world.config.nodes.get(app.services[name])
         if service and node and (lacking := list(lacks(node, requirement_of(service)))):
             message = (
-                f"{quoted(node.id)} lacks {joined(lacking)}, which the service requires (place in "
-                f"{service.file}); name another node, or name none for this service"
+                f"{quoted(node.id)} lacks {joined(lacking)}, which the service requires ('place' "
+                f"in {service.file}); name another node, or name none for this service"
             )
             yield one.fault(f"services.{name}", message, code="no-node")
 
@@ -266,8 +264,8 @@ def _contradictions(one: Demanded, app: Application, claim: Claim) -> Iterator[F
         if current != app.services[name]:
             message = (
                 f"{quoted(app.services[name])} contradicts an existing claim: '{app.id}' is held "
-                f"by {', '.join(claim.requesters)} with {name} on '{current}'; name '{current}', "
-                "or use another application id"
+                f"by {', '.join(claim.requesters)} with service {name} on node '{current}'; name "
+                f"node '{current}', or use another application id"
             )
             yield one.fault(f"services.{name}", message, code="conflict")
 
@@ -285,7 +283,7 @@ def _named(choice: Choice) -> Fault | None:
         return None
     message = (
         f"{quoted(choice.app.node)} lacks {joined(lacking)}; name another node, or leave out one "
-        "of the fields node and place"
+        "of the fields 'node' and 'place'"
     )
     return choice.one.fault("place", message, code="no-node")
 

@@ -97,8 +97,7 @@ def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
     """Return the ids of the applications that must move together with ``id``, including ``id``.
 
-    These are the applications that share the instances of ``service`` on the node. If the instances
-    are not shared, the result has only ``id``.
+    These are the applications that share the instances of ``service`` on the node.
     """
     app = world.ledger.application(id)
     if service is None or service.scope != "topic" or app is None:
@@ -238,7 +237,6 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
 def _all_moved(
     world: World, applications: Iterable[str], move: Move
 ) -> tuple[World, dict[str, tuple[ClaimChange, ...]]]:
-    """Return the world with these applications moved, and a map from application to changes."""
     changes: dict[str, tuple[ClaimChange, ...]] = {}
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
@@ -263,7 +261,7 @@ def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
 
 
 def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> Iterator[Fault]:
-    """Yield the faults of moved claims; each claim is checked like a demand for its content."""
+    """Yield the faults of moved claims; each claim is checked as if it were demanded now."""
     for change in changes:
         claim = change.after
         if claim is None:
@@ -283,10 +281,10 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
 
 
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
-    """Yield a fault for each output that the claimed connection brings to a node a second time.
+    """Yield a fault for each topic that two connections bring to a node from different senders.
 
-    Another connection already brings a topic of the same name there from another sender. A topic
-    that a demand lists as an input is never a fault, because the demand names the source.
+    ``claim`` is the claim on one of the two connections. A topic that a demand lists as an input is
+    never a fault, because the demand names the source.
     """
     if claim.is_on_application:
         return
@@ -306,7 +304,6 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
 
 
 def _senders(ledger: Ledger, receiver: str, topic: str) -> set[str]:
-    """Return the nodes from which connections bring ``topic`` to the node ``receiver``."""
     connections = map(ledger.connection, ledger.connections_bringing(receiver, topic))
     routes = ((one, route) for one in connections if one for route in one.topics)
     ends = ((*route.sender_and_receiver(*one.nodes), route.written_topic) for one, route in routes)

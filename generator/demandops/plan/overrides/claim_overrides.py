@@ -29,7 +29,7 @@ from demandops.subject import Subject, SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """The values of a claim, demand or release that a selector is compared with.
+    """The values with which a selector is compared: those of a claim, a demand or a release.
 
     ``service`` is set only for the release of a service. If ``requesters`` is ``None``, the
     requesters of the selector are not compared.
@@ -214,7 +214,7 @@ def with_kept_claims(
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger with exactly those kept claims on ``subjects`` that overrides want.
+    """Return the ledger in which ``subjects`` have exactly the kept claims that overrides want.
 
     The second value has the keys of all kept claims on ``subjects``, before and after the update.
 

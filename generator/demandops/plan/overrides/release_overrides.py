@@ -18,7 +18,7 @@ from demandops.plan.replicas import overridden
 
 
 def apply_overrides(release: Release, world: World) -> Release | None:
-    """Return a release after all overrides that select it, or ``None`` if one of them denies it.
+    """Return a release with the effects of all overrides, or ``None`` if one of them denies it.
 
     Raises:
         Refused: if an override moves the release to a node that the inventory no longer has.
@@ -52,7 +52,7 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release after the effects of overrides; the last override wins.
+    """Return a release with the effects of overrides; the last override wins.
 
     ``by`` has pairs of an override and the names of its effects on the release.
     """

@@ -179,7 +179,6 @@ def _time(moment: datetime) -> str:
 
 
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
-    """Return the amounts of each resource with a declared capacity, by node and resource."""
     usage = whole_usage(world)
     found: dict[str, dict[str, ResourceEntry]] = {}
     machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
@@ -251,7 +250,7 @@ class EntryChange:
     """One service or connection that was added, changed or removed.
 
     ``requesters`` are the requesters after the change. If the entry was removed, they are those
-    before the change. ``lost`` has the facts about a changed entry that no longer hold, and
+    before the change. If the entry was changed, ``lost`` has the facts that no longer hold, and
     ``gained`` has the new facts.
     """
 
@@ -290,11 +289,7 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield the facts about an entry, as texts.
-
-    One of ``entry`` and ``other`` is an entry before a change, and one is the same entry after the
-    change. A fact that holds for only one of the two is part of the change.
-    """
+    """Yield the facts about ``entry``, as texts, for a comparison with those about ``other``."""
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"

@@ -1,4 +1,4 @@
-"""Warnings about misspelled topics: those that differ by a letter from a known topic of the node.
+"""Warnings about misspelled topics, which differ by a letter from a known topic of the node.
 
 Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ in a
 digit, or in a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two correct topics.

@@ -79,11 +79,10 @@ def _unfit_places(config: Config) -> Iterator[Fault]:
 
 
 def _above_capacity(world: World) -> Iterator[Fault]:
-    """Yield a warning for each node on which services request more than its capacity."""
     for node, excess in overcommitted(world, whole_usage(world)):
         message = (
-            f"{excess}; running services stay, but nothing more is booked on this node; raise the "
-            "capacity, or move something to another node"
+            f"{excess}; these services stay on the node, but nothing more is booked on it; raise "
+            "the capacity, or move something to another node"
         )
         file = world.config.file_of(NODES_FILE, node.id)
         yield fault("", f"'{node.id}': {message}").within(file)
@@ -103,8 +102,9 @@ def _connections_of_before(world: World) -> Iterator[Fault]:
                 )
     for (name, other), count in sorted(counts.items()):
         message = (
-            f"no rule of access domain '{name}' has '{other}' in its peers; the existing "
-            f"connections between the two domains ({count}) stay, but cannot be demanded again"
+            f"no rule of access domain '{name}' has '{other}' among its 'peers', so nobody can "
+            "demand a connection between the two domains; claims on such connections stay in "
+            f"effect: {count}"
         )
         yield fault("", message).within(world.config.file_of(DOMAINS_FILE, name))
 
@@ -208,8 +208,8 @@ def _refused(
             file = config.file_of(DOMAINS_FILE, domain.name)
             message = (
                 f"{kind} is not among the kinds of access domain '{domain.name}', so the cluster "
-                f"refuses such an object if the chart renders one; add {kind} to kinds in {file}, "
-                "or remove it from the chart"
+                f"refuses such an object if the chart renders one; add {kind} to 'kinds' in "
+                f"{file}, or remove the object from the chart"
             )
             yield fault("", message, line=line).within(path)
 

@@ -67,10 +67,10 @@ def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[st
 def how_to_release(claim: Claim) -> str:
     """Return, in words, how the holders of a claim release it."""
     if claim.keeping_override is not None:
-        return f"remove keep from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
+        return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
     if claim.demand == demand_id(claim.request, claim.requesters):
         return f"send request '{claim.request}' again with shutdown: true"
-    return f"send operation: release for demand '{claim.demand}'"
+    return f"send 'operation: release' for demand '{claim.demand}'"
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:

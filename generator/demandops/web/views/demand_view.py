@@ -70,7 +70,7 @@ def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
         "requesters": list(requesters_of(claims)),
     }
     how = how_to_release(claims[0])
-    is_by_id = how.startswith("send operation")
+    is_by_id = how.startswith("send 'operation")
     file = strict_yaml.dump(goal) if is_by_id else ""
     try:
         read = reader.file_reader(now.commit_state.commit)
