@@ -46,7 +46,7 @@ class Ros(ConnectionType):
         if known and _listener(connection, config) is None:
             yield fault(
                 "type",
-                f"{self.name} needs an end with a reachable address; add wan: {{host: …}} to "
+                f"{self.name} needs an end with a reachable address; add 'wan: {{host: …}}' to "
                 f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}",
                 code=UNSUPPORTED,
             )

@@ -94,7 +94,10 @@ class Scaling(CamelModel):
         if len(deciding) > 1:
             yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
         for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
-            yield f"'sizes' lists all numbers of replicas, so {name} does nothing; remove {name}"
+            yield (
+                f"'sizes' gives the number of replicas for each size, so {name} does nothing; "
+                f"remove {name}"
+            )
         for name in ("per", "autoscaler"):
             if getattr(self, name) and self.min == self.max:
                 yield f"'{name}' does nothing, because min and max are both {self.max}; raise max"
@@ -116,7 +119,7 @@ class Scaling(CamelModel):
 
     @property
     def kept_for(self) -> timedelta | None:
-        """How long a service keeps replicas that no demand needs any more; ``None`` for no time."""
+        """How long a service keeps replicas that no demand needs; ``None`` if it keeps none."""
         return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
 
     @property

@@ -139,7 +139,7 @@ def _follow(cluster: str, then: str) -> Step:
 
 
 def _bootstrap_again(cluster: str) -> Step:
-    description = "apply its bootstrap file again, because the file changed"
+    description = "apply the cluster's bootstrap file again, because the file changed"
     return Step(cluster, description, (_apply(cluster),))
 
 
