@@ -83,8 +83,8 @@ class Config:
     ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
     ``files`` maps the path of each file below ``appdefs/`` to its text, for example of templates
     and charts. ``overrides`` has every override; :class:`demandops.ledger.world.World` knows which
-    of them have ended. ``entry_files`` maps each collection to a map from its entries to the files
-    that have them. ``hosts`` maps each node in a further access domain (``edge@city``) to the node
+    of them have ended. ``entry_files`` has a map for each collection, from each entry to
+    its file. ``hosts`` maps each node in a further access domain (``edge@city``) to the node
     of the inventory (``edge``).
     """
 

@@ -327,7 +327,8 @@ def _domains_of_nodes(
                 file,
                 f"{place}.id",
                 f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
-                "domain matches the node, and list the other domains as accessDomains of the node",
+                "domain matches the node, and list the other domains under 'accessDomains' of the "
+                "node",
             )
         elif matching:
             owner[node] = matching[0]

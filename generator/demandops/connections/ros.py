@@ -93,8 +93,8 @@ class Ros(ConnectionType):
                 message = (
                     f"connection '{key.id}' would listen on port {port} of "
                     f"'{listener.id}', but connection '{other}' already does; use another "
-                    "connection id, or widen the range from firstPort to lastPort under wan of "
-                    f"'{listener.id}'"
+                    "connection id, or widen the range from 'firstPort' to 'lastPort' under 'wan' "
+                    f"of '{listener.id}'"
                 )
                 raise Refused.at("connections", message, code=UNSUPPORTED)
         connection = replace(connection, topics=typed)

@@ -113,7 +113,7 @@ class Scaling(CamelModel):
             yield "'mayDependOnRequesters' does nothing unless 'per' counts requesters; remove it"
         if self.down_after and not (self.per or self.sizes):
             own = " (an autoscaler has a delay of its own)" if self.autoscaler else ""
-            yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove downAfter"
+            yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove 'downAfter'"
         if self.down_after and seconds_of(self.down_after) < 1:
             yield "downAfter is zero; leave it out"
 
