@@ -10,7 +10,7 @@ from demandops.quoting import is_visible, quoted
 MAX_ID = 1024
 """The maximum length of an id, in characters.
 
-The name of a file or object that is made from a long id is shortened, and gets a hash.
+A file or an object that is named after a long id has a shortened name with a hash.
 """
 
 MAX_TOPIC = 247
@@ -117,7 +117,7 @@ PATTERN_WORDS = {
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
     r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
     r"^[a-z0-9][a-z0-9._/:-]*$": "an image without its tag, such as registry.example/detection",
-    r"^sha256:[0-9a-f]{64}$": "a digest: sha256: and 64 digits from 0 to f",
+    r"^sha256:[0-9a-f]{64}$": "a digest, which is 'sha256:' and 64 digits (0 to 9, a to f)",
     r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
     r"^(tcp|udp|ws)/[^\s/#?]+:\d{1,5}$": "an endpoint of Zenoh, such as tcp/router.example:7447",
     r"^(\d+h)?(\d+m)?(\d+s)?$": "a duration, such as 30s, 1m or 1h30m",

@@ -33,7 +33,7 @@ MAX_LENGTH = 4_000_000
 """How many characters a file may have; an inventory of 20,000 nodes has fewer."""
 MAX_DEPTH = 100
 _MAX_BITS = 14_000
-"""How many bits a whole number may have, because Python prints at most 4,300 digits."""
+"""How many bits a whole number may have. Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: it has a tag, number or character that cannot be read"
 
@@ -79,14 +79,14 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if the word that stands for a list was not read as the value of a field."""
+    """Raised if a word that stands for a list is not the plain value of a field."""
 
 
 class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
-    It refuses deep nesting, because recursive code that reads the values could fail. ``lists`` maps
-    each stand-in in the text to the list that it stands for.
+    Deep nesting is refused, because recursive code that reads the values could fail. ``lists`` maps
+    a word in the text (:data:`_STAND_IN`) to the list that the word stands for.
     """
 
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
@@ -283,7 +283,7 @@ def _load_around_lists(text: str) -> list[Any]:
 
 
 def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
-    """Return the only document of ``text``, or ``None`` if it is empty.
+    """Return the only document of ``text``, or ``None`` if ``text`` has no document.
 
     Raises:
         InvalidInput: if ``text`` is not strict YAML; the fault names ``file``.
@@ -379,7 +379,7 @@ def set_key(text: str, key: str, value: object) -> str:
     A plain value is replaced in place. A missing key is added at the end.
 
     Raises:
-        InvalidInput: if the key cannot be set in the file as it is written.
+        InvalidInput: if the form of the file does not permit the change.
     """
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)

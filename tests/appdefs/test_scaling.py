@@ -276,7 +276,7 @@ class TestAutoscaler:
         repo = books(AUTOSCALED, **replicas_by_overrides(3, 0))
         with pytest.raises(InvalidInput) as invalid:
             repo.send(demand())
-        told = "is 0, but an autoscaler keeps at least one replica; deny the service instead"
+        told = "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
         assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
         with pytest.raises(InvalidInput) as invalid:
             render_trial_demands(repo.state, repo.state.engine)

@@ -83,7 +83,7 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
     before = dict(documents(manifests))
     assert run("upgrade").out.endswith(
         "after the upgrade, on the clusters:\n"
-        "- c-its: apply its bootstrap file again, because the file changed\n"
+        "- c-its: apply the cluster's bootstrap file again, because the file changed\n"
         f"      git show main:{BOOTSTRAP} | kubectl apply -f -\n"
     )
     new = state.files()

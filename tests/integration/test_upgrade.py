@@ -215,7 +215,8 @@ def test_a_dry_run_tells_all_and_writes_nothing(
         'patch --type merge -p \'{"spec":{"suspend":true}}\'\n'
         "\n"
         "after the upgrade, on the clusters:\n"
-        "- c-its: make the cluster follow the repo again; wait until all Applications are Synced\n"
+        "- c-its: make the cluster follow the repo again; then wait until all Applications are "
+        "Synced\n"
         "      git show main:bootstrap/c-its.yaml | kubectl apply -f -\n"
         "- c-its: delete Flux's objects; because Flux is suspended, no workload is removed\n"
         "      kubectl -n perception get helmrelease -l "

@@ -83,8 +83,8 @@ class Config:
     ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
     ``files`` maps the path of each file below ``appdefs/`` to its text, for example of templates
     and charts. ``overrides`` has every override; :class:`demandops.ledger.world.World` knows which
-    of them have ended. ``entry_files`` maps each collection to a map from its entries to the files
-    that have them. ``hosts`` maps each node in a further access domain (``edge@city``) to the node
+    of them have ended. ``entry_files`` has a map for each collection, from each entry to
+    its file. ``hosts`` maps each node in a further access domain (``edge@city``) to the node
     of the inventory (``edge``).
     """
 
@@ -110,15 +110,15 @@ class Config:
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """Part of a topic name → the nodes for whose ids ``topic_part`` returns this part."""
+    """For each part of a topic name, the nodes for whose ids ``topic_part`` returns this part."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    """Node type → the nodes of the type, sorted by id; the empty type stands for all nodes."""
+    """For each node type, its nodes, sorted by id. The empty type stands for all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """``(capability,)`` or ``(label key, label value)`` → the nodes that have it, sorted by id."""
+    """For each ``(capability,)`` or ``(label key, value)``, the nodes with it, sorted by id."""
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    """Property → the type of its value on most nodes, and the first node with this type."""
+    """For each property, the type of its value on most nodes, and the first node with this type."""
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
     """The nodes that are drained, sorted."""
     limits_capacity: bool = field(init=False, compare=False, repr=False)
@@ -130,10 +130,12 @@ class Config:
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """Appdef → name of a version or channel → the version; an empty name means the default."""
+    """For each appdef, a map from names of versions and channels to versions.
+
+    The empty name stands for the default version.
+    """
 
     def __post_init__(self) -> None:
-        """Set the fields that are derived from other fields."""
         found: dict[str, tuple[str, ...]] = {}
         for id in self.nodes:
             part = naming.topic_part(id)

@@ -153,7 +153,7 @@ ResourceName = Annotated[
 """A name of a resource: ``cpu``, ``memory``, ``gpu``, ``nvidia.com/gpu``."""
 
 Resources = dict[ResourceName, Quantity]
-"""Resource → how much of it a node has, or a service requests."""
+"""How much of each resource a node has, or a service requests."""
 
 NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
@@ -197,7 +197,7 @@ class Toleration(CamelModel):
 
 
 Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp", "image"]
-"""A middleware of ROS; with ``image``, each container uses the middleware of its image."""
+"""A middleware of ROS. The word ``image`` stands for the middleware of the container's image."""
 
 
 RosDomainId = Annotated[int, Field(ge=0, le=232)]
@@ -242,9 +242,9 @@ class Node(CamelModel):
     ``capacity`` (:mod:`demandops.plan.nodes.capacity`).
 
     ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses. If the access
-    domain has a ROS domain, it replaces the ROS domain in ``ros``. ``topics`` maps each input role
-    to the node's usual topic. The names of releases and derived topics contain the node. For a
-    topic that is not the usual one, these names contain the topic too.
+    domain has a ROS domain, the node has this ROS domain, and not the one in ``ros``. ``topics``
+    maps each input role to the node's usual topic. The names of releases and derived topics
+    contain the node. For a topic that is not the usual one, these names contain the topic too.
 
     Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` maps topics to
     message types, for requests that give no type. ``bridged`` maps another node to the topics that
@@ -284,7 +284,7 @@ class Node(CamelModel):
         return self
 
     def labels(self) -> dict[str, str]:
-        """Return the node selector."""
+        """Return the node selector: the labels that select the node in its cluster."""
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
     def in_domain(self, further: FurtherDomain) -> Node:

@@ -93,8 +93,8 @@ def load(files: Mapping[str, str]) -> Config:
         reader.add_fault(
             ROOT_FILE,
             repository.gitops,
-            f"is missing, but gitops is {repository.gitops}; add it with the url that the "
-            "clusters fetch this repo from",
+            f"is missing, but 'gitops' is {repository.gitops}; add it, with the 'url' from which "
+            "the clusters fetch this repo",
         )
     _refuse_unread(reader)
     nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
@@ -132,10 +132,7 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services, with ``runs_at`` set for those that run once for each cluster.
-
-    ``runs_at`` maps the id of each node to the node in the same cluster where the service runs.
-    """
+    """Return the services, with ``runs_at`` set for those that run once for each cluster."""
     found = dict(services)
     for name, service in services.items():
         if service.nodes:
@@ -160,7 +157,7 @@ def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
 
 
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the clients' settings of all types, and a map from type to the file that has them."""
+    """Return the settings of all connection types, and for each type the file with its settings."""
     found, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
@@ -261,7 +258,6 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
 
 
 def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:
-    """Return the node with the ROS domain of its access domain, if the access domain has one."""
     if domain is None or domain.ros is None:
         return node
     ros = node.ros.model_copy(update={"domain_id": domain.ros.domain_id})
@@ -302,7 +298,7 @@ def _in_further_domains(
                     message = (
                         f"access domains '{other}' and '{domain.name}' share ROS domain {number}, "
                         f"so each would read the other's topics on '{node.id}'; give one of them "
-                        "ros: {domainId: …} in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
+                        "'ros: {domainId: …}' in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
                     )
                     reader.add_fault(file, f"{where}.name", message)
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
@@ -311,7 +307,6 @@ def _in_further_domains(
 
 
 def _pattern_of(node: str, domain: AccessDomain) -> str:
-    """Return the first pattern of a domain that a node matches."""
     return next(pattern for pattern in domain.nodes if matches(node, (pattern,)))
 
 
@@ -332,7 +327,8 @@ def _domains_of_nodes(
                 file,
                 f"{place}.id",
                 f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
-                "domain matches the node, and list the other domains as accessDomains of the node",
+                "domain matches the node, and list the other domains under 'accessDomains' of the "
+                "node",
             )
         elif matching:
             owner[node] = matching[0]

@@ -105,7 +105,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Raise an error if a given field has no value, because that field would have no effect."""
+    """Raise ValueError if the file has a field without a value, which would have no effect."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
@@ -254,7 +254,7 @@ class Shaping:
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return an image of the registry, changed by the pins of the overrides for ``name``."""
+        """Return ``image``, changed by the pins that the overrides have for the image ``name``."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)

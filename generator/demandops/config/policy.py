@@ -223,7 +223,7 @@ class AccessDomain(CamelModel):
         if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
             raise ValueError(
                 "kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; remove "
-                "NetworkPolicy from kinds, or remove network"
+                "NetworkPolicy from 'kinds', or remove 'network'"
             )
         return self
 

@@ -59,7 +59,7 @@ class ChartSource(FrozenModel):
                 "Secret"
             )
         if self.folder and ".." in self.folder.split("/"):
-            raise ValueError("folder must stay inside the state repo; remove '..'")
+            raise ValueError("'folder' must stay inside the state repo; remove '..'")
         return self
 
 
@@ -117,10 +117,9 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        """Return the image pulled from ``registry``.
+        """Return this image with ``registry`` as the host in its name.
 
-        ``registry`` replaces the host in the image's name. If the name has no host, ``registry``
-        is put before the name.
+        If the name has no host, ``registry`` is put before the name.
         """
         host, _, path = self.repository.partition("/")
         named = path and ("." in host or ":" in host or host == "localhost")

@@ -105,13 +105,13 @@ class Proposals(FrozenModel):
         has_api = self.forge in ("github", "gitea")
         if has_api and (self.url is None or len(self.project) != 2):
             raise ValueError(
-                f"forge: {self.forge} needs url, the project's address in a browser, like "
+                f"'forge: {self.forge}' needs 'url', the project's address in a browser, like "
                 "https://github.com/OWNER/REPOSITORY"
             )
         if self.api is not None and not has_api:
-            raise ValueError(f"api: is not used with forge: {self.forge}; leave it out")
+            raise ValueError(f"api: is not used with 'forge: {self.forge}'; leave it out")
         if self.labels and self.forge != "gitlab":
-            raise ValueError("labels: are used only with forge: gitlab; leave them out")
+            raise ValueError("labels: are used only with 'forge: gitlab'; leave them out")
         return self
 
     @property

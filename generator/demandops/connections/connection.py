@@ -116,11 +116,7 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what is left of the connection without ``node``, which is its broker or an end.
-
-        Without its broker, the connection names no broker. Without an end, nothing is left and the
-        result is ``None``.
-        """
+        """Return the connection without its broker ``node``, or ``None`` if ``node`` is an end."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:

@@ -100,7 +100,10 @@ class Client(ABC):
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Yield (file, entry, what the entry decides) for each entry that shapes the client."""
+        """Yield (file, entry, what the entry decides) for each entry that affects the client.
+
+        An entry is a part of a configuration file, such as a node.
+        """
         file = config.entry_files.get(CLIENTS_FILE, {}).get(self.type.word)
         if file is not None:
             yield file, self.type.word, "how its container runs"
@@ -149,7 +152,7 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection of this type with an id, or ``None`` if no claim holds it.
+        """Return this type's connection ``id``, or ``None`` if no claim holds it.
 
         Raises:
             Refused: if the type cannot carry the connection.
@@ -183,7 +186,6 @@ class ConnectionType(ABC):
     """Whether the clients must know the message type of each topic."""
 
     def __repr__(self) -> str:
-        """Return the type's name."""
         return self.name
 
     @property

@@ -43,9 +43,9 @@ def by_number() -> list[ConnectionType]:
 
 
 def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
-    """Return the validator of a field that accepts the types' words and the given words.
+    """Return the validator of a field that accepts ``before``, the types' words and ``after``.
 
-    A message about a wrong word lists ``before``, then the types' words, then ``after``.
+    A message about another word lists the accepted words in this order.
     """
 
     def words() -> tuple[str, ...]:

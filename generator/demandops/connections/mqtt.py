@@ -213,7 +213,7 @@ def _broker(broker: Broker) -> dict[str, Any]:
 
 
 def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
-    """Return the parameters of a topic that differ from the client's defaults."""
+    """Return the parameters that a topic needs besides the client's defaults."""
     options: dict[str, Any] = {}
     if route.primitive:
         options["primitive"] = True

@@ -46,7 +46,7 @@ class Ros(ConnectionType):
         if known and _listener(connection, config) is None:
             yield fault(
                 "type",
-                f"{self.name} needs an end with a reachable address; add wan: {{host: …}} to "
+                f"{self.name} needs an end with a reachable address; add 'wan: {{host: …}}' to "
                 f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}",
                 code=UNSUPPORTED,
             )
@@ -93,8 +93,8 @@ class Ros(ConnectionType):
                 message = (
                     f"connection '{key.id}' would listen on port {port} of "
                     f"'{listener.id}', but connection '{other}' already does; use another "
-                    "connection id, or widen the range from firstPort to lastPort under wan of "
-                    f"'{listener.id}'"
+                    "connection id, or widen the range from 'firstPort' to 'lastPort' under 'wan' "
+                    f"of '{listener.id}'"
                 )
                 raise Refused.at("connections", message, code=UNSUPPORTED)
         connection = replace(connection, topics=typed)

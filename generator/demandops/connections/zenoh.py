@@ -62,9 +62,9 @@ class Zenoh(ConnectionType):
             if node.zenoh is None:
                 yield fault(
                     end,
-                    f"'{node.id}' runs no Zenoh bridge; add zenoh: {{endpoint: …}} to it in "
-                    f"{config.file_of(NODES_FILE, node.id)}, or zenoh: {{}} if the "
-                    "node can reach other bridges",
+                    f"'{node.id}' runs no Zenoh bridge; add 'zenoh: {{endpoint: …}}' to the node "
+                    f"in {config.file_of(NODES_FILE, node.id)}, or 'zenoh: {{}}' if the node can "
+                    "reach other bridges",
                     code=UNSUPPORTED,
                 )
         if source.zenoh is None or target.zenoh is None or source.id == target.id:
@@ -137,7 +137,7 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
     """
     if node.zenoh is None:
         message = (
-            f"'{node.id}' carries Zenoh connections, but has no zenoh in "
+            f"'{node.id}' carries Zenoh connections, but has no 'zenoh' in "
             f"{config.file_of(NODES_FILE, node.id)} any longer; restore 'zenoh' there"
         )
         raise Refused.at("node", message, code=UNSUPPORTED)
@@ -154,8 +154,9 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
 class Bridge(Client):
     """The desired state of a node's Zenoh bridge.
 
-    The bridge reads ``publishers`` from the node's ROS graph and publishes ``subscribers``
-    there. ``rates`` limits the messages per second of topics that the bridge reads.
+    ``publishers`` are the topics that the bridge reads from the node's ROS graph.
+    ``subscribers`` are the topics that the bridge publishes in this graph. ``rates`` maps a topic
+    that the bridge reads to the most messages per second.
     """
 
     publishers: tuple[str, ...]
@@ -214,5 +215,4 @@ class Bridge(Client):
 
 
 def _exactly(topic: str) -> str:
-    """Return the regular expression that matches only this topic's name."""
     return f"^{re.escape(topic)}$"

@@ -59,7 +59,6 @@ class _FilesLoader(BaseLoader):
         self._files = files
 
     def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        """Return a template's text, its path, and a function that says that the text is current."""
         if template not in self._files:
             raise TemplateNotFound(template)
         text = self._files[template]
@@ -78,7 +77,6 @@ class _CompiledTemplates(BytecodeCache):
         self._kept: dict[tuple[str, str], CodeType] = {}
 
     def load_bytecode(self, bucket: Bucket) -> None:
-        """Set the bucket's code to the kept code of its template, or to None if no code is kept."""
         bucket.code = self._kept.get((bucket.key, bucket.checksum))
 
     def dump_bytecode(self, bucket: Bucket) -> None:

@@ -31,7 +31,9 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
     template = config.values_template(release.service)
     if release.autoscaler and release.autoscaler.max == 0:
         by = [each.path for each, effects in release.shaping.by if "replicas" in effects]
-        message = "is 0, but an autoscaler keeps at least one replica; deny the service instead"
+        message = (
+            "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
+        )
         raise InvalidInput.at("replicas", message, file=by[-1])
     try:
         check = partial(check_values, chart=release.chart, config=config, template=template)
@@ -45,11 +47,7 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
 
 
 def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
-    """Yield the faults of a template, with a note in each message.
-
-    The note names the overrides that change the variables of the template. Without such overrides,
-    the messages have no note.
-    """
+    """Yield the faults. Each message names the overrides that change the template's variables."""
     changing = {"version", "images", "replicas", "node"}
     files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
     note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"

@@ -149,7 +149,6 @@ def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noq
 
 @lru_cache(maxsize=64)
 def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
-    """Return the validator for objects of a kind that is built into Kubernetes."""
     *group, version = api.split("/")
     prefix = f"{group[0].split('.')[0]}-" if group else ""
     package = find_spec("kubernetes_validate")  # only its files are used; an import is slow

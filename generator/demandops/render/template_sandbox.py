@@ -38,7 +38,7 @@ MAX_STEPS = 1_000_000
 A template with 100 topics takes several thousand steps.
 """
 MAX_LENGTH = 1_000_000
-"""How many characters a text may have, because Kubernetes accepts objects of at most 1.5 MB."""
+"""How many characters a text may have. Kubernetes accepts objects of at most 1.5 MB."""
 MAX_SIZE = 100_000
 """How many parts a value may have. An item, a key and 16 characters of text each count as one."""
 _MAX_BITS = 1024
@@ -57,7 +57,7 @@ _PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
 """Filters that call another filter or test for each item; each call takes its own steps."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
-"""Slow filter → the factor by which its steps are multiplied."""
+"""For each slow filter, the factor by which its steps are multiplied."""
 _PADDING = frozenset(
     {"batch", "center", "indent", "literal", "block", "round", "slice", "truncate"}
 )
@@ -137,7 +137,7 @@ def _size(value: object, *, data: bool = True) -> int:
 
 
 def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Return a value, as a list if it is an iterator, and take as many steps as it has parts."""
+    """Take a step for each part of a value, and return the value. An iterator becomes a list."""
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:

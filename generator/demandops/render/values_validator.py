@@ -1,7 +1,6 @@
 """Validators for a chart's ``values.schema.json``.
 
-A validator reads no file besides the schema's. A schema whose validation could take long is
-refused.
+A schema may not refer to other files. A schema whose validation could take long is refused.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def test_the_list_of_the_documentation_is_taken() -> None:
         (
             {"kinds": f"[{', '.join(KINDS)}]", "network": "namespace"},
             ": kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; "
-            "remove NetworkPolicy from kinds, or remove network",
+            "remove NetworkPolicy from 'kinds', or remove 'network'",
         ),
     ],
 )

@@ -199,7 +199,7 @@ def test_a_node_that_leaves_leaves_all_its_domains() -> None:
             [{"name": "city"}],
             (FLEET, {**CITY, "ros": {"domainId": 0}}),
             "accessDomains[0].name: access domains 'fleet' and 'city' share ROS domain 0, so each "
-            "would read the other's topics on 'edge'; give one of them ros: {domainId: …} in "
+            "would read the other's topics on 'edge'; give one of them 'ros: {domainId: …}' in "
             "policy/access-domains.yaml",
         ),
     ],

@@ -214,18 +214,18 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("{forge: github}", "proposals: forge: github needs url, the project's address"),
-        ("{forge: github, url: 'https://github.com/its'}", "needs url, the project's address"),
+        ("{forge: github}", "proposals: 'forge: github' needs 'url', the project's address"),
+        ("{forge: github, url: 'https://github.com/its'}", "needs 'url', the project's address"),
         (
             "{forge: gitea, url: 'http://git.example.org/a/b'}",
             "proposals.url: 'http://git.example.org/a/b' is not an address that a token may be "
             "sent to",
         ),
         ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
-        ("{forge: none, api: 'https://x.org/a'}", "api: is not used with forge: none"),
+        ("{forge: none, api: 'https://x.org/a'}", "api: is not used with 'forge: none'"),
         (
             "{forge: gitea, url: 'https://x.org/a/b', labels: [x]}",
-            "labels: are used only with forge: gitlab",
+            "labels: are used only with 'forge: gitlab'",
         ),
         ('{forge: gitlab, labels: ["a\\nb"]}', "proposals.labels[0]: "),
         ("{forge: bitbucket}", "proposals.forge: "),

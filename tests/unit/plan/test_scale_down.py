@@ -118,11 +118,14 @@ def test_a_clock_that_was_set_back_gives_a_valid_record() -> None:
 @pytest.mark.parametrize(
     ("scaling", "problem"),
     [
-        ("{downAfter: 10m}", "'downAfter' does nothing without 'per' or 'sizes'; remove downAfter"),
+        (
+            "{downAfter: 10m}",
+            "'downAfter' does nothing without 'per' or 'sizes'; remove 'downAfter'",
+        ),
         (
             "{max: 3, autoscaler: {cpu: 70}, downAfter: 10m}",
             "'downAfter' does nothing without 'per' or 'sizes' (an autoscaler has a delay of its "
-            "own); remove downAfter",
+            "own); remove 'downAfter'",
         ),
         ("{max: 3, per: {topics: 1}, downAfter: 0s}", "downAfter is zero; leave it out"),
         ("{max: 3, per: {topics: 1}, downAfter: soon}", "'soon' is not a duration"),

@@ -152,7 +152,7 @@ def test_its_node_counts_it_and_its_rules_hold() -> None:
         (
             "nodes: {c-its: cloud}",
             "nodes: {c-its: cloud}\nplacement: source",
-            "with scope 'cluster' the service runs on the nodes in 'nodes'; leave out placement",
+            "with scope 'cluster' the service runs on the nodes in 'nodes'; leave out 'placement'",
         ),
         (
             "nodes: {c-its: cloud}",

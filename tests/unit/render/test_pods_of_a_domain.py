@@ -179,8 +179,8 @@ def test_a_node_may_not_have_what_its_domain_forbids() -> None:
     assert str(invalid.value).splitlines() == [
         *(
             f"{NODES}: nodes[{place}].hostNetwork: is true (the default), and podSecurity of "
-            "access domain 'fleet' is baseline, which forbids it; set hostNetwork: false, or "
-            "podSecurity: host-network"
+            "access domain 'fleet' is baseline, which forbids it; set 'hostNetwork: false' or "
+            "'podSecurity: host-network'"
             for place in (1, 2, 3)
         ),
         f"{CLIENTS}: mqtt.hostNetwork: is true, and podSecurity of access domain 'fleet' is "

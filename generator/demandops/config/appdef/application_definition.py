@@ -71,7 +71,9 @@ class ApplicationDefinition(FileModel):
             for problem in size_problems(service.scaling, self.parameters)
         ]
         if not self.services and not self.uses:
-            problems.append("services: is empty; define a service, or name a shared one under uses")
+            problems.append(
+                "services: is empty; define a service, or name a shared one under 'uses'"
+            )
         if problems:
             raise ValueError(sentences(problems))
         return self

@@ -202,10 +202,10 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
             if others and root not in others:
                 yield (
                     _place(service, role),
-                    f"the service runs once for each topic of '{root}', but "
-                    f"'{service.inputs[role]}' does not belong to a single one of these topics; "
-                    f"read '{service.inputs[role]}' in a service that runs once for the "
-                    "application or the node",
+                    f"the service runs once for each topic of '{root}', but these topics do not "
+                    f"each have their own '{service.inputs[role]}'; read "
+                    f"'{service.inputs[role]}' in a service that runs once for the application "
+                    "or the node",
                 )
     elif service.at_source:
         roots = tuple(sorted({one for of in made_from.values() for one in of}))

@@ -94,7 +94,10 @@ class Scaling(CamelModel):
         if len(deciding) > 1:
             yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
         for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
-            yield f"'sizes' lists all numbers of replicas, so {name} does nothing; remove {name}"
+            yield (
+                f"'sizes' gives the number of replicas for each size, so {name} does nothing; "
+                f"remove {name}"
+            )
         for name in ("per", "autoscaler"):
             if getattr(self, name) and self.min == self.max:
                 yield f"'{name}' does nothing, because min and max are both {self.max}; raise max"
@@ -110,13 +113,13 @@ class Scaling(CamelModel):
             yield "'mayDependOnRequesters' does nothing unless 'per' counts requesters; remove it"
         if self.down_after and not (self.per or self.sizes):
             own = " (an autoscaler has a delay of its own)" if self.autoscaler else ""
-            yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove downAfter"
+            yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove 'downAfter'"
         if self.down_after and seconds_of(self.down_after) < 1:
             yield "downAfter is zero; leave it out"
 
     @property
     def kept_for(self) -> timedelta | None:
-        """How long a service keeps replicas that no demand needs any more; ``None`` for no time."""
+        """How long a service keeps replicas that no demand needs; ``None`` if it keeps none."""
         return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
 
     @property

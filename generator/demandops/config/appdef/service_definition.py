@@ -136,7 +136,8 @@ class ServiceDefinition(Deployed, FileModel):
             )
         if self.placement == "source" and self.scope == "cluster":
             raise ValueError(
-                "with scope 'cluster' the service runs on the nodes in 'nodes'; leave out placement"
+                "with scope 'cluster' the service runs on the nodes in 'nodes'; leave out "
+                "'placement'"
             )
         if (self.each is None) is (self.scope == "topic"):
             raise ValueError("scope 'topic' needs 'each', and no other scope may have 'each'")

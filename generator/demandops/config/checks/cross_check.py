@@ -104,7 +104,8 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
             file, place = reader.place_of(NODES_FILE, node.id)
             message = (
                 f"is true (the default), and podSecurity of access domain '{domain.name}' is "
-                "baseline, which forbids it; set hostNetwork: false, or podSecurity: host-network"
+                "baseline, which forbids it; set 'hostNetwork: false' or "
+                "'podSecurity: host-network'"
             )
             reader.add_fault(file, f"{place}.hostNetwork", message)
     for word, file in config.entry_files[CLIENTS_FILE].items():
@@ -195,7 +196,10 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
 
 
 def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    """Yield (file, start of the paths of its fields, name, definition) for each service."""
+    """Yield (file, path in the file, name, definition) for each service.
+
+    The path is the start of the paths of the service's fields: ``services.<name>.``, or empty.
+    """
     for appdef in config.appdefs.values():
         for name, service in appdef.services.items():
             yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
@@ -204,7 +208,7 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Add the faults in the nodes of shared services and in the origins of their inputs.
+    """Check the nodes of shared services, and the origins of the services' inputs.
 
     If a shared service has ``each``, all appdefs that use the service must give the same origin to
     the input that ``each`` names.
@@ -274,7 +278,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault for each shared service that runs once per topic of an unshared service.
+    """Add a fault for each shared service that runs once for each topic of an unshared service.
 
     With ``versions: separate``, each version has its own instance of the unshared service, but the
     shared service runs once for all versions.
@@ -371,7 +375,7 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
 
 
 def _versions_for(override: Override, config: Config) -> set[str]:
-    """Return the versions and channels of the charts of all services that an override selects."""
+    """Return the versions and channels that an override may name for the selected services."""
     charts = {
         service.chart
         for appdef, services in config.services.items()

@@ -61,9 +61,9 @@ class Changeset:
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Key → the release after the change, for all releases that may differ."""
+    """For each key of a release that may differ, the release after the change."""
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Key → the release before the change, for the keys of ``plans``."""
+    """For each key of ``plans``, the release before the change."""
 
 
 def build_changeset(
@@ -173,7 +173,6 @@ def render_all(
 
 
 def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
-    """Return the release of a former world, or None if the release cannot be planned any more."""
     try:
         return plan(world, key)
     except Refused:

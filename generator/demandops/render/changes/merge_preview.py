@@ -2,7 +2,8 @@
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
 may affect any release, so this module compares all releases. The files decide whether a release
-differs, because the clusters follow the files. The plans before and after say how it differs.
+differs, because the clusters follow the files. The former and the new plan of a release show how
+the release differs.
 The functions here are pure.
 """
 
@@ -106,7 +107,6 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
 
 def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
-    """Return a map from each release's key to the files of the claims that need the release."""
     by_release: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
         paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]

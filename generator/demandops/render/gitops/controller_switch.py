@@ -131,15 +131,15 @@ def _delete_applications(config: Config) -> Iterator[Step]:
 
 def _finish_switch_to_flux(config: Config) -> Iterator[Step]:
     for cluster in domains_by_cluster(config):
-        yield _follow(cluster, "Flux adopts the running workloads")
+        yield _follow(cluster, "Flux adopts the running workloads by itself")
 
 
 def _follow(cluster: str, then: str) -> Step:
-    return Step(cluster, f"make the cluster follow the repo again; {then}", (_apply(cluster),))
+    return Step(cluster, f"make the cluster follow the repo again; then {then}", (_apply(cluster),))
 
 
 def _bootstrap_again(cluster: str) -> Step:
-    description = "apply its bootstrap file again, because the file changed"
+    description = "apply the cluster's bootstrap file again, because the file changed"
     return Step(cluster, description, (_apply(cluster),))
 
 

@@ -31,7 +31,7 @@ def bootstrap_path(cluster: str) -> str:
 
 
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
-    """Return (cluster, access domain) for each domain with nodes in the cluster, sorted by name."""
+    """Return (cluster, access domain) for each domain with nodes in the cluster, sorted."""
     pairs = {
         (node.cluster, config.domain_of[node.id].name)
         for node in config.nodes.values()
