@@ -87,7 +87,7 @@ def _too_large(size: str, limit: str, most: int) -> str:
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of the fields that only a Demand has, and not a DeploymentRequest."""
+    """Yield the faults of the fields that a Demand has and a DeploymentRequest lacks."""
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         message = (
@@ -150,7 +150,7 @@ def _delivery(where: str, delivery: Delivery, services: Services) -> Iterator[Fa
         yield fault(f"{where}.output", message)
     elif delivery.topic and service.roots:
         message = (
-            f"{name} may make several topics, so a delivery cannot rename them; leave topic out"
+            f"{name} may make several topics, so a delivery cannot rename them; leave 'topic' out"
         )
         yield fault(f"{where}.topic", message)
     problem = topic_problem(delivery.topic) if delivery.topic else ""
@@ -191,11 +191,6 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
 
 
 def _named_services(app: Application, appdef: str, config: Config) -> Iterator[Fault]:
-    """Yield a fault for each wrong entry in the demand's map from services to nodes.
-
-    An entry is wrong if the service is unknown, if a demand cannot name the service's node, or if
-    the node is empty.
-    """
     services = config.services[appdef]
     for name in app.named:
         service = services.get(name)
@@ -204,8 +199,8 @@ def _named_services(app: Application, appdef: str, config: Config) -> Iterator[F
             yield fault(f"services.{name}", f"{appdef} has no such service{known}")
         elif not service.is_placeable:
             message = (
-                f"{name} runs at its sources, or for applications of other types too, so a demand "
-                "cannot name its node; leave it out"
+                f"{name} runs at its sources, or serves applications of several types, so a "
+                f"demand cannot name the node of {name}; leave {name} out of 'services'"
             )
             yield fault(f"services.{name}", message)
         elif not app.services.get(name):
@@ -215,10 +210,6 @@ def _named_services(app: Application, appdef: str, config: Config) -> Iterator[F
 def _instance(
     app: Application, appdef: ApplicationDefinition, versions: Collection[str]
 ) -> Iterator[Fault]:
-    """Yield a fault if the id of a separate instance is wrong.
-
-    Also yield a fault if another application has an id that is reserved for a separate instance.
-    """
     id, _, named = app.id.rpartition("@")
     if app.separate and (not id or named != app.version):
         message = f"{quoted(app.id)} is a separate instance, but does not end in '@{app.version}'"
@@ -226,8 +217,8 @@ def _instance(
     elif not app.separate and appdef.versions == "separate" and id and named in versions:
         yield fault(
             "id",
-            f"{quoted(app.id)} is the instance of version {named}; ask for id {quoted(id)} with "
-            f"version: {named}, or choose an id that does not end in '@{named}'",
+            f"{quoted(app.id)} is the instance of version {named}; demand {quoted(id)} with "
+            f"version '{named}' instead, or choose an id that does not end in '@{named}'",
         )
 
 

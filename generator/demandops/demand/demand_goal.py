@@ -211,7 +211,7 @@ def _field(item: str, path: str) -> str:
 
 
 def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield a fault for each field in a release or a renewal that only a put may have."""
+    """Yield the faults of a release or a renewal: each field that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:

@@ -130,8 +130,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
     Args:
         data: the goal as a mapping, as ``ros2 action send_goal`` takes it.
-        appdef_by_type: takes the number of an application type in the message, and returns the
-            appdef that has it, or ``None``.
+        appdef_by_type: takes an application's type, which is a number in the message, and returns
+            the appdef of this type, or ``None``.
 
     Returns:
         The request and the faults of its form. Fields of the wrong form are left out of the
@@ -158,8 +158,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         sources, targets = len(connection.source_topics), len(connection.target_topics)
         if sources != targets:
             message = (
-                f"has {targets} names for {sources} in source_topics; source topic i goes to "
-                "target topic i, so list as many of each"
+                f"has {targets} names, but source_topics has {sources}; source topic i goes to "
+                "target topic i, so both lists must have the same length"
             )
             faults.append(fault(f"{where}.target_topics", message))
     # if "shutdown" is invalid, treat the goal as a shutdown, because a join must obey all its rules

@@ -120,7 +120,6 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
 
 
 def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
-    """Return a sentence about the access that a rule does not grant a requester."""
     where = f"access domain '{domain.name}'"
     if kind == PEERS:
         whose = f"rule '{rule.name}' of {where}" if domain.rules else where
@@ -129,7 +128,7 @@ def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: 
             "(peers)"
         )
     return (
-        f"rule '{rule.name}' of {where} lets '{requester}' have {kind} "
+        f"rule '{rule.name}' of {where} lets '{requester}' have only these {kind}: "
         f"{' '.join(getattr(rule, kind))}, not '{value}'"
     )
 
@@ -204,7 +203,6 @@ def approval_reasons(
 
 
 def _is_more_than_renewed(before: Claim | None, after: Claim) -> bool:
-    """Return whether a claim is new or differs in more than its lease."""
     return before is None or replace(after, lease=before.lease) != before
 
 

@@ -1,4 +1,4 @@
-"""Finds the events that had started before a restart, by the demands that are booked."""
+"""Finds, from the booked demands, the events that had started before a restart."""
 
 from __future__ import annotations
 

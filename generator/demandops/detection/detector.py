@@ -109,11 +109,7 @@ class Detector:
         return changed
 
     def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the values for the rule's template.
-
-        They are the rule's name, the entities' names, and the values from the event's start. The
-        result is ``None`` if the template needs a value that is not known.
-        """
+        """Return the values for the rule's template; ``None`` if a value is not known."""
         named = dict(zip(rule.subjects, key[1], strict=True))
         values: Values = {**self._values.get(key, {}), "rule": rule.name, **named}
         return values if rule.template.names() <= set(values) else None

@@ -77,7 +77,6 @@ def _number(value: object) -> float:
 
 
 def _getter(path: str) -> Getter:
-    """Return a function that reads a field of a message by its path."""
     parts = [(name, int(index or 0)) for name, index in _PART.findall(path)]
 
     def get(message: Any) -> Any:  # noqa: ANN401

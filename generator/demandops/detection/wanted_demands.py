@@ -161,7 +161,7 @@ class WantedDemands:
 
         Returns:
             The reason of a failure, for the log. The text is empty if the goal succeeded, or if the
-            attempt before it failed for the same reason.
+            previous attempt failed for the same reason.
         """
         entry = self._entries[sending.key]
         entry.is_under_way = False

@@ -98,7 +98,7 @@ class Demands:
 
     @property
     def proposed(self) -> list[Ticket]:
-        """The demands on a branch that a person may merge, even if they were withdrawn later."""
+        """The demands that are on a proposal's branch, including withdrawn ones."""
         with self._changed:
             return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
 
@@ -407,7 +407,11 @@ class Demands:
         try:
             self._journal.mark_done(operations, durably=durably)
         except StateRepoError as error:  # the next successful write makes the removal durable
-            log.error("an answer cannot be journaled, so a crash may repeat the demand: %s", error)
+            log.error(
+                "an answer cannot be journaled, so after a crash the demand may be carried out "
+                "again: %s",
+                error,
+            )
             self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:

@@ -100,12 +100,12 @@ class Evaluator:
             return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of the demands in ``batch`` that ``tip`` records, oldest first.
+        """Return the results of the demands in ``batch`` that were pushed before, oldest first.
 
-        An earlier attempt pushed these demands but did not answer them, because the connection or
-        the process ended after the remote accepted the push, or because an fsync failed. In a
-        repository on this disk, this method writes the commits since the oldest base of these
-        demands once more, and fsyncs them.
+        The history of ``tip`` records these demands. An earlier attempt pushed them but did not
+        answer them, because the connection or the process ended after the remote accepted the push,
+        or because an fsync failed. In a repository on this disk, this method writes their commits
+        and all later ones once more, and fsyncs them.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())

@@ -1,10 +1,11 @@
 """The queue of waiting demands: requesters take turns, and related demands keep their order.
 
-A demand takes the turn of its first requester. Demands that share an application, a connection or
-a demand id keep their order. Goals of the reference's action that share a requester also keep their
-order, because the second of two equal shutdowns has an effect only if a join came between them. If
-the next demand must follow another demand, the queue returns the other demand first. A rollback or
-a decommission may touch any subject, so no demand overtakes it, and it overtakes no demand.
+For the turns, only the first requester of a demand counts. Demands that share an application, a
+connection or a demand id keep their order. Goals of the reference's action that share a requester
+also keep their order, because the second of two equal shutdowns has an effect only if a join came
+between them. If the next demand must follow another demand, the queue returns the other demand
+first. A rollback or a decommission may touch any subject, so no demand overtakes it, and it
+overtakes no demand.
 """
 
 from __future__ import annotations
@@ -24,8 +25,7 @@ _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
 class _Queued:
     """A demand in the queue.
 
-    ``number`` is higher for each later arrival. ``subjects`` is None if the demand may touch any
-    subject. ``has_left`` is true once the demand is no longer in the queue.
+    ``number`` gives the order of arrival. ``subjects`` is None if the demand may touch any subject.
     """
 
     number: int

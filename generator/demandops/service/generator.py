@@ -154,7 +154,7 @@ class Generator:
 
     @property
     def failures(self) -> dict[str, str]:
-        """A map from thread or task to its error, for those that failed and have not recovered.
+        """The errors of the threads and tasks that failed and have not recovered, by name.
 
         Any thread may read this.
         """
@@ -205,11 +205,14 @@ class Generator:
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is or descends from ``other``; any thread may call this."""
+        """Return whether ``other`` is ``commit`` or one of its ancestors.
+
+        Any thread may call this.
+        """
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether two commits have equal content at ``path``; any thread may call it."""
+        """Return whether two commits have equal content at ``path``; any thread may call this."""
         return self._repository.unchanged(commit, other, path)
 
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
@@ -262,7 +265,6 @@ class Generator:
         finished.set_result(not unpublished)
 
     def _have_ended(self, timeout: float) -> bool:
-        """Wait for the threads to end, for up to ``timeout`` seconds; return whether they have."""
         end = self._runtime.monotonic() + timeout
         for thread in self._threads:
             thread.join(max(0.0, end - self._runtime.monotonic()))
@@ -274,7 +276,6 @@ class Generator:
 
 
 def _is_deeper(value: object, levels: int) -> bool:
-    """Return whether lists and mappings are nested deeper than ``levels``."""
     if not isinstance(value, dict | list):
         return False
     parts = value.values() if isinstance(value, dict) else value

@@ -47,7 +47,7 @@ class PushWebhook:
         Args:
             address: ``host:port``; port 0 picks a free port.
             secret: the key that signs notifications. If it is empty, notifications need no
-                signature, and the address must be on the loopback.
+                signature, and the address must be a loopback address.
             on_push: called for each notification; must return at once.
 
         Raises:
@@ -114,7 +114,7 @@ class PushWebhook:
         return any(signed) or token
 
     def _warn(self, sender: str) -> None:
-        """Log that a notification is not signed, at most once a minute.
+        """Log, at most once a minute, that a notification is not signed.
 
         Anyone may send requests, and a line for each request could fill the log.
         """

@@ -68,8 +68,8 @@ class Ticket:
     """A demand under way; ``future`` returns its receipt or raises its error.
 
     The future ``journaled`` returns True as soon as the journal has the demand, because from then
-    on a crash does not lose the demand. If the demand is refused before, ``journaled`` returns
-    False, and ``future`` raises the reason.
+    on a crash does not lose the demand. If the demand is refused and not journaled, ``journaled``
+    returns False, and ``future`` raises the reason.
 
     ``base`` is the tip that was known when the demand arrived. ``maybe_published`` is true if the
     remote may have accepted a push of the demand although no answer arrived. ``has_released`` is
@@ -158,7 +158,7 @@ def reason_of(error: DemandOpsError) -> str:
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
     """Return a ticket for a demand that an earlier run left in the journal.
 
-    The listener of the ticket logs the last stages of the demand.
+    The ticket's listener logs what becomes of the demand.
     """
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"

@@ -160,7 +160,6 @@ class Worker:
         self._demands.fail(batch, error)
 
     def _begin_rest(self) -> None:
-        """Stop following the state repo for a while after a failure."""
         if self._rest.follows_success:
             self._renew_clone_if_damaged()
         self._rest.begin()
@@ -220,11 +219,6 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
 
     def _require_not_ending(self) -> None:
-        """Return only if :meth:`end_soon` was not called.
-
-        Raises:
-            ShuttingDown: after :meth:`end_soon`; the next start resumes the demands.
-        """
         if self._ends_soon.is_set():
             reason = self._demands.blocked or "the generator stops"
             raise ShuttingDown(
@@ -306,8 +300,8 @@ class Worker:
         """Publish a commit batch and answer its demands, or return false and answer none.
 
         The result is false if another writer published first. If the remote denies the push, the
-        demands after the first ``certain`` results get this error as their answer, unless they are
-        withdrawn.
+        demands after the first ``certain`` ones get :class:`PushDenied` as their answer, unless
+        they were withdrawn.
 
         Args:
             commits: the commits of the demands.
@@ -372,7 +366,6 @@ class Worker:
             self._own_work.postpone()
 
     def _check_proposals(self) -> None:
-        """Check the proposals against the newest main, if a check is due."""
         if not self._approvals.is_due(str(self.snapshot.commit)):
             return
         try:

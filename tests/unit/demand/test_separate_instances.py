@@ -160,8 +160,8 @@ def test_one_topic_for_both_is_refused() -> None:
         (
             "edge/a@1.1.0",
             "",
-            "applications[0].id: 'edge/a@1.1.0' is the instance of version 1.1.0; ask for id "
-            "'edge/a' with version: 1.1.0, or choose an id that does not end in '@1.1.0'",
+            "applications[0].id: 'edge/a@1.1.0' is the instance of version 1.1.0; demand "
+            "'edge/a' with version '1.1.0' instead, or choose an id that does not end in '@1.1.0'",
         ),
     ],
 )

@@ -33,9 +33,9 @@ def faults(text: str) -> list[str]:
     [
         (
             rule("a", near={**NEAR, "stop": 84}),
-            "rules.yaml:21: rules[0].near: stop 84 must be above start 84: between the two, the "
-            "condition stays as it is, so that an entity near the limit does not start and stop it "
-            "again and again",
+            "rules.yaml:21: rules[0].near: 'stop' is 84, but must be more than 'start', which is "
+            "84: between the two, the condition stays as it is, so that an entity near the limit "
+            "does not start and stop it again and again",
         ),
         (
             rule("a", near={**NEAR, "source": "car"}),
@@ -130,8 +130,8 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "d": {"topic": "/d/{entity}", "type": "p/msg/M", "timeout": "0s"},
     }
     assert faults(text_of(rule("r", near={**NEAR, "source": "a"}), sources=sources)) == [
-        "rules.yaml:4: sources.a: needs the name of the entity once: write {entity} as a part of "
-        "topic, or set entity to the field of the message that has the name",
+        "rules.yaml:4: sources.a: must say where the name of the entity is: either write {entity} "
+        "as a part of 'topic', or set 'entity' to the field of the message that has the name",
         "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
         "letters, digits and '_', with a single '/' between parts; no part may start with a digit",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
@@ -146,7 +146,7 @@ def test_two_rules_for_the_same_entities_have_demands_of_their_own() -> None:
     same, other = demand(demand="b/{entity}"), demand()
     told = faults(text_of(rule("a", near=NEAR, demand=same), rule("b", near=far, demand=other)))
     assert told == [
-        "rules.yaml:30: rules[1].demand.demand: is the id of a demand of rule 'a' too, so the "
+        "rules.yaml:30: rules[1].demand.demand: is also the id of a demand of rule 'a', so the "
         "event that ends first would end the other event's demand; add {rule} to one of the ids"
     ]
     cars = rule("a", near=NEAR, demand=same, entities=["car*"])

@@ -167,9 +167,8 @@ class PairRule(CompiledRule):
     ) -> None:
         """Move an entity in ``cells`` from the square where it was to the square where it is now.
 
-        ``before`` and ``after`` are the entity's last and new observation. If ``before`` is
-        ``None`` or has no position, the entity was in no square. The same holds for ``after`` and
-        the square that the entity enters.
+        ``before`` and ``after`` are the entity's last and new observation. An entity without an
+        observation or without a position is in no square.
         """
         left, entered = self._cell(before), self._cell(after)
         if left == entered:

@@ -35,7 +35,7 @@ class Observation(NamedTuple):
 
 
 class Event(NamedTuple):
-    """The start or the end of an event: from now on a demand is wanted, or no longer wanted.
+    """An event that starts or ends: from now on its demand is wanted, or no longer wanted.
 
     ``values`` are for the rule's template. ``why`` explains to people what has happened.
     """
@@ -101,7 +101,7 @@ class State:
         return frozenset(key for key, phase in self.phases.items() if phase.lasts)
 
     def shifted(self, seconds: float) -> State:
-        """Return the state with its times moved by ``seconds``, as the clock was."""
+        """Return the state with all its times moved by ``seconds``."""
         return replace(
             self,
             now=self.now + seconds,

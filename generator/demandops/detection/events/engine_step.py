@@ -205,10 +205,6 @@ class EngineStep:
     # ---- events ----
 
     def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
-        """Stop a condition if ``stops`` is true, or start it if ``starts`` is true.
-
-        If neither is true, the condition stays as it is.
-        """
         phase = self._phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")

@@ -68,10 +68,7 @@ class EventEngine:
         return step.result()
 
     def _timeout_of_count(self, key: Key) -> float:
-        """Return the timeout of the source whose entities the event's rule counts.
-
-        The result is 0 if the rule does not count entities.
-        """
+        """Return the timeout of the entities that the event's rule counts; 0 without a count."""
         rule = self.rules.get(key[0])
         is_count = isinstance(rule, AreaRule) and rule.count is not None
         return self.timeouts[rule.sources[0]] if rule and is_count else 0.0

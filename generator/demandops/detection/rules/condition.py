@@ -58,8 +58,9 @@ class _InArea(CamelModel):
 def _refuse_distances(start: float, stop: float) -> None:
     if stop <= start:
         raise ValueError(
-            f"stop {stop:g} must be above start {start:g}: between the two, the condition stays as "
-            "it is, so that an entity near the limit does not start and stop it again and again"
+            f"'stop' is {stop:g}, but must be more than 'start', which is {start:g}: between the "
+            "two, the condition stays as it is, so that an entity near the limit does not start "
+            "and stop it again and again"
         )
 
 
@@ -110,7 +111,9 @@ class Count(_InArea):
     @model_validator(mode="after")
     def _has_hysteresis(self) -> Count:
         if self.stop >= self.start:
-            raise ValueError(f"stop {self.stop} must be below start {self.start}")
+            raise ValueError(
+                f"'stop' is {self.stop}, but must be less than 'start', which is {self.start}"
+            )
         if self.point is not None and not self.radius:
             raise ValueError("radius is missing; add it, because no entity is exactly at a point")
         return self
@@ -131,14 +134,16 @@ class Threshold(CamelModel):
     @model_validator(mode="after")
     def _has_hysteresis(self) -> Threshold:
         if (self.above is None) == (self.below is None):
-            raise ValueError("needs either above or below")
+            raise ValueError("must have exactly one of 'above' and 'below'")
         if self.above is not None and self.stop > self.above:
             raise ValueError(
-                f"stop {self.stop:g} must be at most {self.above:g}, the value of above"
+                f"'stop' is {self.stop:g}, but must not be more than 'above', which is "
+                f"{self.above:g}"
             )
         if self.below is not None and self.stop < self.below:
             raise ValueError(
-                f"stop {self.stop:g} must be at least {self.below:g}, the value of below"
+                f"'stop' is {self.stop:g}, but must not be less than 'below', which is "
+                f"{self.below:g}"
             )
         return self
 

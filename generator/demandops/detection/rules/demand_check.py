@@ -58,10 +58,7 @@ def faults_of_demand(
 
 
 def _number_for_text(text: str) -> str:
-    """Return a message if ``text`` is only a name in braces, and the name's value is a number.
-
-    ``{x}`` is such a text. The result is empty for other texts.
-    """
+    """Return a message if ``text`` is only a number's name in braces, like ``{x}``; else empty."""
     if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
         return f"{quoted(text)} alone becomes a number, but this field needs text; add a word to it"
     return ""
@@ -70,8 +67,8 @@ def _number_for_text(text: str) -> str:
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
     """Yield a fault for each id that is missing, that may change, or that two entities would share.
 
-    ``needed`` has the names in braces that the demand's id must contain. In a
-    ``DeploymentRequest``, the requesters of each item together must contain them.
+    ``needed`` has the names in braces that a ``Demand`` must have in its id, and a
+    ``DeploymentRequest`` in the requesters of each item.
     """
     data = template.data
     if template.action == "demand":
@@ -102,7 +99,6 @@ def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: A
 
 
 def _requesters_by_field(data: Any) -> Iterator[tuple[str, list[str]]]:  # noqa: ANN401
-    """Yield (field, requesters) for each item of a ``DeploymentRequest``."""
     for index, app in enumerate(data.get("apps", ())):
         field = "object_detection_fusion_app"
         yield f"apps[{index}].{field}.requester_ids", app.get(field, {}).get("requester_ids", [])

@@ -56,8 +56,8 @@ class Source(CamelModel):
     def _names_entities(self) -> Source:
         if ("{entity}" in self.topic) == bool(self.entity):
             raise ValueError(
-                "needs the name of the entity once: write {entity} as a part of topic, or set "
-                "entity to the field of the message that has the name"
+                "must say where the name of the entity is: either write {entity} as a part of "
+                "'topic', or set 'entity' to the field of the message that has the name"
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
@@ -207,8 +207,9 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
             for other_id, other in ids:
                 if id == other_id and _may_meet(rule, other):
                     message = (
-                        f"is the id of a demand of rule '{other.name}' too, so the event that ends "
-                        "first would end the other event's demand; add {rule} to one of the ids"
+                        f"is also the id of a demand of rule '{other.name}', so the event that "
+                        "ends first would end the other event's demand; add {rule} to one of the "
+                        "ids"
                     )
                     yield fault(f"{where}.demand.demand", message)
                     break

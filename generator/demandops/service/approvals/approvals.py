@@ -143,7 +143,7 @@ class Approvals:
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Add a demand that needs approval to the proposal that has its key, or to a new proposal.
+        """Add a demand to the proposal that has the demand's key, or to a new proposal.
 
         A put replaces the earlier demands of its proposal. The demand gets an error as its answer
         if other requesters own the proposal, if a requester has too many proposals, or if the
@@ -158,8 +158,9 @@ class Approvals:
             return
         if proposal is None and (full := self._requester_over_limit(request)):
             message = (
-                f"{PROPOSAL_LIMIT} proposals of {quoted(full)} await approval already; release "
-                "some of their demands, or ask a person to approve or reject some proposals"
+                f"{quoted(full)} already has {PROPOSAL_LIMIT} proposals that await approval; "
+                "release some of the demands in these proposals, or ask a person to approve or "
+                "reject some of the proposals"
             )
             self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
             return
@@ -179,7 +180,6 @@ class Approvals:
         self._changed.append(proposal.branch)
 
     def _requester_over_limit(self, request: DemandRequest) -> str:
-        """Return a requester of ``request`` that has too many proposals; empty if there is none."""
         counts = Counter(name for each in self._proposals.values() for name in each.requesters())
         full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
         return next(full, "")
@@ -253,7 +253,6 @@ class Approvals:
         self._timer.ended(str(snapshot.commit))
 
     def _must_pause(self, began: float) -> bool:
-        """Return whether a check that began at ``began`` must pause, because a demand waits."""
         is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
         return is_long and self._demands.has_waiting
 
@@ -264,7 +263,6 @@ class Approvals:
         self._changed.append(proposals[0].branch)
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Decide the verdict on a proposal, and carry it out."""
         objects, tip = self._repository.objects, str(snapshot.commit)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         proposal.searched_to = tip
@@ -358,7 +356,7 @@ class Approvals:
     def _bring_up_to_date(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
     ) -> bool:
-        """Push the branch with one commit for each demand on top of main, unless it is up to date.
+        """Rebuild the branch on main, with one commit for each demand, unless it is up to date.
 
         Return False if a demand was withdrawn; the branch is then not pushed.
         """
@@ -406,19 +404,21 @@ class Approvals:
         self._forget(proposal, close=True)
 
     def _forget(self, proposal: Proposal, *, close: bool) -> None:
-        """Forget a proposal; with ``close``, also close its pull request if it is open."""
         self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
         self._forge.forget(proposal.branch, close=close)
 
     def _on_forge_update(self, branch: str) -> None:
-        """Request a check of a branch whose pull request changed; runs in the forge's thread."""
+        """Make a check of the branch due, because its pull request changed.
+
+        The forge's thread calls this.
+        """
         self._changed.append(branch)
         self._demands.wake()
 
     def suspend(self) -> None:
-        """Answer with an error all demands that await approval, and keep them in the journal.
+        """Answer the demands that await approval: each gets an error, but stays in the journal.
 
-        The next start resumes them.
+        The next start resumes these demands.
         """
         error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
@@ -428,10 +428,7 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return a demand's request if it is a release that can be carried out, or None if it is not.
-
-    A demand that is withdrawn, or whose goal is refused, cannot be carried out.
-    """
+    """Return the release that a demand requests; None if there is none that can be carried out."""
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)

@@ -27,8 +27,8 @@ class CheckTimer:
     def is_due(self, tip: str, *, has_news: bool) -> bool:
         """Return whether to check now; ``tip`` is the newest commit of main.
 
-        If ``has_news`` is true, because a proposal has changed, a check is due at once, unless the
-        last check failed.
+        ``has_news`` is true if a proposal has changed. A check is then due at once, unless the last
+        check failed.
         """
         if has_news and self._checked_at is not None:
             return True

@@ -20,7 +20,7 @@ from demandops.settings import MAIN_BRANCH
 log = logging.getLogger("demandops")
 
 POLL_S = 30.0
-"""The seconds between queries of the forge: only the forge knows which pull requests are closed."""
+"""The seconds between two queries to the forge, to learn which pull requests were closed."""
 
 _REST_S = 60.0
 """How long to pause after a forge has answered that it got too many requests."""
@@ -73,7 +73,7 @@ class ForgeWorker:
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, *, close: bool) -> None:
-        """Stop watching a branch; if ``close``, also close its pull request if it is open."""
+        """Stop watching a branch; with ``close``, also close its open pull request."""
         with self._lock:
             task = self._wanted.pop(branch, None)
             self._pull_requests.pop(branch, None)

@@ -259,5 +259,5 @@ def _required_by(reasons: Iterable[str]) -> str:
 
 
 def _fence(text: str, shortest: int) -> str:
-    """Return at least ``shortest`` backticks, and more than any run of backticks in ``text``."""
+    """Return at least ``shortest`` backticks, and more than ``text`` has in a row."""
     return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])

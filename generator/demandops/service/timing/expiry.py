@@ -28,9 +28,9 @@ log = logging.getLogger("demandops")
 _JUMP = timedelta(seconds=30)
 _SHORTEST_S = 1.0
 LONGEST_WAIT_S = 60.0
-"""The longest time between two checks of the leases, because the clock may be set meanwhile."""
+"""The longest time between two checks of the leases. It is short, as the clock may be set."""
 _RETRY = timedelta(seconds=LONGEST_WAIT_S)
-"""The pause before a retry of a failed release of claims, or of a failed end of an override."""
+"""The pause after a failed try to end a lease or an override, or to scale down."""
 
 
 class LeaseExpiry:
@@ -47,9 +47,9 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        Once a ticket is answered, its demand gets no new ticket until a minute after the old one
-        was made. The tickets are correct only at the time of the call, because later a requester
-        may have renewed a lease, or a person may have set the clock.
+        A demand whose ticket was answered is left out until that ticket is a minute old. The
+        tickets are correct only at the time of the call, because later a requester may have renewed
+        a lease, or a person may have set the clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
@@ -120,7 +120,7 @@ class OverrideExpiry:
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit the end of each expired override; retry failed ones later."""
+        """Commit the end of each expired override; if that fails, try again later."""
         for override in expired_overrides(commits.head.state, now):
             if self._retry_at.get((override.name, override.end), now) > now:
                 continue
@@ -161,7 +161,7 @@ class ScaleDown:
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit each scale-down that is due; retry failed ones later."""
+        """Commit each scale-down that is due; if that fails, try again later."""
         for instance in commits.head.state.ledger.kept.due(now):
             if self._retry_at.get(instance, now) > now:
                 continue

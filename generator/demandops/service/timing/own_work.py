@@ -1,4 +1,4 @@
-"""The work that the generator commits by itself when it is due, not because of a new demand."""
+"""The work that becomes due without a new demand, such as ends of overrides."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class OwnWork:
         self._waiting_turns = WaitingTurns(runtime)
 
     def commit_due(self, commits: CommitBatch) -> None:
-        """Commit all work that is due; retry later the work that failed."""
+        """Commit all work that is due; if a part fails, try it again later."""
         self._override_expiry.end_due(commits, self._runtime.now())
         self._scale_down.end_due(commits, self._runtime.now())
         self._draining.move_due(commits)
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand, which was decided on ``before``, freed room."""
+        """Book waiting demands if the last demand freed room; ``before`` is the state before it."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:

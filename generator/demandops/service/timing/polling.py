@@ -14,7 +14,7 @@ DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5
 _LOCAL_S = 1.0
-"""The longest interval for a repository on this disk, because a check reads only one file."""
+"""The longest interval for a repository on this disk, where a check is cheap: it reads one file."""
 
 
 def parse_interval(text: str) -> float:
@@ -63,9 +63,9 @@ class PollTimer:
         return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
-        """Return whether a fetch is due; the caller then fetches.
+        """Return whether a fetch is due; if it is, the caller must fetch.
 
-        The fetch serves every earlier :meth:`request`. A later one makes another fetch due.
+        The fetch serves every earlier :meth:`request`. A later request makes another fetch due.
         """
         due = self.seconds_until_due() == 0.0
         if due:

@@ -39,9 +39,9 @@ class RateLimit:
             for requester in request.requesters() if most else ():
                 if self._count((domain.name, requester), operation, received) > (most or 0):
                     message = (
-                        f"'{requester}' sent more than the {most} demands in a minute that "
-                        f"quotas.demandsPerMinute of access domain '{domain.name}' allows; send "
-                        "the demand again later"
+                        f"'{requester}' sent more than {most} demands in a minute, the limit in "
+                        f"quotas.demandsPerMinute of access domain '{domain.name}'; send the "
+                        "demand again later"
                     )
                     yield fault("", message, code="quota")
 

@@ -20,7 +20,7 @@ class Rest:
 
     @property
     def follows_success(self) -> bool:
-        """Whether no rest has begun since the last success, or since the start."""
+        """Whether the next rest is the first one since a success or since the start."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
