@@ -37,7 +37,7 @@ _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
     f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
-    f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
+    f"{_DEFAULT_DEPTH} may miss results; give the client a deeper queue (docs/demand.md)"
 )
 _MOST_READERS = 4
 """How many calls of the bookkeeping service may wait for their answers.
@@ -141,7 +141,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer a call of the service in another thread.
+        """Answer a call of the bookkeeping service, in another thread.
 
         A call that reads an old revision may take seconds, and must not block the executor.
         """
@@ -223,7 +223,7 @@ class DemandNode(Node):  # type: ignore[misc]
             )
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Withdraw a demand and accept the cancel; reject it if the demand is already committed."""
+        """Withdraw the demand of a goal; reject the cancellation if the demand is committed."""
         goal = self._goals.get(id(handle.request))
         if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT
@@ -276,7 +276,7 @@ class DemandNode(Node):  # type: ignore[misc]
         if status is not None:
             problem = status.why_unreachable(target.domain for target in outcome.targets)
         if problem or status is None:
-            warnings = (*outcome.warnings, f"answered at pushed, not at {level}: {problem}")
+            warnings = (*outcome.warnings, f"answered once pushed, not once {level}: {problem}")
             self._finish(goal, replace(outcome, warnings=warnings))
             return
         rolled_out = status.follow(

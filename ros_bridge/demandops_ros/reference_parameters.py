@@ -32,7 +32,7 @@ _REPLACED = {
 
 
 def read(ros_args: Sequence[str]) -> dict[str, Any]:
-    """Return the reference node's parameters from ROS arguments and the files that they name."""
+    """Return the reference node's parameters, from ROS arguments and their parameter files."""
     renames = {
         at
         for at, word in enumerate(ros_args)

@@ -1,7 +1,7 @@
 """Follows the state repo, and provides what the page shows.
 
-The page shows the newest situation, situations at earlier commits, and the newest commits. A
-situation is the state at a commit, with the reports of the clusters (:class:`Situation`).
+A situation is the state at a commit, with the reports of the clusters (:class:`Situation`). The
+page shows the newest situation, situations at earlier commits, and the newest commits.
 
 One thread fetches new commits and publishes each new situation. The threads that answer requests
 read the published situation.

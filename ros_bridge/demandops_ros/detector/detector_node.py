@@ -100,7 +100,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._sender.close()
 
     def _log(self, level: str, text: str) -> None:
-        logger = self.get_logger()  # rclpy allows each line of code one level only
+        logger = self.get_logger()  # in rclpy, a line of code can log at one level only
         if level == "warning":
             logger.warning(one_line(text))
         else:

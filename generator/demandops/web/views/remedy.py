@@ -81,7 +81,7 @@ def remedy_of(
     if _ROOM.search(reason):
         return Remedy(
             f"the operator of node {release.node.id} in cluster {cluster}",
-            "make room for the release, or have the demand run on another node",
+            "make room for the release, or demand it on another node",
             command,
         )
     if _IMAGE.search(reason):
@@ -110,7 +110,7 @@ def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
     """Return a text that names who last changed each path; empty if no person changed any."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
-    return f" ({', '.join(people)} changed it last)" if people else ""
+    return f" (last changed by {', '.join(people)})" if people else ""
 
 
 def _image(release: Release, name: str, config: Config) -> Image:
