@@ -201,10 +201,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return GoalResponse.REJECT
 
     def _accepted(self, handle: ServerGoalHandle) -> None:
-        """Store the handle of an accepted goal, and publish the feedback that was made before.
-
-        There was no handle before, because rclpy makes the handle only after the acceptance.
-        """
+        """Store the handle, which rclpy makes now; publish the feedback that came before."""
         goal = self._goals[id(handle.request)]
         goal.handle = handle
         for feedback in goal.feedback:
@@ -230,7 +227,6 @@ class DemandNode(Node):  # type: ignore[misc]
         return CancelResponse.REJECT
 
     def _execute(self, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
-        """End a goal whose outcome is known, and return its result."""
         goal = self._goals.pop(id(handle.request))
         outcome = goal.outcome
         result = goal.adapter.result(outcome, goal.reached)

@@ -275,7 +275,7 @@ class _Signals:
         """Wait until a signal comes or ``until()`` is true.
 
         Each call of :meth:`wake` makes this method check ``until()`` again. If :class:`Unsound` was
-        raised in any thread, a demand could be lost. Then this method ends the process.
+        raised in any thread, this method ends the process.
         """
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)

@@ -94,7 +94,7 @@ class Follower:
         return self._watch.changes
 
     def reader(self) -> Reader:
-        """Return a reader of the state repo that the calling thread may use."""
+        """Return a reader of the state repo for the calling thread."""
         return self._reader.for_another_thread()
 
     def at(self, revision: str) -> Situation:
@@ -190,7 +190,6 @@ class Follower:
             self.version += 1
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
-        """Read statuses, proposals and history, and return the situation at ``commit_state``."""
         self._read_history(commit_state.commit)
         statuses: Mapping[str, ReleaseStatus] = {}
         old: tuple[OldBootstrap, ...] = ()

@@ -61,7 +61,6 @@ def detect(
 
 
 def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
-    """Print the demands that the rules would make for a bag; draw them if ``plot`` is given."""
     name, text = read_input(rules)
     file = rule_file.read(text, name)
     try:

@@ -36,8 +36,6 @@ def svg(replay: Replay) -> str:
 
 
 class _Colors:
-    """Gives each entity a color, in the order in which the entities first appear."""
-
     def __init__(self) -> None:
         self._of: dict[str, str] = {}
 

@@ -148,7 +148,6 @@ def _why_outdated(
 
 
 def _synced_health(app: Object, name: str, objects: Objects) -> Health:
-    """Return a service's health, from its synced Application and from its Deployments."""
     for item in (app.get("status") or {}).get("resources") or ():
         if item.get("kind") != "Deployment":
             continue

@@ -66,7 +66,7 @@ def remedy_of(
     if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
-            who = f"the GitOps controller of cluster {cluster} by itself; if not, its operator"
+            who = f"the GitOps controller of cluster {cluster} by itself; if it fails, its operator"
         return Remedy(who, "", command)
     if kind == "starting":
         who = f"nobody yet; if this lasts, the operator of cluster {cluster}"
@@ -86,7 +86,7 @@ def remedy_of(
         )
     if _IMAGE.search(reason):
         return _of_images(release, config, command, last_change)
-    how = "look at the log of its container" if _CRASH.search(reason) else ""
+    how = "look at the log of the container" if _CRASH.search(reason) else ""
     if not isinstance(release, ServiceRelease):
         return Remedy(f"the maintainer of the {release.type.word} client", how, command)
     where = f"appdefs/{release.service.folder}"
