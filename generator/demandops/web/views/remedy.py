@@ -81,7 +81,7 @@ def remedy_of(
     if _ROOM.search(reason):
         return Remedy(
             f"the operator of node {release.node.id} in cluster {cluster}",
-            "make room for the release, or demand it on another node",
+            "make room on the node, or name another node in the demand",
             command,
         )
     if _IMAGE.search(reason):
