@@ -297,7 +297,7 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- events that other threads pass to the executor's thread ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Send a stage as feedback; if the stage is ``refused``, send nothing and log the refusal.
+        """Send a stage as feedback, or log it if it is ``refused``.
 
         The result will report the refusal too, but a crash may come before the result.
         """

@@ -247,9 +247,8 @@ def _drain(
 class _Signals:
     """Handles Ctrl-C and SIGTERM: the first signal stops the program once its goals are finished.
 
-    A second signal stops the program at once. The kernel may deliver a signal to any thread.
-    Therefore Python writes each signal to a wake-up pipe, which the main thread reads. So the main
-    thread notices the signal at once.
+    A second signal stops the program at once. The kernel may deliver a signal to any thread, so
+    Python writes each signal to a wake-up pipe that the main thread reads.
     """
 
     def __init__(self) -> None:

@@ -170,7 +170,6 @@ class Follower:
                 self.closed.wait(min(1.0, _MOST_OF_TIME * (self._runtime.monotonic() - began)))
 
     def _look(self) -> None:
-        """Read new commits and statuses; publish a new situation if something changed."""
         known = self._newest
         try:
             commit, commit_state = self._reader.refresh(), known.commit_state

@@ -177,10 +177,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._detector.set_clock(jumped)
 
     def _reload_if_changed(self) -> None:
-        """Read the file of rules, and use its rules if the text has changed.
-
-        If the file is invalid, log each new problem once and keep the last valid rules.
-        """
+        """If the file is invalid, log each new problem once and keep the last valid rules."""
         try:
             _, text = read_input(self._path)
         except InvalidInput as error:
