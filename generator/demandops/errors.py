@@ -158,7 +158,7 @@ def fault(field: str, message: str, *, code: str = "invalid", line: int | None =
 
 
 def internal(error: Exception) -> StateRepoError:
-    """Return the error that answers a demand that failed because of a fault of the program."""
+    """Return the error for a demand that failed because of a fault of the program."""
     return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
 

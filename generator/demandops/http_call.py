@@ -1,6 +1,6 @@
 """HTTP calls to other services: the only module that imports httpx.
 
-A call trusts the certificates in ``SSL_CERT_FILE``, or those of the system if that is not set. It
+A call trusts the certificates in ``SSL_CERT_FILE``, or the system's if the variable is not set. It
 uses the proxy that the usual environment variables name. It follows no redirect, because
 credentials must not reach another host. The answer's length and duration are limited. No error
 contains the URL or a header, because they may hold secrets.
@@ -110,7 +110,7 @@ def _trust(url: str) -> ssl.SSLContext:
 
 
 def _too_slow(timeout: float) -> str:
-    return f"no complete answer within {timeout:g} s; check that it runs and can be reached"
+    return f"no complete answer within {timeout:g} s; check that the server runs and can be reached"
 
 
 def _cause(error: httpx.TransportError) -> str:
@@ -120,4 +120,4 @@ def _cause(error: httpx.TransportError) -> str:
     text = one_line(str(error) or type(error).__name__)
     if "CERTIFICATE_VERIFY_FAILED" in text:
         return f"{text}; if you trust the certificate, set SSL_CERT_FILE to its file"
-    return f"{text}; check that it runs and can be reached"
+    return f"{text}; check that the server runs and can be reached"

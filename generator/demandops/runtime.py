@@ -1,6 +1,6 @@
 """Time, random numbers and threads: only this module takes them from the machine.
 
-The service and the cluster's watchers take a :class:`Runtime`. A test can pass its own, with a
+The generator and the watchers of clusters take a :class:`Runtime`. A test can pass its own, with a
 clock that it moves, numbers from a seed, and threads that take turns. An object that gets an
 open state repo uses the runtime of this state repo. Commands, git's processes and locks, HTTP and
 ROS's executors always use :data:`REAL`.
@@ -141,7 +141,6 @@ class Runtime:
 
 
 def _reason(error: Exception) -> str:
-    """Return an error's text on one line."""
     text = str(error) if isinstance(error, DemandOpsError) else repr(error)
     return " ".join(text.split())[:_LONGEST_REASON]
 

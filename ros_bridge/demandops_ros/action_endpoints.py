@@ -44,7 +44,7 @@ class DemandError(Exception):
 
 
 def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
-    """Send a node a request without effect, and return the future of the node's answer.
+    """Send the node a harmless request, and return the future of the node's answer.
 
     The request asks the node to cancel a goal that does not exist. The answer shows that the node
     has discovered the client.
@@ -83,7 +83,7 @@ class GoalSender:
         self._action_name = action_name
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain_id)
-        # a launch file renames every node of the process, but the node's own rule has precedence
+        # a launch file renames all nodes of a process, unless a node has a rule of its own
         own_name = ["--ros-args", "-r", f"__node:={node_name}"]
         self._node = rclpy.create_node(node_name, context=self._context, cli_args=own_name)
         self._client = ActionClient(
@@ -133,7 +133,6 @@ class GoalSender:
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
 
     def _wait_until_discovered(self, deadline: float) -> None:
-        """Wait until the node has discovered this client, but only until ``deadline``."""
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
                 self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
@@ -240,7 +239,7 @@ class LastingResults(ActionServer):  # type: ignore[misc]
 
 
 class OtherServers:
-    """Finds other nodes that serve the same actions as ``node``, and logs changes."""
+    """Finds other nodes that serve the same actions as ``node``; logs when they come or go."""
 
     def __init__(self, node: Node, actions: Iterable[str]) -> None:
         self._node = node

@@ -81,7 +81,7 @@ class DemandAdapter(DeploymentRequestAdapter):
         return str(goal.demand_id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level that the goal names, or None if its number stands for no level."""
+        """Return the level at which to answer the goal; None if the goal's number is no level."""
         return ANSWER_LEVELS[goal.answer] if goal.answer < len(ANSWER_LEVELS) else None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401

@@ -69,7 +69,7 @@ class DemandClient:
 
         Args:
             requesters: the requesters of every demand.
-            action_name: the name of the action ``Demand`` of the node.
+            action_name: the name under which the node serves the action ``Demand``.
             node_name: the name of the client's own ROS node.
             timeout_s: how many seconds one call, such as :meth:`put`, may take.
             domain_id: the ROS domain; by default that of the environment.
@@ -108,8 +108,7 @@ class DemandClient:
         Args:
             demand: the demand's id.
             applications, connections: as in a YAML document of the kind ``Demand``.
-            answer: when the call returns: once the change is ``pushed``, ``reconciled`` or
-                ``healthy``.
+            answer: the call returns once the change is ``pushed``, ``reconciled`` or ``healthy``.
             lease: seconds, or a duration like ``10m``; by default the access domain's lease.
             request: free text for the commit.
             on_stage: called with each stage and its text.

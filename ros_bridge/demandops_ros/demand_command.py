@@ -21,8 +21,8 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
 @click.command()
 @click.argument("file", metavar="FILE")
 @click.option("--hold", is_flag=True, help="Renew the demand until Ctrl-C, then release it.")
-@click.option("--release", is_flag=True, help="Do not put the demand of the file, but release it.")
-@click.option("--renew", is_flag=True, help="Do not put the demand of the file, but renew it.")
+@click.option("--release", is_flag=True, help="Release the demand of the file.")
+@click.option("--renew", is_flag=True, help="Renew the demand of the file.")
 @click.option(
     "--action",
     default=DEFAULT_DEMAND_ACTION_NAME,

@@ -175,7 +175,7 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 def _fields(
     data: Mapping[str, Any], names: Mapping[str, str], more: set[str], what: str
 ) -> dict[str, Any]:
-    """Return the fields of ``data`` that ``names`` lists, under their names in the message.
+    """Return the fields of ``data``, renamed by ``names``; leave out those in ``more``.
 
     Raises:
         ValueError: for a field of ``data`` that is neither in ``names`` nor in ``more``.

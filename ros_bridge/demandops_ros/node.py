@@ -37,7 +37,7 @@ _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
     f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
-    f"{_DEFAULT_DEPTH} may miss results; give it a deeper one (docs/demand.md)"
+    f"{_DEFAULT_DEPTH} may miss results; give the client a deeper queue (docs/demand.md)"
 )
 _MOST_READERS = 4
 """How many calls of the bookkeeping service may wait for their answers.
@@ -141,7 +141,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer a call of the service in another thread.
+        """Answer a call of the bookkeeping service, in another thread.
 
         A call that reads an old revision may take seconds, and must not block the executor.
         """
@@ -201,10 +201,7 @@ class DemandNode(Node):  # type: ignore[misc]
         return GoalResponse.REJECT
 
     def _accepted(self, handle: ServerGoalHandle) -> None:
-        """Store the handle of an accepted goal, and publish the feedback that was made before.
-
-        There was no handle before, because rclpy makes the handle only after the acceptance.
-        """
+        """Store the handle, which rclpy makes now; publish the feedback that came before."""
         goal = self._goals[id(handle.request)]
         goal.handle = handle
         for feedback in goal.feedback:
@@ -223,14 +220,13 @@ class DemandNode(Node):  # type: ignore[misc]
             )
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Withdraw a demand and accept the cancel; reject it if the demand is already committed."""
+        """Withdraw the demand of a goal; reject the cancellation if the demand is committed."""
         goal = self._goals.get(id(handle.request))
         if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT
         return CancelResponse.REJECT
 
     def _execute(self, handle: ServerGoalHandle) -> Any:  # noqa: ANN401
-        """End a goal whose outcome is known, and return its result."""
         goal = self._goals.pop(id(handle.request))
         outcome = goal.outcome
         result = goal.adapter.result(outcome, goal.reached)
@@ -276,7 +272,7 @@ class DemandNode(Node):  # type: ignore[misc]
         if status is not None:
             problem = status.why_unreachable(target.domain for target in outcome.targets)
         if problem or status is None:
-            warnings = (*outcome.warnings, f"answered at pushed, not at {level}: {problem}")
+            warnings = (*outcome.warnings, f"answered once pushed, not once {level}: {problem}")
             self._finish(goal, replace(outcome, warnings=warnings))
             return
         rolled_out = status.follow(
@@ -301,7 +297,7 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- events that other threads pass to the executor's thread ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Send a stage as feedback; if the stage is ``refused``, send nothing and log the refusal.
+        """Send a stage as feedback, or log it if it is ``refused``.
 
         The result will report the refusal too, but a crash may come before the result.
         """

@@ -32,7 +32,7 @@ _REPLACED = {
 
 
 def read(ros_args: Sequence[str]) -> dict[str, Any]:
-    """Return the reference node's parameters from ROS arguments and the files that they name."""
+    """Return the reference node's parameters, from ROS arguments and their parameter files."""
     renames = {
         at
         for at, word in enumerate(ros_args)
@@ -73,8 +73,8 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     images = config.images.values()
     if registry and not all(image.repository.startswith(f"{registry}/") for image in images):
         yield (
-            "parameter k3d_image_registry of the reference is not used: set the field "
-            f"registry to {registry} in {config.place_of(IMAGES_FILE)}, and give the images the "
+            "parameter k3d_image_registry of the reference is not used: set the field 'registry' "
+            f"to {registry} in {config.place_of(IMAGES_FILE)}, and give the images the "
             "names that they have in that registry (docs/migration.md)"
         )
     yield from _brokers(values, config)
@@ -85,7 +85,7 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     if missing := [topic for topic in topics if topic not in known]:
         yield (
             "parameter connections.init_comm_topics of the reference is not used: add "
-            f"{', '.join(missing)} to the field bridged of the source node in "
+            f"{', '.join(missing)} to the field 'bridged' of the source node in "
             f"{config.place_of(NODES_FILE)}"
         )
 

@@ -26,11 +26,11 @@ _LAST_CALLBACK_S = 20.0
 
 
 class ExecutorThread:
-    """Runs a node's callbacks in a thread that ends before the node is destroyed and Python exits.
+    """Runs a node's callbacks in a thread; :meth:`close` ends the thread.
 
-    The thread ends itself, because rclpy's ``shutdown`` does not wait for running callbacks and
-    destroys what the thread may need. If the thread still waits for ROS when Python exits, the
-    process aborts.
+    The thread must end before the node is destroyed. rclpy's ``shutdown`` is not enough, because it
+    does not wait for running callbacks. The thread must also end before Python exits. If the thread
+    still waits for ROS then, the process aborts.
     """
 
     def __init__(self, node: Node, name: str = "executor") -> None:
@@ -45,9 +45,9 @@ class ExecutorThread:
         self._executor.create_task(callback)
 
     def close(self) -> None:
-        """End the thread. A second call does nothing.
+        """End the thread, so that the node may be destroyed.
 
-        After the first call, the node may be destroyed.
+        A second call does nothing.
         """
         atexit.unregister(self.close)
         if not self._over.is_set():
@@ -95,7 +95,7 @@ class RosLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a record at the matching ROS level."""
-        text = self.format(record)  # rclpy allows each line of code one level only
+        text = self.format(record)  # in rclpy, a line of code can log at one level only
         if record.levelno >= logging.ERROR:
             self._log.error(text)
         elif record.levelno >= logging.WARNING:

@@ -81,7 +81,7 @@ _FLUSH_S = 0.3
 @click.option(
     "--leader-lease",
     metavar="NAMESPACE/NAME",
-    help="The Lease that makes one of several nodes the leader, which answers the actions; the "
+    help="The Lease that makes one of several nodes the leader, which serves the actions; the "
     "others stand by. For pods; see docs/deployment.md.",
 )
 @signing_option
@@ -102,10 +102,10 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
     Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
-    fetch_interval, requester_queue_limit (how many demands of one requester may wait), log_level
-    (debug, info, warn, error or fatal). The parameter file of the reference's node works too
-    (docs/migration.md). Stop it with Ctrl-C or SIGTERM: it publishes waiting demands for some
-    seconds, and the journal keeps the others for the next start.
+    fetch_interval, requester_queue_limit (how many demands of one requester may be queued),
+    log_level (debug, info, warn, error or fatal). The parameter file of the reference's node works
+    too (docs/migration.md). Stop the node with Ctrl-C or SIGTERM: it publishes queued demands for
+    some seconds, and the journal keeps the others for the next start.
 
     \b
     Examples:
@@ -201,7 +201,7 @@ def _run(
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value
-        # read only, because a later change would have no effect
+        # read-only, because a later change would have no effect
         node.declare_parameter(name, shown, node_parameters.descriptor(name, read_only=True))
     ros_process.log_to(node.get_logger(), settings["log_level"])
     # the node runs in another thread, so that the main thread notices a signal at once
@@ -223,7 +223,7 @@ def _drain(
 ) -> None:
     """Finish the open goals before the node is destroyed.
 
-    The generator publishes waiting demands for some seconds. Then the results of all open goals are
+    The generator publishes queued demands for some seconds. Then the results of all open goals are
     sent.
     """
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
@@ -247,9 +247,8 @@ def _drain(
 class _Signals:
     """Handles Ctrl-C and SIGTERM: the first signal stops the program once its goals are finished.
 
-    A second signal stops the program at once. The kernel may deliver a signal to any thread.
-    Therefore Python writes each signal to a wake-up pipe, which the main thread reads. So the main
-    thread notices the signal at once.
+    A second signal stops the program at once. The kernel may deliver a signal to any thread, so
+    Python writes each signal to a wake-up pipe that the main thread reads.
     """
 
     def __init__(self) -> None:
@@ -275,7 +274,7 @@ class _Signals:
         """Wait until a signal comes or ``until()`` is true.
 
         Each call of :meth:`wake` makes this method check ``until()`` again. If :class:`Unsound` was
-        raised in any thread, a demand could be lost. Then this method ends the process.
+        raised in any thread, this method ends the process.
         """
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)

@@ -160,13 +160,13 @@ def missing(environ: Mapping[str, str]) -> list[str]:
             f"install with: apt-get install {' '.join(sorted(set(tools.values())))}",
         ]
     if not os.access(PREFIX, os.W_OK):
-        remedy = "run this script as its owner, or in an environment of your own"
+        remedy = "run this script as the folder's owner, or in an environment of your own"
         lines.append(f"{PREFIX} is not writable; {remedy}")
     return lines
 
 
 def _missing_tools(environ: Mapping[str, str]) -> dict[str, str]:
-    """Return the missing tools, each with the package that contains it."""
+    """Return a map from each missing tool to the package that contains the tool."""
 
     def found(*names: str) -> bool:
         return any(shutil.which(name, path=environ.get("PATH", "")) for name in names)
@@ -270,7 +270,7 @@ def _stage(stage: str, command: list[str], log: Path) -> None:
 
 
 def _environ() -> dict[str, str]:
-    """Return the environment of a stage, without variables that point to another ROS or prefix."""
+    """Return the environment of a stage, without variables of other ROS installations."""
     # The wheels set BOOTSTRAPPED in a Python that has their library path. Child processes
     # inherit it, so it may come from another environment's wheels.
     foreign = ("CMAKE_PREFIX_PATH", "DESTDIR", "PYTHONHOME", "PYTHONPATH", BOOTSTRAPPED)
@@ -281,7 +281,7 @@ def _environ() -> dict[str, str]:
 def _remove_installed(package: str) -> None:
     """Remove the files of an earlier build of a package.
 
-    The new build does not overwrite all of these files if interfaces have been renamed since.
+    If interfaces have been renamed since then, the new build does not overwrite all of these files.
     """
     index = PREFIX / "share" / "ament_index" / "resource_index"
     for path in (

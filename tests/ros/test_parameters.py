@@ -65,7 +65,7 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
 REPLACED = [
     f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; give "
     "--clusters if the node shall answer goals once they are reconciled or healthy",
-    f"parameter k3d_image_registry {UNUSED} set the field registry to "
+    f"parameter k3d_image_registry {UNUSED} set the field 'registry' to "
     "k3d-registry.localhost:41671 in registry/images.yaml, and give the images the names that they "
     "have in that registry (docs/migration.md)",
 ]
@@ -118,7 +118,7 @@ def test_the_parameters_of_an_older_file(ros: None, tmp_path: Path) -> None:
         f"parameter connections.communication_broker.host {UNUSED} the broker at broker:1883 is "
         "not in inventory/brokers.yaml; add it there",
         f"parameter connections.init_comm_topics {UNUSED} add /vehicles/vehicle00/pose to the "
-        "field bridged of the source node in inventory/nodes.yaml",
+        "field 'bridged' of the source node in inventory/nodes.yaml",
     ]
 
 

@@ -97,7 +97,7 @@ def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no
 
 
 class AccessFile(FileModel):
-    """The operator's file: the access to each cluster, by its name."""
+    """The operator's file: the access to each cluster, by the cluster's name."""
 
     kind: Literal["ClusterAccess"]
     clusters: dict[DnsLabel, ClusterAccess]

@@ -1,4 +1,4 @@
-"""Leadership: one of the generators of a state repo, the leader, answers the ROS actions.
+"""Leadership: one of the generators of a state repo, the leader, serves the ROS actions.
 
 Any number of generators may write to a state repo, but only one node may serve an action's name. So
 the processes compete for a Kubernetes Lease. The holder of the Lease is the leader, and renews it.

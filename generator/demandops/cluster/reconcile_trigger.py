@@ -112,7 +112,7 @@ class ReconcileTrigger:
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
-        """Request a wake after a push; return at once."""
+        """Plan to wake the clusters after a push; return at once."""
         self._config = config
         self._pushed = True
         self._changed.set()
@@ -146,11 +146,11 @@ class ReconcileTrigger:
 
     @property
     def _is_call_left(self) -> bool:
-        # A push may have come during the last call, and is not noted yet.
+        # A push that came during the last call is not noted yet.
         return self._pushed or any(wake.is_untried for wake in self._wakes.values())
 
     def _seconds_until_due(self) -> float | None:
-        """Return the seconds until the next call or the thread's end; None if none is planned."""
+        """Return the seconds until the next call or the thread's end; None if neither is due."""
         due = min((wake.due for wake in self._wakes.values()), default=inf)
         due = min(due, self._ends)
         return None if due == inf else max(0.0, due - self._runtime.monotonic())

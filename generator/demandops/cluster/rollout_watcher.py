@@ -31,7 +31,7 @@ from demandops.runtime import REAL, Runtime
 log = logging.getLogger("demandops")
 
 OnProgress = Callable[[str, str], None]
-"""Called with a state (``reconciled``, ``healthy``, ``failing``) and each new text about it."""
+"""Called with a state (``reconciled``, ``healthy``, ``failing``) and a text, once for each text."""
 
 _PAUSE_S = 0.05
 _LONGEST_WAIT_S = 1.0

@@ -59,7 +59,7 @@ class ClusterWatch:
     ) -> dict[str, ReleaseStatus]:
         """Return the status of each release, by the release's name.
 
-        Domains of ``targets`` that are not watched yet are watched from now on.
+        The access domains of ``targets`` are watched from now on.
         """
         wanted = list(targets)
         self._watch(target.domain for target in wanted)

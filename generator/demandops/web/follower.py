@@ -1,7 +1,7 @@
 """Follows the state repo, and provides what the page shows.
 
-The page shows the newest situation, situations at earlier commits, and the newest commits. A
-situation is the state at a commit, with the reports of the clusters (:class:`Situation`).
+A situation is the state at a commit, with the reports of the clusters (:class:`Situation`). The
+page shows the newest situation, situations at earlier commits, and the newest commits.
 
 One thread fetches new commits and publishes each new situation. The threads that answer requests
 read the published situation.
@@ -94,7 +94,7 @@ class Follower:
         return self._watch.changes
 
     def reader(self) -> Reader:
-        """Return a reader of the state repo that the calling thread may use."""
+        """Return a reader of the state repo for the calling thread."""
         return self._reader.for_another_thread()
 
     def at(self, revision: str) -> Situation:
@@ -170,7 +170,6 @@ class Follower:
                 self.closed.wait(min(1.0, _MOST_OF_TIME * (self._runtime.monotonic() - began)))
 
     def _look(self) -> None:
-        """Read new commits and statuses; publish a new situation if something changed."""
         known = self._newest
         try:
             commit, commit_state = self._reader.refresh(), known.commit_state
@@ -190,7 +189,6 @@ class Follower:
             self.version += 1
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
-        """Read statuses, proposals and history, and return the situation at ``commit_state``."""
         self._read_history(commit_state.commit)
         statuses: Mapping[str, ReleaseStatus] = {}
         old: tuple[OldBootstrap, ...] = ()

@@ -176,7 +176,6 @@ class CommitState:
 
     @cached_property
     def _sorted(self) -> list[Planned]:
-        """All planned releases, sorted by cluster and name."""
         found = filter(None, self.planned.values())
         return sorted(found, key=lambda one: (one.target.domain.cluster, one.target.name))
 
@@ -208,12 +207,12 @@ class CommitState:
 
     @cached_property
     def claims_of_releases(self) -> dict[str, list[Claim]]:
-        """The claims that need each release, by the release's name."""
+        """A map from each release's name to the claims that need the release."""
         return {one.target.name: one.claims for one in self._sorted}
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
-        """The names of the releases that each demand needs, by the demand's id."""
+        """A map from each demand's id to the names of the releases that the demand needs."""
         found: dict[str, list[str]] = {}
         for name, claims in self.claims_of_releases.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -222,7 +221,7 @@ class CommitState:
 
     @cached_property
     def claims_of_demands(self) -> dict[str, list[Claim]]:
-        """The claims of each demand, sorted by subject, by the demand's id."""
+        """A map from each demand's id to the demand's claims, sorted by subject."""
         found: dict[str, list[Claim]] = {}
         for claim in self.state.ledger:
             found.setdefault(claim.demand, []).append(claim)
@@ -233,7 +232,6 @@ class CommitState:
 
 
 def _subjects_of(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
-    """Return the subjects that a release serves: their kind, and their ids."""
     if isinstance(release, ServiceRelease):
         return SubjectKind.APPLICATION, release.applications
     return SubjectKind.CONNECTION, release.connections
@@ -242,8 +240,7 @@ def _subjects_of(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
 def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
     """Return the subjects whose claims differ between two ledgers.
 
-    The function compares only the identities of Python objects, which is fast. That suffices,
-    because both ledgers share the tuple of claims of an unchanged subject.
+    Comparing identities suffices, because ledgers share the claims of an unchanged subject.
     """
     before = {id(claims): subject for subject, claims in old.claims.items()}
     after = {id(claims): subject for subject, claims in new.claims.items()}
@@ -252,7 +249,7 @@ def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
 
 
 def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services whose records of kept replicas differ between two ledgers."""
+    """Yield the services whose kept replicas differ between two ledgers."""
     before, after = old.kept.steps, new.kept.steps
     for instance in {*before, *after}:
         if before.get(instance) != after.get(instance):

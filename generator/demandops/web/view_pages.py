@@ -46,7 +46,7 @@ View = Callable[["ViewRequest"], tuple[str, Data]]
 
 
 class ViewRequest:
-    """A request for a view: its parameters, and the situation and filter that they choose."""
+    """A request for a view: the parameters, and the situation and filter that these choose."""
 
     def __init__(self, follower: Follower, request: Request) -> None:
         self.follower = follower

@@ -97,7 +97,7 @@ class DemandSender:
                 self._log("info", f"rule {rule}: {what}: {outcome.message}")
 
     def _take(self) -> Sending | None:
-        """Wait for a goal to send, and return it; return ``None`` once the sender is closed."""
+        """Wait for a goal to send; return None once the sender is closed."""
         with self._changed:
             while not self._is_closed:
                 now = REAL.monotonic()

@@ -35,7 +35,7 @@ def detect(
 ) -> None:
     """Watch topics, and send the demands that rules ask for.
 
-    RULES is a file of rules (docs/detector.md); the ROS parameter rules can name it instead. The
+    RULES is a file of rules (docs/detector.md); the ROS parameter "rules" can name it too. The
     detector reads the file again when the file changes. Everything after --ros-args goes to ROS.
     Stop the detector with Ctrl-C or SIGTERM. Its demands then stay booked, and the next start
     continues with them.
@@ -61,7 +61,6 @@ def detect(
 
 
 def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
-    """Print the demands that the rules would make for a bag; draw them if ``plot`` is given."""
     name, text = read_input(rules)
     file = rule_file.read(text, name)
     try:
@@ -89,7 +88,6 @@ def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
 
 
 def _run(rules: str | None, ros_args: list[str]) -> None:
-    """Run the node until a signal stops it."""
     from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
 
     from demandops_ros import ros_process  # noqa: PLC0415

@@ -100,7 +100,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._sender.close()
 
     def _log(self, level: str, text: str) -> None:
-        logger = self.get_logger()  # rclpy allows each line of code one level only
+        logger = self.get_logger()  # in rclpy, a line of code can log at one level only
         if level == "warning":
             logger.warning(one_line(text))
         else:
@@ -145,7 +145,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             missing += "demanded; start a node that publishes /clock, or set use_sim_time to false"
         else:
             missing = "no bookkeeping has come, so nothing is demanded; start demandops serve, or "
-            missing += "set the parameter bookkeeping_topic to the topic of its bookkeeping"
+            missing += "set the parameter bookkeeping_topic to the topic on which it comes"
         self.get_logger().warning(missing)
 
     # ---- periodic work ----
@@ -177,10 +177,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._detector.set_clock(jumped)
 
     def _reload_if_changed(self) -> None:
-        """Read the file of rules, and use its rules if the text has changed.
-
-        If the file is invalid, log each new problem once and keep the last valid rules.
-        """
+        """If the file is invalid, log each new problem once and keep the last valid rules."""
         try:
             _, text = read_input(self._path)
         except InvalidInput as error:

@@ -24,13 +24,13 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     ),
     "bookkeeping_topic": (
         "/demandops/bookkeeping",
-        "Topic that lists the booked demands, read at the start; empty: do not read it.",
+        "Topic of the bookkeeping, which the detector reads at its start; if empty, it reads none.",
         None,
     ),
     "settling_time": (
         10.0,
-        "How many seconds after the start an entity of a booked demand may stay unseen before it "
-        "counts as gone; if the timeout of its source is longer, the timeout counts.",
+        "After the start, an entity of a booked demand counts as gone if it stays unseen for this "
+        "many seconds, or for the timeout of its source if that is longer.",
         (0.1, 3_600.0),
     ),
     "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),
@@ -65,7 +65,7 @@ def declare(node: Node, rules: str | None) -> dict[str, Any]:
         except ParameterException as error:
             raise click.UsageError(str(error)) from None
     if not values["rules"]:
-        raise click.UsageError("no rules given; name a file, or set the ROS parameter rules")
+        raise click.UsageError("no rules given; name a file, or set the ROS parameter 'rules'")
     if values["log_level"] not in LOG_LEVELS:
         raise click.UsageError(
             f"parameter log_level is '{values['log_level']}'; it takes {', '.join(LOG_LEVELS)}"

@@ -19,7 +19,7 @@ from demandops.detection.rules.rule_file import RuleFile
 from demandops_ros.detector.recorded_bag import RecordedBag
 
 _TOGETHER = 1_000
-"""How many messages one step of the engine takes; the number does not change the events."""
+"""How many messages the detector gets at a time; the number does not change the events."""
 _TRACK_M = 0.5
 """The least distance in metres between two points of an entity's track in the plot."""
 
@@ -100,7 +100,7 @@ def show(replay: Replay, output: str) -> None:
     ]
     summary = (
         f"{replay.messages} messages on {len(replay.topics)} topics in "
-        f"{replay.span[1] - replay.span[0]:.1f} s; events that last at the end: "
+        f"{replay.span[1] - replay.span[0]:.1f} s; events that have not stopped: "
         f"{len(replay.lasting)}"
     )
     json_output.show(output, as_data(replay), [Table(columns, rows), summary])

@@ -1,7 +1,7 @@
 """Draws a replay as a picture.
 
-The picture has the map with tracks and areas, and below it a row for each event that shows when the
-event lasted.
+The upper part of the picture is a map with tracks and areas. In the lower part, each event has a
+row that shows when the event lasted.
 """
 
 from __future__ import annotations
@@ -36,8 +36,6 @@ def svg(replay: Replay) -> str:
 
 
 class _Colors:
-    """Gives each entity a color, in the order in which the entities first appear."""
-
     def __init__(self) -> None:
         self._of: dict[str, str] = {}
 
@@ -46,7 +44,7 @@ class _Colors:
 
 
 class _Scale:
-    """Converts positions in metres to the picture, where y grows downwards."""
+    """Converts positions in metres to positions in the picture, where y grows downwards."""
 
     def __init__(self, xs: list[float], ys: list[float]) -> None:
         self._x, self._y = min(xs, default=0.0), max(ys, default=0.0)

@@ -64,7 +64,7 @@ class SourceSubscriptions:
 
     @property
     def topics(self) -> int:
-        """How many subscriptions there are."""
+        """How many topics are read; a topic counts once for each source that reads it."""
         return len(self._subscriptions)
 
     def refresh(self) -> None:

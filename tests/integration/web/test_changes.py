@@ -84,7 +84,7 @@ def test_an_invalid_file_names_who_wrote_it(
     page = look("/")
     (cause,) = causes(follower.newest, follower)
     assert cause.kind == "invalid"
-    assert cause.remedy.who == "Petra Platform <petra@example.org>, who changed it last"
+    assert cause.remedy.who == "Petra Platform <petra@example.org>, who last changed it"
     assert cause.remedy.command.startswith("git show ")
     assert "registry/images.yaml" in look("/overrides").text
     assert "its last valid version stays in effect" in page.text

@@ -130,7 +130,6 @@ def _applied_commits(app: Object) -> list[str]:
 def _why_outdated(
     domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
 ) -> str:
-    """Return why a service's Application has not applied ``commit`` yet; empty if it has."""
     sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
     if not sync:
         return "has not been compared yet"
@@ -148,7 +147,6 @@ def _why_outdated(
 
 
 def _synced_health(app: Object, name: str, objects: Objects) -> Health:
-    """Return a service's health, from its synced Application and from its Deployments."""
     for item in (app.get("status") or {}).get("resources") or ():
         if item.get("kind") != "Deployment":
             continue

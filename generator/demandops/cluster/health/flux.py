@@ -87,7 +87,7 @@ class Flux(HealthReader):
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
         """Return whether Flux has finished all work of a domain's last fetch.
 
-        Flux is idle too if the domain's objects do not exist or are suspended.
+        Flux counts as idle if the domain's objects do not exist or are suspended.
 
         Args:
             domain: the domain.

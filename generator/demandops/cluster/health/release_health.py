@@ -1,4 +1,4 @@
-"""The computation of releases' health that all GitOps controllers share. Pure."""
+"""Computes the health of releases: the part that is the same for Flux and Argo CD. Pure."""
 
 from __future__ import annotations
 

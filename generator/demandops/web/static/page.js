@@ -73,8 +73,8 @@ function age() {
   }
 }
 
-// Each event names the version of the data. The page may have been made from an earlier version, also
-// if the event is the first one.
+// Each event names the version of the data. The page may have been made from an earlier version, so
+// even the first event may bring news.
 let version = live?.dataset.version;
 
 function follow() {

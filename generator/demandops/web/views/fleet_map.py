@@ -79,8 +79,6 @@ class Picture:
 
 @dataclass(slots=True)
 class _Content:
-    """The services on a node."""
-
     marks: list[ServiceMark] = field(default_factory=list)
 
     @property
@@ -232,10 +230,7 @@ def _short(text: str, most: int) -> str:
 
 
 def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
-    """Return a line for each pair of nodes with connections.
-
-    Highlighted lines come last, so they are drawn on top of the others.
-    """
+    """Return a line for each connected pair of nodes; highlighted lines come last, on top."""
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows_of(now, "connections"):
         ends = row.hidden["node"]
@@ -255,7 +250,6 @@ def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> lis
 
 
 def _curve(one: NodeCard, other: NodeCard) -> str:
-    """Return the SVG path of a line from one card to another."""
     if one.y + one.height <= other.y:
         start, end, bend = one.y + one.height, other.y, 1.0
     elif other.y + other.height <= one.y:

@@ -120,7 +120,7 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
 
 
 def clients_of(commit_state: CommitState) -> dict[str, list[str]]:
-    """Return the names of the releases that carry each connection, by the connection's id."""
+    """Return a map from each connection's id to the names of the releases that carry it."""
     found: dict[str, list[str]] = {}
     for name, release in commit_state.releases.items():
         if not isinstance(release, ServiceRelease):

@@ -143,7 +143,9 @@ def _unread(now: Situation) -> Iterator[Cause]:
             "unread",
             Part("The state repo"),
             "cannot be read, so this page may be out of date",
-            Remedy("the operator of the Git server", "make it reachable; the page tries again"),
+            Remedy(
+                "the operator of the Git server", "make the server reachable; the page tries again"
+            ),
             told=now.unread,
         )
 
@@ -160,7 +162,7 @@ def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
             Part(f"{problem.file or 'The configuration'}{field}"),
             "is not valid, so its last valid version stays in effect",
             Remedy(
-                f"{author}, who changed it last" if author else "the person who changed it last",
+                f"{author}, who last changed it" if author else "the person who last changed it",
                 "correct the file by pull request",
                 shlex.join(["git", "show", since[:10]]) if since else "demandops check .",
             ),
@@ -213,7 +215,7 @@ def _denied(commit_state: CommitState, last_change: LastChange) -> Iterator[Caus
 
 
 def _by_owner(override: Override) -> Remedy:
-    ends = f", or wait: it ends at {override.expires}" if override.expires else ""
+    ends = f", or wait until the override ends at {override.expires}" if override.expires else ""
     return Remedy(
         f"{override.owner}, who owns the override",
         f"remove the file by pull request{ends}",
@@ -228,7 +230,7 @@ def _proposed(proposal: PendingProposal) -> Cause:
         "awaits a person's approval",
         Remedy(
             "a person who may merge to main",
-            "merge the branch to approve it, delete the branch to refuse it",
+            "merge the branch to approve the demand, or delete the branch to refuse it",
             shlex.join(["git", "merge", f"origin/{proposal.branch}"]),
         ),
         since=proposal.since,
@@ -241,7 +243,7 @@ def _unapplied(old: OldBootstrap) -> Cause:
     return Cause(
         "decision",
         Part(old.file),
-        f"is not applied to cluster '{old.cluster}' in its current version",
+        f"is not applied to cluster '{old.cluster}', or only in an older version",
         Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
         told=f"access domains: {', '.join(old.domains)}",
     )
@@ -265,7 +267,7 @@ def _pending(commit_state: CommitState, paths: list[str]) -> Iterator[Cause]:
         f"{'waits' if len(paths) == 1 else 'wait'} for a generator to carry out a person's commit",
         Remedy(
             "the operator of the generator",
-            "start a generator; a running generator does it at its next fetch",
+            "start a generator; a running generator carries out the commit at its next fetch",
         ),
         told=", ".join(paths[:_MOST_LISTED]) + more,
         since=commit_state.entry.time,

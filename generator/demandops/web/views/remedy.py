@@ -66,7 +66,7 @@ def remedy_of(
     if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
-            who = f"the GitOps controller of cluster {cluster} by itself; if not, its operator"
+            who = f"the GitOps controller of cluster {cluster} by itself; if it fails, its operator"
         return Remedy(who, "", command)
     if kind == "starting":
         who = f"nobody yet; if this lasts, the operator of cluster {cluster}"
@@ -81,12 +81,12 @@ def remedy_of(
     if _ROOM.search(reason):
         return Remedy(
             f"the operator of node {release.node.id} in cluster {cluster}",
-            "make room for the release, or have the demand run on another node",
+            "make room on the node, or name another node in the demand",
             command,
         )
     if _IMAGE.search(reason):
         return _of_images(release, config, command, last_change)
-    how = "look at the log of its container" if _CRASH.search(reason) else ""
+    how = "look at the log of the container" if _CRASH.search(reason) else ""
     if not isinstance(release, ServiceRelease):
         return Remedy(f"the maintainer of the {release.type.word} client", how, command)
     where = f"appdefs/{release.service.folder}"
@@ -110,7 +110,7 @@ def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
     """Return a text that names who last changed each path; empty if no person changed any."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
-    return f" ({', '.join(people)} changed it last)" if people else ""
+    return f" (last changed by {', '.join(people)})" if people else ""
 
 
 def _image(release: Release, name: str, config: Config) -> Image:
