@@ -43,7 +43,7 @@ ROWS = [
 
 
 def books(scaling: str, *, gitops: Literal["flux", "argocd"] = "flux", **files: str) -> MemoryRepo:
-    """Return a state repo whose recorder has the `scaling` of this YAML text."""
+    """Return a state repo whose recorder scales as the YAML text `scaling` says."""
     text = ADDITIONS[APPDEF].replace("{min: 1, max: 3, per: {topics: 2}}", scaling)
     text = text.replace("parameters:\n", "parameters:\n  size: {default: small, merge: union}\n")
     assert scaling in text
@@ -231,7 +231,7 @@ class TestRequesters:
 class TestAutoscaler:
     """A HorizontalPodAutoscaler owns the number of replicas.
 
-    No GitOps controller sets the number, and an override sets both bounds.
+    No GitOps controller sets the number. An override sets both bounds of the autoscaler.
     """
 
     def test_flux_leaves_the_number_alone(self) -> None:

@@ -28,7 +28,7 @@ BATCH = 500
 
 
 def lay_down(folder: Path, releases: int, commits: int) -> Path:
-    """Make a state repo with a fleet and ``commits`` further demands; return its path."""
+    """Make a state repo with a fleet, and carry out ``commits`` goals there; return its path."""
     laid = fleet.lay_down(folder / "state-repo.git", releases)
     generator = Generator(str(laid.path), data=folder / "data")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync while the repo is made
@@ -56,7 +56,6 @@ def timed(what: str, call: Callable[[], object]) -> None:
 
 
 def measure(repo: Path) -> None:
-    """Ask each question once, and print its time."""
     with reader.opened(str(repo)) as opened:
         tip = opened.commit()
         timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))

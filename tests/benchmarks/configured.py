@@ -138,13 +138,13 @@ def _when_idle() -> float:
 
 
 def reference(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a join and a shutdown of the reference's action; both always name the node."""
+    """Return a join and a shutdown of the reference's action; both name the node in any case."""
     join = fleet.goal(fleet.edge_id(edge), fleet.spare_id(edge))
     return [join, join | {"shutdown": True}]
 
 
 def demand(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a demand in our own format and its release; ``placed`` leaves out the node."""
+    """Return a put and a release in our own format; if ``placed``, the put names no node."""
     who, node = fleet.spare_id(edge), fleet.edge_id(edge)
     made = goals.put(f"of-{who}", who, topic=(f"/{who}/ego", who), node="" if placed else node)
     made["applications"][0]["connect"] = "mqtt"

@@ -47,7 +47,7 @@ Row = dict[str, float]
 
 
 def _on_server(url: str) -> tuple[float, int]:
-    """Return how many seconds the server takes to serve a view again, and the view's bytes."""
+    """Return the seconds in which the server serves a view again, and the view's size in bytes."""
     for _ in range(2):
         start = time.perf_counter()
         with urllib.request.urlopen(url) as answer:  # noqa: S310 - the page on this machine
@@ -87,7 +87,6 @@ def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -
 
 
 def measure(releases: int) -> dict[str, Row]:
-    """Return the figures of each view by its name."""
     rows: dict[str, Row] = {}
     with TemporaryDirectory() as folder, chromium() as browser:
         os.environ["DEMANDOPS_DATA_HOME"] = f"{folder}/home"

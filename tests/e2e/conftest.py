@@ -1,4 +1,4 @@
-"""Fixtures that both controllers share: a ROS domain, clients in it, and progress messages."""
+"""Fixtures for the tests of both controllers: a ROS domain, its clients, and progress messages."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ esac
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Put a fake Go on PATH and use an empty cache; return the file where that Go lists builds."""
+    """Put a fake Go on PATH and use an empty cache; return the file where the fake lists builds."""
     program = tmp_path / "bin" / "go"
     program.parent.mkdir()
     program.write_text(FAKE_GO)

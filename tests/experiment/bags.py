@@ -16,7 +16,7 @@ def bag_tracks(bag: Path, near: Near) -> tuple[Track, ...]:
     """Return the track of each vehicle in a bag.
 
     Raises:
-        InvalidInput: if the bag cannot be read, or has no topic of the rules.
+        InvalidInput: if the bag cannot be read, or has none of the topics that the rules name.
         SystemExit: if the bag has a vehicle that the experiment lacks, or one that begins near
             the station.
     """

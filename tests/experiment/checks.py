@@ -15,7 +15,7 @@ from .participants import EGO_DATA
 from .routes import VEHICLES
 
 _SLACK_S = 3.0
-"""How many seconds after the end of a connection's pods its messages may still arrive."""
+"""How many seconds a connection's messages may still arrive after its pods have ended."""
 
 
 @dataclass(frozen=True)

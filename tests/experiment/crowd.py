@@ -27,7 +27,7 @@ NODES = (*EDGES, *STATIONS, "cloud")
 
 
 def crossings(near: Near) -> tuple[Near, ...]:
-    """Return a nearness condition for each intersection; the first is that of the paper."""
+    """Return a nearness condition for each intersection; the first one is the paper's condition."""
     (x, y) = near.point
     return tuple(replace(near, point=(x + dx, y + dy)) for dx, dy in MIDDLES)
 
@@ -74,7 +74,10 @@ def rules(near: Near) -> str:
 
 
 def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> list[Event]:
-    """Return the events before `until`, by time; `passing` has each vehicle's intersection."""
+    """Return the events before `until`, sorted by time.
+
+    `passing` has the condition of the intersection that each vehicle passes.
+    """
     own: defaultdict[Near, list[Pose]] = defaultdict(list)
     for pose in poses:
         own[passing[pose.vehicle]].append(pose)

@@ -51,7 +51,6 @@ class Experiment:
         self._stack = ExitStack()
 
     def run(self) -> Outcome:
-        """Run the experiment and return all observations."""
         with self._stack:
             self._start_cluster()
             self._start_fleet()

@@ -72,7 +72,7 @@ def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
 
 
 def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | None:
-    """Return when the fusion first published a position of this vehicle; None if it never did."""
+    """Return the time at which the fusion first published a position of the vehicle, or None."""
     places = {
         (pose.x, pose.y)
         for pose in outcome.poses

@@ -30,7 +30,6 @@ class Settings:
     tracks: tuple[Way, ...] = ()
 
     def routes(self) -> tuple[Way, ...]:
-        """Return the way of each vehicle."""
         if self.tracks:
             return self.tracks
         if self.large:

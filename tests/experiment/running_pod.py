@@ -59,7 +59,7 @@ def program_of(image: str) -> str:
 
 
 def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
-    """Return a text in which a path of this machine replaces each path below a mount."""
+    """Replace each path below a mount in ``text`` by its path on this machine; return the text."""
     if not mounts:
         return text
     longest_first = sorted(mounts, key=len, reverse=True)

@@ -21,7 +21,7 @@ def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[s
     Args:
         ran: what the process did.
         told: words; the process must print one of them if it did not book the demand.
-        unsound: whether a sync failed on which the acknowledgement depends.
+        unsound: whether a sync failed that the acknowledgement relies on.
     """
     if ran.hangs == "waits":
         if not ran.err.strip():

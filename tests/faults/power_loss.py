@@ -66,7 +66,7 @@ class _Change:
 
 
 class Disk:
-    """The changes that a trace made to the files below a folder, and which of them are safe."""
+    """The changes that traced calls made to files below a folder, and which of them are safe."""
 
     def __init__(self, root: Path, *, always_safe: str = "") -> None:
         self.root = root
@@ -86,7 +86,6 @@ class Disk:
         self._first_names = dict(self._names)
 
     def follow(self, call: Call) -> None:
-        """Apply one system call to the model."""
         path = call.paths[-1]
         if call.kind in SYNCS:
             self._sync(path, worked=not call.failed)

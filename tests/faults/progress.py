@@ -67,11 +67,9 @@ class Progress:
 
     @property
     def seconds(self) -> float:
-        """How long the run has taken so far."""
         return time.monotonic() - self._began
 
     def add(self, results: Iterable[Result]) -> None:
-        """Count a task that is done."""
         self._done += 1
         self._wrong += sum(bool(result.problems) for result in results)
         now = time.monotonic()

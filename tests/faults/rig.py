@@ -118,9 +118,9 @@ class GitTrace:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a process did: its exit code, its output, its traces, and how it hung if it did.
+    """What a process did: its exit code, its output, its traces, and how it hung, if it hung.
 
-    ``lingers`` is true if a process that it started, such as ``git push``, outlived it.
+    ``lingers`` is true if a child of the process, such as ``git push``, outlived the process.
     """
 
     code: int

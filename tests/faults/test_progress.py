@@ -1,4 +1,4 @@
-"""A run of the fault injection that resumes an interrupted run tries only what is left."""
+"""If the fault injection resumes an interrupted run, it tries only the tasks that are left."""
 
 from __future__ import annotations
 

@@ -151,7 +151,7 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
 def file_of_the_reference(data: bytes) -> None:
     """Check that a file of the reference, if it can be read, can also be imported.
 
-    The import proposes a map for the file; with this map, it must form goals.
+    The import proposes a map for the file. With this map, the import must form goals.
     """
     documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
     files = reference_files.read(documents)

@@ -193,7 +193,7 @@ def name_of_object(ids: tuple[str, str]) -> None:
 
 
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
-    """Check that the override file has what a person gave, unless the command refuses it."""
+    """Check that the command refuses what a person gives, or writes all of it to the override."""
     reason, owner, nodes, patch = words
     options = EditOptions("", None, " ".join(reason.split()) or "x", False, False, False, "text")
     given = {"owner": owner or "x", "values": patch}

@@ -1,4 +1,4 @@
-"""`demandops new image` writes valid pipelines, and a script whose proposal `check` accepts."""
+"""`demandops new image` writes valid pipelines, and a script whose branch passes `check`."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def helm(tmp_path: Path) -> dict[str, str]:
 
 
 def put_demandops(at: Path) -> None:
-    """Write a script `demandops` that runs this program, where the pipeline would install it."""
+    """Write a script that runs this program, in place of the `demandops` of the pipeline."""
     at.parent.mkdir(parents=True)
     at.write_text(f'#!{BASH}\nexec "{sys.executable}" -m demandops.cli.main "$@"\n')
     at.chmod(at.stat().st_mode | stat.S_IXUSR)

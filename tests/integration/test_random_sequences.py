@@ -1,4 +1,4 @@
-"""The command line books long random sequences of requests in a real state repo as the model does.
+"""Long random sequences of requests give the same bookkeeping in a real state repo as in a model.
 
 The model in ``tests/model`` takes the same requests. After each call, and at commits in between,
 the bookkeeping of both must be equal.

@@ -83,7 +83,7 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""For each point: whether to kill after (true) or before (false) a call, and of which functions."""
+"""For each point: whether to kill after (true) or before (false) a call, and which functions."""
 
 
 def arm(where: str, address: str) -> None:

@@ -39,7 +39,6 @@ def application(
     clouds: Iterable[Topic] = (CLOUD,),
     type: int = 1,
 ) -> Item:
-    """Return an application for a goal of the reference's action."""
     return {
         "header": {"id": id, "node_id": node},
         "type": type,

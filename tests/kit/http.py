@@ -15,8 +15,6 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Call:
-    """A request that a server received."""
-
     method: str
     path: str
     headers: Message
@@ -28,8 +26,6 @@ class Call:
 
 @dataclass(frozen=True)
 class Answer:
-    """An HTTP answer of a server."""
-
     status: int = 200
     body: bytes = b""
     headers: dict[str, str] = field(default_factory=dict)

@@ -206,7 +206,7 @@ class Form:
         return sorted(limits)
 
     def free(self) -> set[str]:
-        """Return the fields that may have any value, or a mapping with any keys."""
+        """Return the fields whose value may be anything, or a mapping with any keys."""
         return {
             f"{part['title']}.{name}"
             for part in self._parts()

@@ -140,7 +140,7 @@ class GitRepo:
 
 
 class Person:
-    """A person who changes the state repo at its forge, or in a clone and by a push."""
+    """A person who changes the state repo: at its forge, or by a push from a clone."""
 
     def __init__(self, remote: Path, folder: Path) -> None:
         self.bare, self.folder = remote, folder

@@ -189,7 +189,6 @@ class Servers:
             )
 
     def kill(self) -> None:
-        """Kill the processes that still run."""
         for served in self._started:
             if served.process.poll() is None:
                 served.process.kill()

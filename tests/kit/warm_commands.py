@@ -39,7 +39,6 @@ class WarmCommand:
         return self._ended(0)
 
     def wait(self, timeout: float | None = None) -> int:
-        """Wait until the command ends; return its exit code."""
         code = self._ended(timeout)
         if code is None:
             raise subprocess.TimeoutExpired("demandops", timeout or 0)
@@ -52,12 +51,10 @@ class WarmCommand:
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal to the command if it runs."""
         if self.poll() is None:
             os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """Send SIGKILL to the command if it runs."""
         self.send_signal(signal.SIGKILL)
 
 

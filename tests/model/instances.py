@@ -93,7 +93,10 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep the replicas that were needed only ``before``, from ``now`` on for ``KEPT_FOR``."""
+        """Keep replicas that the goal has made superfluous, until ``KEPT_FOR`` after ``now``.
+
+        ``before`` has the topics of each instance before the goal.
+        """
         after = self.running()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -116,12 +119,11 @@ class Instances(Places):
             self.kept[one] = told
 
     def replicas(self, one: Instance) -> int:
-        """Return the number of replicas that an instance has."""
         return max(needed(self.running()[one]), *self.kept.get(one, ()), 0)
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Map each number above ``least`` to the time until which at least as many replicas stay."""
+    """Map each number above ``least`` to the time until which at least that many replicas stay."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)
@@ -129,5 +131,4 @@ def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
 
 
 def needed(topics: Collection[Any]) -> int:
-    """Return the number of replicas that an instance with these topics needs."""
     return min(MOST, len(topics))

@@ -130,7 +130,6 @@ class Places(Promises):
         self.held[demand][subject] = replace(held, what=held.what | {"node": self._told(subject)})
 
     def drain(self, node: str, drained: bool) -> None:
-        """Begin or end the draining of a node."""
         self.drained = self.drained | {node} if drained else self.drained - {node}
 
     def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:

@@ -80,7 +80,7 @@ fi
 
 @pytest.fixture
 def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """A copy of the script with a prefix of its own; it calls the fake CMake above."""
+    """A copy of the script that installs into a folder of the test and calls a fake CMake."""
     copy, prefix, tools = (tmp_path / name for name in ("interfaces", "prefix", "bin"))
     shutil.copytree(INTERFACES, copy, ignore=shutil.ignore_patterns("__pycache__"))
     spec = importlib.util.spec_from_file_location("interfaces_build", copy / "build.py")

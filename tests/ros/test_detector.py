@@ -31,8 +31,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
 _MOST_AHEAD_S = 2.0
 """How many seconds the simulated time may run ahead of the time that the detector has reported.
 
-If a vehicle has been silent for 5 s, it counts as gone. With this limit, that happens to no vehicle
-only because the machine is slow.
+A vehicle that has been silent for 5 s counts as gone. Without this limit, a vehicle could count as
+gone only because the machine is slow.
 """
 STATION = (-5352.679, -3363.067)
 S, V0, V1, V2, V3 = paper.S, paper.V0, paper.V1, paper.V2, paper.V3

@@ -55,7 +55,7 @@ def record(path: Path, poses: Poses, plugin: StoragePlugin) -> None:
 
 
 def plainly(poses: Poses) -> list[tuple[float, str, str]]:
-    """Return when each vehicle enters (`start`) and leaves (`stop`), by a plain script.
+    """Return the times at which vehicles enter (`start`) and leave (`stop`), by a plain script.
 
     A vehicle enters within 84 m, and leaves beyond 90 m or after 5 s of silence.
     """

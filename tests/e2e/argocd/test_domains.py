@@ -164,7 +164,7 @@ def test_no_application_in_argo_cds_own_namespace(world: World, slip_in: SlipIn)
 def test_a_later_commit_is_applied_once_the_refused_manifest_is_gone(
     world: World, slip_in: SlipIn
 ) -> None:
-    """The generator removes the file with the next demand, and Argo CD applies that commit."""
+    """The commit of the next demand removes the manifest, so Argo CD can apply this commit."""
     world.follow(world.demand(expected.demand(1)), expected.after(1))
     slip_in(build_manifest("v1", "ConfigMap", "foreign", NEIGHBOUR, data={"made": "by hand"}))
     world.step(2, expected.after(2))

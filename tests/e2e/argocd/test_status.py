@@ -18,8 +18,6 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 
 class TestArgoCD(Answers):
-    """The tests of `Answers` with Argo CD."""
-
     def read_repaired_chart(self, world: Any) -> None:
         """Refresh the Application, because Argo CD reads a chart folder only every few minutes."""
         world.domain.refresh("od-edge-vehicle00")

@@ -102,7 +102,7 @@ def push_chart(world: World, added: str) -> dict[str, str]:
 class Answers:
     """A demand is answered once it is reconciled or healthy.
 
-    If the demand never becomes so, the answer says why.
+    If neither ever happens, the answer says why.
     """
 
     def read_repaired_chart(self, world: World) -> None:

@@ -94,5 +94,5 @@ def _deployed(node: str, name: str) -> tuple[str, str]:
 
 
 def unscheduled(lines: frozenset[str]) -> frozenset[str]:
-    """Return these lines as they are while the pods of the edge have no node and are not ready."""
+    """Return the lines, changed to say that the edge's pods have no node and are not ready."""
     return frozenset(line.replace(" on edge, ready", " on no node, not ready") for line in lines)

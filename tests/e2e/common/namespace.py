@@ -90,7 +90,7 @@ class Namespace:
         }
 
     def identity(self, name: str) -> tuple[object, ...]:
-        """Return ids of a Deployment that change if its pods restart or are about to restart.
+        """Return ids that change if a Deployment's pods restart or are about to restart.
 
         These are the UID and generation of the Deployment, and the UIDs of pods and ReplicaSets.
         """

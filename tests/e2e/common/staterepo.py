@@ -70,7 +70,6 @@ class Generator:
             time.sleep(0.05)
 
     def kill(self) -> None:
-        """Kill the generator, which simulates a crash."""
         assert self._process is not None
         self._process.kill()
         self._process.wait(10)
@@ -180,13 +179,14 @@ class StateRepo(Generic[Domain]):
         return sent
 
     def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Send the goal of a step and wait until it is carried out, as `follow` does."""
+        """Send the goal of a step, then `follow` the goal."""
         return self.follow(self.demand(demand(number)), wanted, wake=wake)
 
     def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
         """Wait until the only cluster has exactly these lines after a goal that succeeded.
 
-        Return when the goal reached each stage. With `wake`, trigger the controller first.
+        Return the times at which the goal reached its stages. With `wake`, trigger the controller
+        first.
         """
         domain = self.domain
         if wake:

@@ -192,7 +192,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
 
 def _autoscaled(world: World) -> dict[str, str | None]:
-    """Return an appdef's files with autoscalers; the fusion's chart also sets a fixed number."""
+    """Return an appdef with autoscalers, and a fusion chart that sets the number of replicas."""
     chart, registry = f"{CHART}/Chart.yaml", "registry/charts.yaml"
     deployment = "appdefs/charts/ros-service/templates/_deployment.yaml"
     named = re.sub(
@@ -247,9 +247,9 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
 
 
 def _controller(rig: Rig) -> list[str]:
-    """Create the namespace of the golden manifests; return kinds that the manifests must have.
+    """Create the golden manifests' namespace; return kinds that these manifests must include.
 
-    These are the kinds that the controller itself defines, and Deployment.
+    These are the kinds that the GitOps controller itself defines, and Deployment.
     """
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
     return [*PARTS[rig.gitops].KINDS, "Deployment"]

@@ -19,7 +19,7 @@ MakeWorld = Callable[[], World]
 
 @pytest.fixture(scope="session")
 def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """A cluster with a node for each node of the skeleton's inventory."""
+    """A cluster with a fake node for each node of the skeleton's inventory."""
     cluster = Rig(CLUSTER, gitops="flux", nodes=NODES, report=say)
     with running(cluster, request.session):
         say(f"\nrig started: {cluster.timings}")

@@ -1,4 +1,4 @@
-"""A link from a cluster to the Git server, which a test cuts to simulate a lost radio link."""
+"""A link between a cluster and the Git server; a test cuts it to simulate a lost radio link."""
 
 from __future__ import annotations
 

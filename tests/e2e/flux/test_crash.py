@@ -72,7 +72,7 @@ def send_until_committed(world: World, goal: dict[str, Any]) -> None:
 
 
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
-    """Kill the generator when it has a commit that it cannot push; the next generator pushes it."""
+    """Kill the generator while it cannot push its commit; the next generator pushes the commit."""
     before = world.tip()
     world.rig.stop_component("git")
     try:

@@ -136,7 +136,7 @@ class Deployed:
         self._git.wait(10)
 
     def start(self, *pods: Pod) -> None:
-        """Start the containers of pods; wait until each is the leader or a standby."""
+        """Start the containers of the pods; wait until each pod is the leader or a standby."""
         for pod in pods:
             pod.start()
         for pod in pods:

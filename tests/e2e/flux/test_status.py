@@ -24,8 +24,6 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 
 class TestFlux(Answers):
-    """The tests of `Answers` with Flux."""
-
     def test_what_flux_forgot_is_named_and_its_command_deletes_it(self, world: World) -> None:
         domain, name = world.domain, target_end("station00")
         world.follow(world.demand(expected.demand(1)), expected.after(1))

@@ -70,7 +70,7 @@ def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
 
 @contextmanager
 def wakes(domain: Domain) -> Iterator[list[bool]]:
-    """Yield a list that gets an entry for each request to Flux to fetch.
+    """Yield a list that gets an entry whenever somebody requests that Flux fetch now.
 
     The entry is true if Flux was idle just before the request.
     """

@@ -189,7 +189,7 @@ class Rig:
         return self._own().log(component)
 
     def url(self, component: str) -> str:
-        """Return the URL of a part that tests call."""
+        """Return the URL at which tests call a part."""
         return self._own().url(component)
 
     def kill(self, component: str) -> None:

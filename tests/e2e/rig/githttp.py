@@ -164,7 +164,7 @@ class Handler(BaseHTTPRequestHandler):
     def _feed(self, stdin: IO[bytes]) -> None:
         """Forward the request's body to the backend.
 
-        Read the body to its end even if the backend has closed its input.
+        Read the whole body even if the backend does not take all of it.
         """
         listening = True
         try:

@@ -228,7 +228,7 @@ def _follow(
 ) -> deque[str]:
     """Pass each line to `line` until None comes; return the last lines that do not report progress.
 
-    `tick` is called after each second without a line, because Go links for long without a line.
+    `tick` is called after each second without a line, because Go prints nothing while it links.
     """
     shown: deque[str] = deque(maxlen=_SHOWN_LINES)
     while True:

@@ -35,7 +35,6 @@ def free_port() -> int:
 
 
 def url(port: int, scheme: str = "http") -> str:
-    """Return the base URL of a server on this port."""
     return f"{scheme}://{LOOPBACK}:{port}"
 
 

@@ -107,7 +107,6 @@ class Processes:
         self._stop_batch([name])
 
     def kill(self, name: str) -> None:
-        """Kill a component, which simulates a crash."""
         self._known(name)
         process = self._running.pop(name, None)
         if process is not None:

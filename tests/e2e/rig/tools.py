@@ -1,7 +1,7 @@
 """Build the rig's programs from pinned Go modules, once, into a cache outside the checkout.
 
 The other modules of the rig take the paths that `ensure` returns. A wrapper module under
-`tests/e2e/tools/` pins each program, so that its `go.sum` covers all dependencies. The name of a
+`tests/e2e/tools/` pins each program; the wrapper's `go.sum` covers all dependencies. The name of a
 cache entry is a digest of everything that decides the program's bytes. An entry appears by one
 rename, so each existing entry is complete.
 

@@ -54,7 +54,7 @@ class Workdir:
         return self.path / "git"
 
     def environment(self) -> dict[str, str]:
-        """Return the environment of the rig's processes, with only PATH from the user's."""
+        """Return the environment of the rig's processes; only PATH comes from the user."""
         return {
             "PATH": os.environ.get("PATH", os.defpath),
             "HOME": str(self.home),

@@ -54,7 +54,6 @@ class Broker:
 
 @pytest.fixture(scope="module")
 def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    """Run mosquitto for the tests of a module."""
     folder = tmp_path_factory.mktemp("broker")
     keys = pki.make(folder / "pki")
     passwords = folder / "passwords"

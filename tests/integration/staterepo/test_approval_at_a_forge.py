@@ -27,8 +27,6 @@ TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 
 @dataclass
 class Hub:
-    """A forge with pull requests."""
-
     url: str = ""
     pulls: list[dict[str, Any]] = field(default_factory=list)
     away: bool = False

@@ -105,7 +105,7 @@ CHANGES = {
     "moved-node": ("http", _move_node, lambda text: "garage" in text),
     "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
-"""Name of a change → kind of address, function that makes the change, and check of the result.
+"""By the name of a change: kind of address, function that makes the change, check of the result.
 
 Each change is tested with one kind of address, because the result does not depend on the address.
 """

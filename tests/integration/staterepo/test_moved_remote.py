@@ -211,7 +211,7 @@ def test_an_inventory_change_is_applied_once_a_removed_node_is_released(
 def test_a_generated_file_that_a_person_edited_is_put_right_with_the_next_commit(
     url: str, bare: Path, person: Person
 ) -> None:
-    """`demandops check` refuses the edit. If it is merged nevertheless, every commit verifies."""
+    """`demandops check` refuses the edit. A person merges the edit nevertheless."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         paths = rig.git(bare, "ls-tree", "-r", "--name-only", "main", "clusters/").splitlines()

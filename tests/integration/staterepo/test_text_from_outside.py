@@ -112,7 +112,7 @@ def with_rules(bare: Path, **quotas: int) -> str:
 def by_hand(
     bare: Path, requester: str, app: str = "edge/d1", demand: str = "by-hand"
 ) -> dict[str, str | None]:
-    """Return the file of a claim like that of user1, but for another requester."""
+    """Return a copy of user1's claim file, for another requester."""
     path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
     data = yaml.safe_load(read(bare, path))
     data |= {"application": app, "demand": demand, "requesters": [requester]}

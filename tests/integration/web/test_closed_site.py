@@ -69,7 +69,8 @@ def test_the_documentation_comes_with_the_page_where_it_was_built(
 
 
 def test_another_name_of_this_machine_is_refused(client: TestClient) -> None:
-    """If any name were accepted, another site could read the page by a visitor's browser.
+    """If any name were accepted, another site could read the page through a visitor's
+    browser.
 
     For that, the other site would make its own name point to this machine (DNS rebinding).
     """

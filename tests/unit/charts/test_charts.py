@@ -1,4 +1,4 @@
-"""Checks of the charts and their library that need no Helm.
+"""Checks, without Helm, of the charts and their library.
 
 These tests compare schemas, default values and READMEs with each other. tests/golden has the values
 that the generator writes. tests/e2e renders the charts with the real Helm.

@@ -62,7 +62,7 @@ def application(
 
 
 def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return the ``operationState`` of a sync from source ``of``, by default ``FOLDER``."""
+    """Return the ``operationState`` of a sync whose source is ``of``, by default ``FOLDER``."""
     result = {"revision": revision, "source": more.pop("of", FOLDER)}
     result["resources"] = more.pop("resources", [])
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}

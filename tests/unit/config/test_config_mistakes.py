@@ -408,7 +408,7 @@ uses:
         },
     ),
 }
-"""Name of a mistake → the files that differ from the skeleton; the configuration is refused."""
+"""By the name of a mistake: the files that differ from the skeleton. Each mistake is refused."""
 
 
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])

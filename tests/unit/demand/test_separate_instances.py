@@ -192,7 +192,7 @@ def test_what_several_definitions_share_runs_once_so_another_version_of_it_is_re
 
 
 def shared(policy: str) -> dict[str, str]:
-    """Return a configuration: version 1.0.1 pins another recorder, 1.1.0 another driver."""
+    """Return a configuration; version 1.0.1 pins another recorder image, 1.1.0 a driver image."""
     appdef = yaml.safe_load(ADDITIONS["appdefs/recorder/appdef.yaml"])
     versions = {
         "1.0.0": {},

@@ -134,7 +134,7 @@ def test_a_demand_booked_before_the_start_is_renewed_at_once_and_not_put_again()
 
 
 def test_an_event_waits_until_another_one_has_ended_the_demand_with_the_same_id() -> None:
-    """So if a rule gets another name, the release for the old name cannot end the new demand."""
+    """If a rule is renamed, the release for its old name must not end the new demand."""
     sent = Sent()
     sent.want(PUT)
     assert sent.done(0) == "start"

@@ -37,7 +37,7 @@ PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 
 def restart(world: running.World, random: Random) -> None:
-    """Restart the generator with the ledger that the files give if read in random order."""
+    """Restart the generator, and let it read the ledger's files in random order."""
     files = random.sample(sorted(world.files.items()), len(world.files))
     ledger = ledger_in(dict(files))
     assert ledger == world.state.ledger

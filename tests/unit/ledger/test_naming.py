@@ -58,7 +58,7 @@ subjects: st.SearchStrategy[Subject] = st.one_of(
 
 
 def rivals(subject: Subject, name: str) -> Iterator[Subject]:
-    """Yield subjects whose names would be like ``name`` if a name were the ids joined by "-"."""
+    """Yield other subjects that a simpler naming might also call ``name``."""
     prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
     yield ("of", rest)
     yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")
@@ -207,7 +207,7 @@ def usual_cloud(nodes: list[str], node: str) -> str:
 
 
 def with_nodes(nodes: list[str]) -> MemoryRepo:
-    """Return a new repo whose inventory also has nodes with these ids, even if not valid as ids."""
+    """Return a new repo with further nodes that have these ids, even invalid ones."""
     repo = MemoryRepo()
     config = repo.state.config
     (domain,) = config.domains.values()

@@ -1,4 +1,4 @@
-"""Holds are counted as the reference's operators count requesters.
+"""The ledger counts holds as the reference's operators count requesters.
 
 A recorded run of the operators shows that the model of the operators is right, and where DemandOps
 differs from them.
@@ -82,8 +82,8 @@ class Recorded:
     """One of the two tables of the recorded run: ``books`` (who requests what) or ``runs``.
 
     ``there`` is the table of the reference after a step. ``here`` is the table that DemandOps must
-    have after the same step. The record of a step lists only the changes of ``there``, and the
-    changes of the difference between ``there`` and ``here``.
+    have after the same step. The record of a step lists only what changes: entries of ``there``,
+    and entries of ``here`` that differ from ``there``.
     """
 
     def __init__(self, name: str) -> None:

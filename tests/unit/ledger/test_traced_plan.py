@@ -28,7 +28,7 @@ def afresh(world: World) -> dict[ReleaseKey, Release]:
 
 
 class Following:
-    """The releases that result from applying the changes that a traced plan returns."""
+    """The releases after each step: a traced plan returns changes, and this class applies them."""
 
     def __init__(self, config: Config) -> None:
         self._plan = TracedPlan(config)

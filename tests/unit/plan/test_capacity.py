@@ -1,4 +1,4 @@
-"""What services request is counted from changes alone, and never exceeds a node's capacity."""
+"""The usage of a node is counted from changes alone, and never exceeds the node's capacity."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
 
 @cache
 def recorders() -> State:
-    """Return a state in which a driver requests 1 cpu, and so does each replica of a recorder."""
+    """Return a state in which each driver and each replica of a recorder requests 1 cpu."""
     nodes = [
         {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
         | ({"capacity": {"cpu": CAPACITY[id]}} if id in CAPACITY else {})
@@ -72,7 +72,7 @@ def goal(random: Random) -> dict[str, Any]:
 
 
 def used(repo: MemoryRepo) -> Counter[str]:
-    """Return how many cpus the services in the bookkeeping request, by node."""
+    """Return, by node, how many cpus the booked services request."""
     found: Counter[str] = Counter()
     for entry in repo.books()["services"].values():
         topics = sum(map(len, entry["inputs"].values()))

@@ -60,7 +60,7 @@ def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
 def wanted(
     graphs: Graphs, app: dict[str, Any], active: Iterable[Override]
 ) -> dict[str, str | None]:
-    """Return the services of an application that overrides move, as a map to their new nodes.
+    """Return the new node of each service of ``app`` that an override moves.
 
     ``active`` is sorted by priority, and the last override that selects a service wins.
     """

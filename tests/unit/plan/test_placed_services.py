@@ -54,7 +54,10 @@ class Naming(Demands):
 
 
 def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
-    """Return the configuration with GPUs and a capacity on some nodes, and all nodes shuffled."""
+    """Return the configuration with GPUs and a capacity on some nodes.
+
+    The nodes are in random order, and the node ``drained`` is drained.
+    """
     nodes = [
         node.model_copy(
             update={

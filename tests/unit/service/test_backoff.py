@@ -1,4 +1,4 @@
-"""Pauses between tries grow to a bound; fewer demands go into one push while pushes fail."""
+"""The pauses between tries grow up to a bound. While pushes fail, a push has fewer demands."""
 
 from __future__ import annotations
 

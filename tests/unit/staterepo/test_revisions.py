@@ -1,4 +1,4 @@
-"""Times as people write them, and the newest commit on main at a time."""
+"""Times as people write them, and the newest commit that main had at a given time."""
 
 from __future__ import annotations
 

@@ -46,9 +46,9 @@ def file_trees(draw: st.DrawFn) -> Files:
 
 @st.composite
 def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
-    """Return random removals of files and random texts of files.
+    """Return random changes: files to remove (None), and new texts of files.
 
-    Some removed files do not exist. The files with texts fit into one tree.
+    Some of the files to remove do not exist. The files with new texts fit into one tree.
     """
     known = st.sampled_from(sorted(files)) if files else PATHS
     removed = draw(st.lists(known | PATHS, max_size=4))
@@ -65,7 +65,7 @@ def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
 def changed(files: Files, change: Mapping[str, str | None]) -> Files:
     """Return the files after a change, by the model.
 
-    First the removed files go. Then each text replaces the files that conflict with its path.
+    First, files are removed. Then each new text replaces the files that conflict with its path.
     """
     after = {path: text for path, text in files.items() if change.get(path, text) is not None}
     for path, text in change.items():
