@@ -2,10 +2,10 @@
 
 | state | the demand | next |
 | --- | --- | --- |
-| arrived | was submitted | waiting, done |
-| waiting | is in the journal and may be evaluated | committed, proposed, withdrawn, done |
+| arrived | was submitted | queued, done |
+| queued | is in the journal and may be evaluated | committed, proposed, withdrawn, done |
 | committed | has a commit, and can no longer be withdrawn | committed, proposed, done |
-| proposed | awaits a person's approval | proposed, waiting, withdrawn, done |
+| proposed | awaits a person's approval | proposed, queued, withdrawn, done |
 | withdrawn | was taken back, released or replaced | done |
 | done | is answered | |
 
@@ -44,10 +44,10 @@ log = logging.getLogger("demandops")
 TAKEN_BACK = "the demand was taken back before it was committed"
 
 _NEXT: dict[State, tuple[State, ...]] = {
-    "arrived": ("waiting", "done"),
-    "waiting": ("committed", "proposed", "withdrawn", "done"),
+    "arrived": ("queued", "done"),
+    "queued": ("committed", "proposed", "withdrawn", "done"),
     "committed": ("committed", "proposed", "done"),
-    "proposed": ("proposed", "waiting", "withdrawn", "done"),
+    "proposed": ("proposed", "queued", "withdrawn", "done"),
     "withdrawn": ("done",),
     "done": (),
 }
@@ -80,7 +80,7 @@ class Demands:
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
-        self._waiting = FairQueue(in_order=requester_limit is None)
+        self._queue = FairQueue(in_order=requester_limit is None)
         for ticket in resumed:
             if ticket.proposal is None:
                 self._enqueue(ticket)
@@ -109,14 +109,14 @@ class Demands:
             return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
 
     @property
-    def has_waiting(self) -> bool:
-        """Whether a demand waits for the worker."""
-        return bool(self._arrived or self._waiting)
+    def has_queued(self) -> bool:
+        """Whether the worker has a demand to publish."""
+        return bool(self._arrived or self._queue)
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether the worker must end a fetch, because a demand waits or the generator stops."""
-        return self.has_waiting or self._closed
+        """Whether the worker must end a fetch: a demand is queued, or the generator stops."""
+        return self.has_queued or self._closed
 
     # ---- waiting for demands ----
 
@@ -139,11 +139,11 @@ class Demands:
         """Wait until a demand arrives, :meth:`wake` or :meth:`close` is called, or time runs out.
 
         Returns:
-            False if no demand waits and no further demand is accepted; otherwise True.
+            False if no demand is queued and no further demand is accepted; otherwise True.
         """
         with self._changed:
             self._wait(timeout, self.must_not_wait)
-            return self.has_waiting or not self._closed
+            return self.has_queued or not self._closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Wait for a new demand; return all demands that arrived since the last call.
@@ -175,8 +175,8 @@ class Demands:
         with self._changed:
             self._journal.require_sound()
             self._new.clear()
-            room = min(limit - len(batch), len(self._waiting))
-            batch += [self._waiting.popleft() for _ in range(room)]
+            room = min(limit - len(batch), len(self._queue))
+            batch += [self._queue.popleft() for _ in range(room)]
 
     def put_back(self, batch: list[Ticket]) -> None:
         """Move all demands of a batch back to the front of the queue.
@@ -185,7 +185,7 @@ class Demands:
         sent meanwhile.
         """
         with self._changed:
-            self._waiting.put_back([each for each in batch if each not in self._taken_back])
+            self._queue.put_back([each for each in batch if each not in self._taken_back])
             batch.clear()
 
     # ---- changes of state ----
@@ -239,8 +239,8 @@ class Demands:
                     refused.append((ticket, why))
                 taken = []
             for ticket in taken:
-                _change(ticket, "waiting")
-                self._waiting.append(ticket)
+                _change(ticket, "queued")
+                self._queue.append(ticket)
             self._new += taken
             self._changed.notify()
         for ticket in taken:
@@ -255,10 +255,10 @@ class Demands:
         """
         if self._closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
-        if others + len(self._waiting) >= self._limit:
-            why = f" for the state repo: {self.blocked}" if self.blocked else ""
+        if others + len(self._queue) >= self._limit:
+            why = f" and cannot be published ({self.blocked})" if self.blocked else ""
             return QueueFull(
-                f"{self._limit} demands are waiting already{why}; send the demand again later"
+                f"{self._limit} demands are queued already{why}; send the demand again later"
             )
         if ticket.operation in self._tickets:
             message = "is the operation id of another demand; choose a new one"
@@ -294,7 +294,7 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Queue demands that were proposed but no longer need approval, as waiting demands.
+        """Queue demands that were proposed but no longer need approval.
 
         Each demand is marked as maybe published, because a person may have merged it meanwhile.
         """
@@ -303,7 +303,7 @@ class Demands:
                 ticket.mark_maybe_published(ticket.base)
                 self._journal.append([ticket.journal_entry()])
                 ticket.proposal = None
-                _change(ticket, "waiting")
+                _change(ticket, "queued")
                 self._enqueue(ticket)
             self._changed.notify()
 
@@ -345,7 +345,7 @@ class Demands:
         self.wake()  # the worker answers the demand even while nothing can be published
 
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
-        """Answer the demands that were withdrawn while waiting, and remove them from the batch.
+        """Answer the demands that were withdrawn while queued, and remove them from the batch.
 
         A demand that was withdrawn while it awaited approval is answered later, after its branch is
         deleted.
@@ -354,7 +354,7 @@ class Demands:
             withdrawn, self._taken_back = self._taken_back, []
             if not withdrawn:
                 return
-            self._waiting.remove(withdrawn)
+            self._queue.remove(withdrawn)
             batch[:] = [ticket for ticket in batch if ticket not in withdrawn]
         self.fail(withdrawn, Withdrawn(TAKEN_BACK))
 
@@ -427,7 +427,7 @@ class Demands:
 
     def _enqueue(self, ticket: Ticket) -> None:
         self._of_requester[requester_of(ticket.goal)] += 1
-        self._waiting.append(ticket)
+        self._queue.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
         """Stop counting a demand towards the limit of its requester."""

@@ -1,4 +1,4 @@
-"""The queue of waiting demands: requesters take turns, and related demands keep their order.
+"""The queue of demands: requesters take turns, and related demands keep their order.
 
 For the turns, only the first requester of a demand counts. Demands that share an application, a
 connection or a demand id keep their order. Goals of the reference's action that share a requester
@@ -35,7 +35,7 @@ class _Queued:
 
 
 class FairQueue:
-    """A queue of waiting demands; not thread-safe.
+    """A queue of demands; not thread-safe.
 
     With ``in_order`` the demands leave in the order of their arrival, without turns.
     """
@@ -49,7 +49,7 @@ class FairQueue:
         self._arrived = 0
 
     def __len__(self) -> int:
-        """Return how many demands wait."""
+        """Return how many demands are queued."""
         return len(self._queued)
 
     def append(self, ticket: Ticket) -> None:
@@ -126,7 +126,7 @@ class FairQueue:
         return None
 
     def _forget(self, queued: _Queued) -> None:
-        """Forget the subjects of a removed demand, except those that a waiting demand touches."""
+        """Forget the subjects of a removed demand, except those that a queued demand touches."""
         for subject in queued.subjects or ():
             if _next_in(self._subjects[subject]) is None:
                 del self._subjects[subject]

@@ -37,7 +37,7 @@ Stage = Literal[
 """
 Listener = Callable[[Stage, str], None]
 
-State = Literal["arrived", "waiting", "committed", "proposed", "withdrawn", "done"]
+State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
 """The state of a demand; only :mod:`demandops.service.demand_lifecycle` changes it."""
 
 
@@ -86,7 +86,7 @@ class Ticket:
     base: str = ""
     maybe_published: bool = False
     has_released: bool = False
-    state: State = "waiting"
+    state: State = "queued"
     notified: set[str] = field(default_factory=set)
     proposal: ProposalRecord | None = None
 

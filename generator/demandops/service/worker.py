@@ -113,7 +113,7 @@ class Worker:
         self._approvals.suspend()
 
     def _work(self) -> None:
-        """Publish waiting demands; if no demand waits, follow the state repo.
+        """Publish the queued demands; if no demand is queued, follow the state repo.
 
         Check the proposals afterwards.
         """
@@ -292,7 +292,7 @@ class Worker:
 
         Return no ticket while a demand waits, because that demand may renew a lease.
         """
-        if self._rest or self._demands.has_waiting:
+        if self._rest or self._demands.has_queued:
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
 

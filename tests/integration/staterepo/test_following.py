@@ -370,7 +370,7 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, ba
         # the worker may take demands from the queue into its batch, so the last may find room
         rig.wait_until(lambda: any(one.future.done() for one in tickets), "a demand is refused")
         refused = next(one for one in tickets if one.future.done())
-        with pytest.raises(QueueFull, match=r"waiting already for the state repo: .*503"):
+        with pytest.raises(QueueFull, match=r"queued already and cannot be published .*503"):
             rig.receipt(refused)
         server.faults.away = False
         for ticket in tickets:

@@ -207,7 +207,7 @@ def test_a_full_queue_takes_no_more_and_takes_again_when_there_is_room(bare: Pat
         waiting = [generator.submit(goal(n)) for n in (1, 2, 3)]
         with pytest.raises(QueueFull) as error:
             rig.receipt(generator.submit(goal(4)))
-        assert str(error.value) == "3 demands are waiting already; send the demand again later"
+        assert str(error.value) == "3 demands are queued already; send the demand again later"
         gate.open.set()
         for ticket in (first, *waiting):
             rig.receipt(ticket)

@@ -1,4 +1,4 @@
-"""The order in which the generator takes the waiting demands of many requesters."""
+"""The order in which the generator takes the queued demands of many requesters."""
 
 from __future__ import annotations
 

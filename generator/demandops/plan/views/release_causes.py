@@ -68,9 +68,15 @@ def how_to_release(claim: Claim) -> str:
     """Return, in words, how the holders of a claim release it."""
     if claim.keeping_override is not None:
         return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
-    if claim.demand == demand_id(claim.request, claim.requesters):
-        return f"send request '{claim.request}' again with shutdown: true"
-    return f"send 'operation: release' for demand '{claim.demand}'"
+    if is_released_by_demand_id(claim):
+        return f"send 'operation: release' for demand '{claim.demand}'"
+    return f"send request '{claim.request}' again with shutdown: true"
+
+
+def is_released_by_demand_id(claim: Claim) -> bool:
+    """Return whether a release that names the claim's demand id releases the claim."""
+    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
+    return claim.keeping_override is None and not is_of_a_request
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:

@@ -57,7 +57,7 @@ from demandops.staterepo.write.proposal_branch import (
 log = logging.getLogger("demandops")
 
 _LONGEST_CHECK_S = 0.5
-"""How many seconds a check of all proposals may take before it pauses for a waiting demand."""
+"""How many seconds a check of all proposals may take before it pauses for a queued demand."""
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -254,7 +254,7 @@ class Approvals:
 
     def _must_pause(self, began: float) -> bool:
         is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
-        return is_long and self._demands.has_waiting
+        return is_long and self._demands.has_queued
 
     def _check_next(self, proposals: list[Proposal]) -> None:
         """Make another check due, which begins with ``proposals``."""
@@ -276,7 +276,7 @@ class Approvals:
         ]
         self._demands.answer(booked)
         proposal.drop(booked)
-        if verdict.waiting:
+        if verdict.unapproved:
             if booked and not head:  # a person merged only some of the demands
                 proposal.record = replace(proposal.record, pushed=False)
             if not self._leave_out(proposal, verdict, snapshot, head):
@@ -288,7 +288,7 @@ class Approvals:
         # the branch no longer has these demands, so nobody can merge them
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
-        if not verdict.waiting:
+        if not verdict.unapproved:
             proposal.wait_for([])
             self._forget(proposal, close=not booked)
 
@@ -318,7 +318,7 @@ class Approvals:
             False if the proposal must be checked again. The proposal then keeps all its demands.
         """
         before, is_updated = proposal.tickets, False
-        proposal.wait_for(verdict.waiting)
+        proposal.wait_for(verdict.unapproved)
         try:
             is_updated = self._update(proposal, verdict, snapshot, head)
         finally:
@@ -361,7 +361,7 @@ class Approvals:
         Return False if a demand was withdrawn; the branch is then not pushed.
         """
         commits = CommitBatch(self._repository, snapshot)
-        steps, failed = decide_in_turn(verdict.waiting, snapshot.state, commits.read)
+        steps, failed = decide_in_turn(verdict.unapproved, snapshot.state, commits.read)
         verdict.failed.extend(failed)
         proposal.drop(failed)
         old, tip = proposal.record, snapshot.commit

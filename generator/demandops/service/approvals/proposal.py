@@ -35,14 +35,14 @@ class Verdict:
 
     ``booked``: main has the claims of these demands. ``failed``: these demands were withdrawn or
     turned down, or can no longer be booked; each has its error. ``free``: these demands no longer
-    need approval. ``waiting``: these demands still need approval. Booked and waiting demands have
-    the decision that they would get on the current main.
+    need approval. ``unapproved``: these demands still need approval. Booked and unapproved demands
+    have the decision that they would get on the current main.
     """
 
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
     failed: Failed = field(default_factory=list)
     free: list[Ticket] = field(default_factory=list)
-    waiting: Decided = field(default_factory=list)
+    unapproved: Decided = field(default_factory=list)
 
 
 @dataclass(eq=False)
@@ -114,7 +114,7 @@ class Proposal:
             elif isinstance(decision, InvalidInput):
                 verdict.failed.append((ticket, decision))
             elif decision.approval:
-                verdict.waiting.append((ticket, decision))
+                verdict.unapproved.append((ticket, decision))
             else:
                 verdict.free.append(ticket)
         why_not = ""
@@ -123,8 +123,8 @@ class Proposal:
         elif pull_request is not None and pull_request.state == "closed":
             why_not = f"was turned down: {pull_request.link} was closed"
         if why_not and not verdict.booked:
-            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.waiting)
-            verdict.waiting.clear()
+            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.unapproved)
+            verdict.unapproved.clear()
         return verdict
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:

@@ -9,7 +9,7 @@ from demandops import strict_yaml
 from demandops.decision import decide
 from demandops.demand.claim import Claim, requesters_of
 from demandops.errors import InvalidInput, StateRepoError
-from demandops.plan.views.release_causes import how_to_release
+from demandops.plan.views.release_causes import how_to_release, is_released_by_demand_id
 from demandops.quoting import quoted
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.settings import API_VERSION
@@ -70,8 +70,7 @@ def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
         "requesters": list(requesters_of(claims)),
     }
     how = how_to_release(claims[0])
-    is_by_id = how.startswith("send 'operation")
-    file = strict_yaml.dump(goal) if is_by_id else ""
+    file = strict_yaml.dump(goal) if is_released_by_demand_id(claims[0]) else ""
     try:
         read = reader.file_reader(now.commit_state.commit)
         decision = decide(now.commit_state.state, goal, now.now, read)
