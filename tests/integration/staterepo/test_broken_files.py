@@ -412,3 +412,19 @@ def test_a_forged_record_of_the_files_in_effect_stops_no_start(
     person.change({}, message, FORGER)
     with rig.running(bare) as generator:
         rig.book(generator, goal(2))
+
+
+def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(
+    address: str, bare: Path, person: Person
+) -> None:
+    """Only a person who writes the generator's name into a commit makes such a claim."""
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        person.override(broken="odd")
+        rig.book(generator, goal(2))
+        (path,) = rig.claims(bare, "fusion-1")
+        person.change({path: "kind: 5\n"}, "x\n\nWhy: x\n\nRender-Version: 2", FORGER)
+        person.change({path: "kind: 6\n"})
+        rig.book(generator, goal(3), leave(1))
+    with rig.running(address) as generator:
+        rig.book(generator, goal(4))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
@@ -95,8 +96,10 @@ def last_valid_claims(
         before = trees.parent_tree(commit)
         changed = [path for path in left if trees.differ(before, commit.tree, (path,))]
         if before is not None and changed and commit_log.is_by_generator(repo, commit):
-            claims |= {path: claim_at(commit.tree, path) for path in changed}
-            left.difference_update(changed)
+            for path in changed:
+                with suppress(InvalidInput):  # only a forged commit has an invalid claim
+                    claims[path] = claim_at(commit.tree, path)
+                    left.remove(path)
     return claims
 
 
