@@ -356,3 +356,17 @@ def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
         with pytest.raises(InvalidInput, match="nowhere"):
             rig.receipt(late)
     assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+@pytest.mark.parametrize("kind", ["heads", "tags"])
+def test_a_reference_whose_name_ends_like_main_stops_no_demand(
+    url: str, bare: Path, kind: str
+) -> None:
+    """A person who pushes to `refs/heads/refs/heads/main` needs no right to push to main."""
+    rig.git(bare, "update-ref", f"refs/{kind}/refs/heads/main", "main")
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1), goal(2))
+        clone = generator._slot.folder / "clone.git"
+    assert rig.git(clone, "for-each-ref", "--format=%(refname)") == "refs/remotes/origin/main"
+    rig.git(bare, "update-ref", "-d", f"refs/{kind}/refs/heads/main")
+    rig.assert_sound(bare)

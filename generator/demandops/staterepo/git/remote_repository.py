@@ -83,6 +83,8 @@ _REMEDIES = (
     ),
 )
 """Pairs: a pattern that matches git's reason, and the remedy for a person."""
+_AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
+"""Matches git's error if the remote also has a reference like ``refs/heads/refs/heads/main``."""
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
@@ -277,11 +279,30 @@ class RemoteRepository(StateRepository):
             options: options for the server (``git push --push-option``).
         """
         push_options = [f"--push-option={option}" for option in options]
-        expects = f"--force-with-lease={lease}"
-        out, err = self._run_git(
-            self._git, "push", "--porcelain", *push_options, expects, "origin", spec
-        )
+        command = ("push", "--porcelain", *push_options, f"--force-with-lease={lease}", "origin")
+        try:
+            out, err = self._run_git(self._git, *command, spec)
+        except git.GitCommandError as error:
+            commit, _, reference = spec.partition(":")
+            if not commit or not _AMBIGUOUS.search(str(error.stderr)):
+                raise
+            out, err = self._push_literally(command, Oid(hex=commit), reference)
         return f"{out}\n{err}"
+
+    def _push_literally(
+        self, command: Sequence[str], commit: Oid, reference: str
+    ) -> tuple[str, str]:
+        """Push a branch although another reference of the remote ends with the branch's name.
+
+        Git takes the name of a branch literally only if it comes from a pattern, and a pattern
+        needs a reference here.
+        """
+        pushed = f"refs/pushed/{reference}"
+        self.objects.references.create(pushed, commit, force=True)
+        try:
+            return self._run_git(self._git, *command, f"{pushed}*:{reference}*")
+        finally:
+            self.objects.references.delete(pushed)
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return the error to raise for a failed push.
