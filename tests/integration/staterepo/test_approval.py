@@ -713,3 +713,21 @@ def test_a_demand_withdrawn_right_before_a_crash_loses_its_branch_at_the_restart
     with rig.running(http):
         rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
     assert rig.claims(bare) == []
+
+
+def test_a_branch_called_demand_is_told_to_the_requester_and_delays_nothing(
+    address: str, bare: Path, petra: Person
+) -> None:
+    git(bare, "branch", "demand", "main")
+    with rig.running(address) as generator:
+        refused = generator.submit(goal(1), "op-1")
+        with pytest.raises(StateRepoError) as error:
+            rig.receipt(refused)
+        branch = f"{error.value}".split(" the branch ")[1].split(",")[0]
+        assert str(error.value) == (
+            f"{address} cannot have the branch {branch}, because it has a branch demand; delete or "
+            "rename demand, then try again"
+        )
+        assert "writer" not in generator.failures
+        git(bare, "branch", "-D", "demand")
+        assert Proposed(generator, goal(1), "op-2").branch in branches(bare)
