@@ -30,6 +30,7 @@ from demandops.staterepo.git.repository import (
     RemoteAway,
     StateRepository,
     Unavailable,
+    missing_main,
 )
 from demandops.staterepo.git.slow_git import SlowGit
 
@@ -340,10 +341,7 @@ class RemoteRepository(StateRepository):
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
         if "couldn't find remote ref" in text:
-            raise StateRepoError(
-                f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
-                "`demandops init DIR`"
-            )
+            raise missing_main(self.address)
         if _NO_ROOM.search(text):
             raise self._disk_full()
         if _NO_CLONE.search(text):

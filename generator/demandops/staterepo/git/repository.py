@@ -85,6 +85,14 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
     return None
 
 
+def missing_main(address: str) -> StateRepoError:
+    """Return the error to raise if a state repo has no main branch."""
+    return StateRepoError(
+        f"{address} has no branch '{MAIN_BRANCH}'; if it was renamed or deleted, restore it; if "
+        "there is no state repo yet, push one made by `demandops init DIR`"
+    )
+
+
 def access_error(error: Exception, address: str) -> Exception:
     """Return the error to raise if reading or writing ``address`` failed with ``error``.
 
