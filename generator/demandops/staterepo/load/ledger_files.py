@@ -139,6 +139,26 @@ def claims_by_people(
     return [change for change in changes if change.before != change.after]
 
 
+def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
+    """Return the keys of the claims at ``to`` that people have added since a commit.
+
+    Merges, and commits that keep the trailers of a proposal, are left out. Return an empty set if
+    the repository lacks the commit ``since``.
+    """
+    if not since or since not in repo:
+        return set()
+    before, after = trees.commit_of(repo, since).tree, trees.commit_of(repo, to).tree
+    paths = {
+        path
+        for commit in commit_log.person_commits(repo, to, since)
+        if len(commit.parents) == 1
+        and commit_log.PROPOSAL not in commit_log.entry_of(commit).trailers
+        for path in changed_files(commit.parents[0].tree, commit.tree)
+    }
+    claims = (valid_claim_at(after, path) for path in paths if not trees.entry(before, path))
+    return {claim.key for claim in claims if claim}
+
+
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     """Return the request to roll back to the ledger of the commit ``to``.
 
