@@ -22,6 +22,7 @@ from demandops.staterepo.git.repository import (
     Unavailable,
     disk_error,
     missing_main,
+    unopened,
 )
 
 _STALE_LOCK_S = 5.0
@@ -43,8 +44,8 @@ class LocalRepository(StateRepository):
         self._lock_seen: tuple[tuple[int, int], float] | None = None
         try:
             self.objects = Repository(str(path))
-        except pygit2.GitError:
-            raise StateRepoError(
+        except pygit2.GitError as error:
+            raise unopened(path, error) or StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
         self.new = NewObjects(self.objects)
