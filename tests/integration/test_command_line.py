@@ -820,3 +820,22 @@ def test_a_command_in_a_hook_works_on_the_state_repo_and_not_on_the_hooks_repo(
     )
     assert (done.returncode, done.stdout[:4]) == (0, "NODE"), done.stderr
     assert (other / ".git" / "config").read_text() == before
+
+
+def test_a_machine_without_git_is_told_what_to_install(bare: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "demandops.cli.main", "get", "nodes", "--state-repo", str(bare)],
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    message = "get needs git, which is not installed; install it (Debian: apt-get install git)"
+    assert (done.returncode, done.stderr) == (1, f"error: {message}\n")
+
+
+def test_a_clone_has_the_state_repos_kind_of_ids_whatever_the_users_default_is(
+    bare: Path, monkeypatch: pytest.MonkeyPatch, demandops: Run
+) -> None:
+    monkeypatch.setenv("GIT_DEFAULT_HASH", "sha256")
+    assert demandops("get", "nodes", "--state-repo", bare.as_uri()).code == 0

@@ -195,7 +195,7 @@ class RemoteRepository(StateRepository):
         self._folder.parent.mkdir(parents=True, exist_ok=True)
         partial = self._folder.with_name(self._folder.name + ".partial")
         shutil.rmtree(partial, ignore_errors=True)
-        with git.Repo.init(partial, bare=True) as repo:
+        with git.Repo.init(partial, bare=True, object_format="sha1") as repo:
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
                 config.set_value("gc", "auto", 0)
