@@ -209,7 +209,8 @@ def _link(output: str) -> str:
 class PendingProposal:
     """A proposal that awaits approval, with data from the messages of its commits.
 
-    ``commit`` is the newest commit. ``since`` is the time when the first demand was received.
+    ``commit`` is the newest commit of the branch, perhaps by a person. ``since`` is the time when
+    the first demand was received.
     """
 
     branch: str
@@ -230,7 +231,8 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
         try:
-            found = list(commit_log.commits(repo, repo.references[name].resolve().target, main))
+            head = repo.references[name].resolve().target
+            found = list(commit_log.commits(repo, head, main))
         except (KeyError, ValueError, TypeError, GitError, StateRepoError):
             _warn_of_unreadable(name)
             continue
@@ -240,7 +242,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
         entries = [entry for _, entry in proposed]
         yield PendingProposal(
             branch=f"{PREFIX}{name.removeprefix(space)}",
-            commit=entries[0].commit,
+            commit=str(head),
             summary=entries[0].summary,
             since=entries[-1].authored or entries[-1].time,
             requesters=_all_of(entries, "Requester"),
