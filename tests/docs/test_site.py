@@ -45,7 +45,7 @@ def test_the_reference_has_all_that_the_code_has(site: Path) -> None:
     assert text["errors"].count("<br") + text["errors"].count("<tr>") - text["errors"].count(
         "<thead>"
     ) == messages.count("\n    ")
-    raised = "has no branch '…'; push one made by `demandops init DIR`"
+    raised = "there is no state repo yet, push one made by `demandops init DIR`"
     assert raised in html.unescape(re.sub(r"<[^>]+>", "", text["errors"]))
 
 

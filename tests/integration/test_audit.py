@@ -517,6 +517,15 @@ class TestVerifyByDifferences:
         self.surrounded(played, request_json, lambda: played.commit(changed))
         assert all(row["holds"] for row in self.verdicts(demandops, played).values())
 
+    def test_a_persons_file_that_stood_in_place_of_a_folder(
+        self, demandops: Run, played: Any, request_json: Run
+    ) -> None:
+        def replace() -> str:
+            return played.commit({**dict.fromkeys(played.files("ledger/")), "ledger": "a file\n"})
+
+        self.surrounded(played, request_json, replace)
+        assert all(row["holds"] for row in self.verdicts(demandops, played).values())
+
     def test_what_is_not_the_generators_to_write(
         self, demandops: Run, played: Any, request_json: Run
     ) -> None:

@@ -6,6 +6,7 @@ Exit codes: 0 done, 1 a fault that the user can fix, 2 wrong usage, 3 a fault of
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -801,3 +802,40 @@ class TestUsage:
         assert ran.returncode == 1
         assert [row["outcome"] for row in json.loads(ran.stdout)] == ["booked", "refused"]
         assert ran.stderr == ""
+
+
+def test_a_command_in_a_hook_works_on_the_state_repo_and_not_on_the_hooks_repo(
+    bare: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    git(tmp_path, "init", "--quiet", str(other))
+    before = (other / ".git" / "config").read_text()
+    done = subprocess.run(
+        [sys.executable, "-m", "demandops.cli.main", "get", "nodes", "--state-repo", bare.as_uri()],
+        env=os.environ
+        | {"GIT_DIR": f"{other}/.git", "GIT_INDEX_FILE": "index", "GIT_QUARANTINE_PATH": "x"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout[:4]) == (0, "NODE"), done.stderr
+    assert (other / ".git" / "config").read_text() == before
+
+
+def test_a_machine_without_git_is_told_what_to_install(bare: Path, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "demandops.cli.main", "get", "nodes", "--state-repo", str(bare)],
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    message = "get needs git, which is not installed; install it (Debian: apt-get install git)"
+    assert (done.returncode, done.stderr) == (1, f"error: {message}\n")
+
+
+def test_a_clone_has_the_state_repos_kind_of_ids_whatever_the_users_default_is(
+    bare: Path, monkeypatch: pytest.MonkeyPatch, demandops: Run
+) -> None:
+    monkeypatch.setenv("GIT_DEFAULT_HASH", "sha256")
+    assert demandops("get", "nodes", "--state-repo", bare.as_uri()).code == 0

@@ -249,6 +249,8 @@ def _connected(hook: PushWebhook) -> socket.socket:
          "127.0.0.1:8090"),
         ("127.0.0.1:65536", "'127.0.0.1:65536' is not an address to listen on; write one like "
          "127.0.0.1:8090"),
+        ("::" + "1" * 5000, f"'::{'1' * 77}…' is not an address to listen on; write one like "
+         "127.0.0.1:8090"),
         ("0.0.0.0:0", "'0.0.0.0:0' can be reached from other machines, so notifications must be "
          "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"),
         ("nowhere.invalid:0", "'nowhere.invalid:0': host 'nowhere.invalid' cannot be resolved; "

@@ -151,3 +151,51 @@ def test_a_branch_of_a_time_that_no_calendar_has_is_listed(demandops: Run, state
     repo.create_commit(branch, author, tip.committer, message, tip.tree.id, [tip.id])
     listed = demandops("get", "proposals", "--state-repo", state.path, "--output", "json")
     assert [row["branch"] for row in listed.json()["items"]] == ["demand/odd"]
+
+
+def edit(person: Person, branch: str, content: bytes, *, executable: bool = False) -> str:
+    """Push a commit with a file `sketch` to a branch; return the commit's id."""
+    person.fetch()
+    git(person.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
+    person.folder.joinpath("sketch").write_bytes(content)
+    git(person.folder, "add", "sketch")
+    if executable:
+        git(person.folder, "update-index", "--chmod=+x", "sketch")
+    git(person.folder, "commit", "--quiet", "--message", "Add a sketch")
+    git(person.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
+    return git(person.folder, "rev-parse", "HEAD")
+
+
+def test_what_a_person_added_to_a_proposal_is_approved_with_it(
+    demandops: Run, send: Send, strict: GitRepo, person: Person
+) -> None:
+    send(strict)
+    [branch] = branches(strict.path)
+    head = edit(person, branch, b"text")
+    assert demandops("approve", branch, "--yes", "--state-repo", strict.path).code == 0
+    assert git(strict, "rev-parse", "main^2") == head
+    assert strict.files()["sketch"] == "text"
+
+
+def test_a_proposal_that_a_person_edited_can_be_rejected(
+    demandops: Run, send: Send, strict: GitRepo, person: Person
+) -> None:
+    send(strict)
+    [branch] = branches(strict.path)
+    edit(person, branch, b"text")
+    assert demandops("reject", branch, "--yes", "--state-repo", strict.path).code == 0
+    assert branches(strict.path) == []
+
+
+@pytest.mark.parametrize("content", [b"\xff\xd8", b"text"], ids=["binary", "executable"])
+def test_a_file_that_approve_would_change_is_told(
+    demandops: Run, send: Send, strict: GitRepo, person: Person, content: bytes
+) -> None:
+    send(strict)
+    [branch] = branches(strict.path)
+    edit(person, branch, content, executable=content == b"text")
+    tip = strict.tip
+    ran = demandops("approve", branch, "--yes", "--state-repo", strict.path)
+    told = f"sketch in {branch} is not a plain text file; merge the branch with git"
+    assert (ran.code, ran.err.splitlines()[-1]) == (1, f"error: {told}")
+    assert strict.tip == tip

@@ -442,6 +442,29 @@ def test_a_shallow_clone_is_told_how_to_become_whole(
     assert run(["check", str(folder), *base]) == 0
 
 
+def test_a_sparse_checkout_is_told_how_to_become_whole(branch: Path, check: Run) -> None:
+    git(branch, "sparse-checkout", "set", "policy")
+    message = f"{branch} is a sparse checkout, which lacks files; check out all files with "
+    assert check() == (1, "", f"error: {message}`git sparse-checkout disable`\n")
+    git(branch, "sparse-checkout", "disable")
+    assert check().code == 0
+
+
+def test_a_checkout_that_git_cannot_open_is_not_taken_for_files_without_git(
+    branch: Path, demandops: Run
+) -> None:
+    """A checkout of another user is one, as is a work tree whose repository is not there."""
+    shutil.rmtree(branch / ".git")
+    (branch / ".git").write_text("gitdir: /nowhere\n")
+    told = f"error: {branch} is a Git repository that cannot be opened: "
+    remedy = f"run `git config --global --add safe.directory {branch}`"
+    for command in (["check"], ["get", "nodes", "--state-repo"]):
+        code, out, errors = demandops(*command, branch)
+        assert (code, out) == (1, "")
+        assert errors.startswith(told)
+        assert errors.rstrip().endswith(remedy)
+
+
 def test_a_base_that_is_none_is_told(branch: Path, check: Run) -> None:
     code, out, errors = check("--base", "nowhere")
     assert (code, out) == (1, "")

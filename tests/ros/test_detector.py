@@ -9,12 +9,15 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import rclpy
 import yaml
 from demandops import strict_yaml
+from demandops.detection.rules.rule_file import read
+from demandops_ros.detector.detector_node import DetectorNode
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
@@ -251,3 +254,22 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     detecting.process.wait(10)
     fleet.until(lambda: commits(served)[-1] == "expire", "its lease ends without the detector")
     assert served.bookkeeping()["services"] == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "null", "[]", "{", "[" * 100_000, '{"demands": []}', '{"demands": {"a": 1}}']
+)
+def test_bookkeeping_that_cannot_be_read_is_told_and_the_next_one_is_used(text: str) -> None:
+    told: list[tuple[str, str]] = []
+    node = SimpleNamespace(
+        _detector=SimpleNamespace(file=read(rules_of(), "rules.yaml")),
+        _bookkeeping=None,
+        _log=lambda level, line: told.append((level, line)),
+    )
+    DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json=text))
+    assert node._bookkeeping is None
+    [(level, line)] = told
+    assert level == "warning"
+    assert line.startswith("the bookkeeping cannot be read (")
+    DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json='{"demands": {}}'))
+    assert node._bookkeeping == {"demands": {}}

@@ -6,6 +6,7 @@ A command's module is imported when the command runs, so that `--version` and `-
 from __future__ import annotations
 
 import logging
+import shutil
 import sys
 from enum import IntEnum
 from importlib import import_module
@@ -92,6 +93,12 @@ def load(name: str) -> click.Command:
             raise
         raise click.ClickException(
             f"{name} needs {missing}, which is not installed; see README.md, 'With ROS 2'"
+        ) from None
+    except ImportError:  # raised by GitPython
+        if shutil.which("git"):
+            raise
+        raise click.ClickException(
+            f"{name} needs git, which is not installed; install it (Debian: apt-get install git)"
         ) from None
     return command
 

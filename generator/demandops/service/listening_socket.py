@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 import socket
 from typing import Any
 
 from demandops.errors import InvalidInput
+from demandops.quoting import quoted
+
+_PORT = re.compile(r"[0-9]{1,5}")
 
 
 def bound(address: str, option: str) -> socket.socket:
@@ -16,9 +20,10 @@ def bound(address: str, option: str) -> socket.socket:
         InvalidInput: the socket cannot listen on the address; the error names the option.
     """
     host, colon, port = address.rpartition(":")
-    if not colon or not host or not (port.isascii() and port.isdigit()) or int(port) > 0xFFFF:
+    if not colon or not host or not _PORT.fullmatch(port) or int(port) > 0xFFFF:
         raise InvalidInput.at(
-            option, f"'{address}' is not an address to listen on; write one like 127.0.0.1:8090"
+            option,
+            f"{quoted(address)} is not an address to listen on; write one like 127.0.0.1:8090",
         )
     family, resolved = _resolved(
         host.removeprefix("[").removesuffix("]"), int(port), address, option

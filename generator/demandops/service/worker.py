@@ -406,7 +406,7 @@ class Worker:
         """
         tip = self._repository.tip()
         before = self.snapshot
-        if tip == before.commit and not before.problems:
+        if tip == before.commit and not before.problems and before.is_rendered:
             commits = CommitBatch(self._repository, before)
         else:
             advance = self._ahead.advance(self._repository.objects, before, tip)

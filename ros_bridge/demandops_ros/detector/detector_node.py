@@ -121,7 +121,17 @@ class DetectorNode(Node):  # type: ignore[misc]
     # ---- start: find the demands of the earlier run ----
 
     def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
-        self._bookkeeping = json.loads(message.bookkeeping_json)
+        try:
+            bookkeeping = json.loads(message.bookkeeping_json)
+            booked_events(self._detector.file, bookkeeping)
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+            self._log(
+                "warning",
+                f"the bookkeeping cannot be read ({error!r}); check who publishes it; the next one "
+                "is waited for",
+            )
+            return
+        self._bookkeeping = bookkeeping
 
     def _start(self, bookkeeping: Mapping[str, Any], now: float) -> None:
         booked = booked_events(self._detector.file, bookkeeping)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from demandops.quoting import one_line
+from demandops.quoting import one_line, quoted
 from demandops.runtime import REAL
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
@@ -17,6 +17,8 @@ from rclpy.parameter import Parameter
 _LOOK_S = 0.2
 _ANSWER_S = 2.0
 _EVENTS = "/parameter_events"
+_LARGEST = 2**63 - 1
+"""The largest integer that ROS can transport."""
 
 
 class ParameterSetter:
@@ -96,6 +98,12 @@ class ParameterSetter:
 
 
 def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
+    for number in value if isinstance(value, list) else [value]:
+        if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
+            raise ValueError(
+                f"parameter {name}: {quoted(str(number))} is too large for ROS; write a number "
+                f"between {-_LARGEST - 1} and {_LARGEST}"
+            )
     try:
         return Parameter(name, value=value)
     except (TypeError, ValueError) as error:

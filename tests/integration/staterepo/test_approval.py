@@ -713,3 +713,61 @@ def test_a_demand_withdrawn_right_before_a_crash_loses_its_branch_at_the_restart
     with rig.running(http):
         rig.wait_until(lambda: branches(bare) == [], "the branch is deleted")
     assert rig.claims(bare) == []
+
+
+def test_a_branch_called_demand_is_told_to_the_requester_and_delays_nothing(
+    address: str, bare: Path, petra: Person
+) -> None:
+    git(bare, "branch", "demand", "main")
+    with rig.running(address) as generator:
+        refused = generator.submit(goal(1), "op-1")
+        with pytest.raises(StateRepoError) as error:
+            rig.receipt(refused)
+        branch = f"{error.value}".split(" the branch ")[1].split(",")[0]
+        assert str(error.value) == (
+            f"{address} cannot have the branch {branch}, because it has a branch demand; delete or "
+            "rename demand, then try again"
+        )
+        assert "writer" not in generator.failures
+        git(bare, "branch", "-D", "demand")
+        assert Proposed(generator, goal(1), "op-2").branch in branches(bare)
+
+
+@pytest.mark.parametrize("deletes", [False, True])
+def test_what_a_person_edits_and_squashes_is_booked(
+    bare: Path, petra: Person, deletes: bool
+) -> None:
+    """A forge's squash of two commits keeps no trailers, so only the claims show the merge."""
+    with rig.running(bare) as generator:
+        proposed, other = Proposed(generator, goal(1)), Proposed(generator, goal(2))
+        branch = proposed.branch
+        petra.fetch()
+        git(petra.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
+        [claim] = petra.folder.glob("ledger/connections/*/*/*.yaml")
+        claim.write_text(claim.read_text().replace("request: ", "request: edited-"))
+        git(petra.folder, "commit", "--quiet", "--all", "--message", "Edit it")
+        git(petra.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
+        petra.squash(branch, "Squashed")
+        if deletes:
+            petra.delete(branch)
+        assert proposed.outcome() == "booked"
+        assert other.branch in branches(bare)
+    assert_rendered(bare)
+
+
+def test_a_merge_of_what_was_replaced_books_not_what_replaced_it(bare: Path, petra: Person) -> None:
+    """The person's squash keeps no trailers, and the generator sees both at once."""
+    link = {"id": "x", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+    made = {"kind": "Demand", "demand": "d", "requesters": ["vehicle00"], "connections": [link]}
+    gate = Gate()
+    with rig.running(bare) as generator:
+        first = Proposed(generator, made)
+        branch = first.branch
+        link = {**link, "topics": [{"source": "/b"}]}
+        second = generator.submit({**made, "connections": [link]}, "op-2", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        petra.squash(branch, "Squashed")
+        petra.delete(branch)
+        gate.open.set()
+        assert first.outcome() == "booked"
+        assert not second.future.done()

@@ -15,6 +15,7 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
+from demandops.errors import InvalidInput
 from demandops.service import Generator
 from demandops.settings import GENERATED_ROOTS
 from demandops.staterepo.history import authorship
@@ -412,3 +413,43 @@ def test_a_forged_record_of_the_files_in_effect_stops_no_start(
     person.change({}, message, FORGER)
     with rig.running(bare) as generator:
         rig.book(generator, goal(2))
+
+
+def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(
+    address: str, bare: Path, person: Person
+) -> None:
+    """Only a person who writes the generator's name into a commit makes such a claim."""
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        person.override(broken="odd")
+        rig.book(generator, goal(2))
+        (path,) = rig.claims(bare, "fusion-1")
+        person.change({path: "kind: 5\n"}, "x\n\nWhy: x\n\nRender-Version: 2", FORGER)
+        person.change({path: "kind: 6\n"})
+        rig.book(generator, goal(3), leave(1))
+    with rig.running(address) as generator:
+        rig.book(generator, goal(4))
+
+
+def test_after_people_squash_the_history_a_start_needs_valid_files_and_no_more(
+    bare: Path, person: Person
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({IMAGES: tagged(bare, "v2").replace("kind: Images", "kind: x")})
+        rig.book(generator, goal(2))
+        squashed = rig.git(bare, "commit-tree", "main^{tree}", "-m", "The history in one commit")
+        rig.git(bare, "update-ref", "refs/heads/main", squashed)
+        rig.book(generator, goal(3))
+    rig.git(bare, "reflog", "expire", "--expire=now", "--all")
+    rig.git(bare, "gc", "--quiet", "--prune=now")
+    with (
+        pytest.raises(InvalidInput, match=f"^{IMAGES}: kind: is 'x', but must be 'Images'$"),
+        rig.running(bare),
+    ):
+        pass
+    person.change({IMAGES: tagged(bare, "v2").replace("kind: x", "kind: Images")})
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(4))
+        assert tag(bare) == "v2"
+    rig.assert_sound(bare, verify_last=2)

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from demandops.errors import InvalidInput, Refused
+from demandops.errors import InvalidInput, Refused, StateRepoError
 
 from tests.kit import rig
 from tests.kit.rig import Person, goal, leave
@@ -356,3 +356,34 @@ def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
         with pytest.raises(InvalidInput, match="nowhere"):
             rig.receipt(late)
     assert rig.books(bare) == rig.books_after([goal(1)])
+
+
+@pytest.mark.parametrize("kind", ["heads", "tags"])
+def test_a_reference_whose_name_ends_like_main_stops_no_demand(
+    url: str, bare: Path, kind: str
+) -> None:
+    """A person who pushes to `refs/heads/refs/heads/main` needs no right to push to main."""
+    rig.git(bare, "update-ref", f"refs/{kind}/refs/heads/main", "main")
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1), goal(2))
+        clone = generator._slot.folder / "clone.git"
+    assert rig.git(clone, "for-each-ref", "--format=%(refname)") == "refs/remotes/origin/main"
+    rig.git(bare, "update-ref", "-d", f"refs/{kind}/refs/heads/main")
+    rig.assert_sound(bare)
+
+
+def test_a_main_that_is_gone_is_told_and_followed_when_it_is_restored(
+    address: str, bare: Path
+) -> None:
+    with rig.running(address) as generator:
+        rig.book(generator, goal(1))
+        rig.git(bare, "branch", "--move", "main", "trunk")
+        with pytest.raises(StateRepoError) as error:
+            rig.book(generator, goal(2))
+        assert str(error.value) == (
+            f"{address} has no branch 'main'; if it was renamed or deleted, restore it; if there "
+            "is no state repo yet, push one made by `demandops init DIR`"
+        )
+        rig.git(bare, "branch", "--move", "trunk", "main")
+        rig.book(generator, goal(2))
+    rig.assert_sound(bare)

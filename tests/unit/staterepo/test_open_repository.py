@@ -11,6 +11,8 @@ from demandops.staterepo.git.open_repository import connect, is_url
 from demandops.staterepo.git.remote_repository import without_secrets
 from demandops.staterepo.git.repository import RemoteAway
 
+from tests.kit.repo import git
+
 URLS = [
     "https://example.org/state.git",
     "http://127.0.0.1:8080/state.git",
@@ -180,13 +182,38 @@ def test_a_folder_that_is_no_repository_is_told_with_the_remedy(tmp_path: Path) 
 def test_a_repository_without_main_is_told_with_the_remedy(tmp_path: Path) -> None:
     empty = tmp_path / "empty.git"
     pygit2.init_repository(str(empty), bare=True)
-    with pytest.raises(StateRepoError, match="has no branch 'main'"):
-        connect(str(empty), tmp_path / "data")
-    with pytest.raises(StateRepoError) as error:
-        connect(empty.as_uri(), tmp_path / "data")
-    assert str(error.value) == (
-        f"{empty.as_uri()} has no branch 'main'; push one made by `demandops init DIR`"
+    for address in (str(empty), empty.as_uri()):
+        with pytest.raises(StateRepoError) as error:
+            connect(address, tmp_path / "data")
+        assert str(error.value) == (
+            f"{address} has no branch 'main'; if it was renamed or deleted, restore it; if there "
+            "is no state repo yet, push one made by `demandops init DIR`"
+        )
+
+
+def test_a_main_that_is_another_name_of_a_branch_is_told_with_the_remedy(tmp_path: Path) -> None:
+    made = _with_main(tmp_path / "made.git")
+    git(made, "branch", "--move", "main", "trunk")
+    git(made, "symbolic-ref", "refs/heads/main", "refs/heads/trunk")
+    with pytest.raises(StateRepoError, match="is only another name of refs/heads/trunk") as error:
+        connect(str(made), tmp_path / "data")
+    git(made, *str(error.value).partition(f"git -C {made} ")[2].split())
+    connect(str(made), tmp_path / "data")
+
+
+@pytest.mark.parametrize("option", ["--depth=1", "--filter=blob:none"])
+def test_a_clone_that_lacks_a_part_is_refused(tmp_path: Path, option: str) -> None:
+    made = _with_main(tmp_path / "made.git")
+    git(made, "config", "uploadpack.allowFilter", "true")
+    git(
+        made,
+        "update-ref",
+        "refs/heads/main",
+        git(made, "commit-tree", "-pmain", "main^{tree}", "-mx"),
     )
+    git(tmp_path, "clone", "--quiet", "--bare", option, made.as_uri(), "part.git")
+    with pytest.raises(StateRepoError, match="lacks a part of the history or of the files"):
+        connect(str(tmp_path / "part.git"), tmp_path / "data")
 
 
 def test_a_checked_out_main_is_refused_with_the_remedy(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from demandops.decision import Decision, State
+from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import DemandRequest, Put
 from demandops.errors import DemandOpsError, InvalidInput, Refused, ShuttingDown, Withdrawn, fault
 from demandops.quoting import quoted
@@ -44,6 +45,7 @@ from demandops.staterepo.git.repository import PushDenied, StateRepository
 from demandops.staterepo.git.signing import SigningFailed
 from demandops.staterepo.history import commit_log
 from demandops.staterepo.history.commit_log import RecordedOutcome
+from demandops.staterepo.load import ledger_files
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.write.commit_batch import CommitBatch
 from demandops.staterepo.write.journal import ProposalRecord
@@ -265,11 +267,13 @@ class Approvals:
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         objects, tip = self._repository.objects, str(snapshot.commit)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
+        head, added = heads.branches.get(proposal.branch, ""), set[ClaimKey]()
+        if proposal.record.pushed and head not in proposal.record.commits:
+            added = ledger_files.added_by_people(objects, proposal.searched_to, snapshot.commit)
         proposal.searched_to = tip
         read = CommitBatch(self._repository, snapshot).read
-        head = heads.branches.get(proposal.branch, "")
         pull_request = self._forge.pull_request(proposal.branch)
-        verdict = proposal.verdict(snapshot.state, read, on_main, head, pull_request)
+        verdict = proposal.verdict(snapshot.state, read, on_main, added, head, pull_request)
         booked = [
             (ticket, self._receipt(ticket, decision, snapshot, on_main.get(ticket.operation)))
             for ticket, decision in verdict.booked

@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 from demandops.decision import Decision, State, admit, decide
 from demandops.demand import permission
+from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
@@ -84,29 +85,38 @@ class Proposal:
         state: State,
         read: FileReader,
         on_main: Container[str],
+        added: Container[ClaimKey],
         head: str,
         pull_request: PullRequest | None,
     ) -> Verdict:
         """Return the verdict on the proposal's demands.
 
         A demand is booked if a commit of main names its operation id in a trailer. A squash merge
-        may lose this trailer, so a demand is also booked if it would change no file of main.
+        may lose this trailer, so a demand is also booked if it would change no file of main. A
+        person may also have edited the branch before. So a demand is booked too if it would change
+        only claims that people have added, and no other demand of the proposal has these claims.
 
         Args:
             state: the state of main.
             read: reads a file of main.
             on_main: the operation ids in the commits of main since ``searched_to``.
+            added: if a person has edited or deleted the branch, the claims that people have added
+                to main since ``searched_to``.
             head: the newest commit of the branch; empty if the branch does not exist.
             pull_request: the pull request, if it is known.
         """
         verdict = Verdict()
+        if any(ticket.goal != self.tickets[0].goal for ticket in self.tickets):
+            added = ()
         for ticket in self.tickets:
             decision: Decision | InvalidInput
             try:
                 decision = decide(state, ticket.goal, ticket.received, read)
             except InvalidInput as error:
                 decision = error
-            changes_main = isinstance(decision, InvalidInput) or decision.files
+            changes_main = isinstance(decision, InvalidInput) or (
+                decision.files and not _changes_only(added, decision)
+            )
             if ticket.operation in on_main or not changes_main:
                 verdict.booked.append((ticket, decision))
             elif ticket.state == "withdrawn" and ticket.proposal:
@@ -141,6 +151,12 @@ class Proposal:
     def requesters(self) -> set[str]:
         """Return the requesters of the proposal's demands."""
         return {name for request in self.requests for name in request.requesters()}
+
+
+def _changes_only(claims: Container[ClaimKey], decision: Decision) -> bool:
+    """Return whether a decision changes claims, and all that it changes are among ``claims``."""
+    changes = decision.changes.claims
+    return bool(changes) and all(change.key in claims for change in changes)
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pygit2 import Commit
+from pygit2 import Commit, Tree
 
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.demand.claim import OVERRIDE_PREFIX
@@ -56,6 +56,8 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
+            continue
+        if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
         if root != claim_file.LEDGER_ROOT:
             yield path

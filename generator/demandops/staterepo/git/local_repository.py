@@ -21,6 +21,8 @@ from demandops.staterepo.git.repository import (
     StateRepository,
     Unavailable,
     disk_error,
+    missing_main,
+    unopened,
 )
 
 _STALE_LOCK_S = 5.0
@@ -42,8 +44,8 @@ class LocalRepository(StateRepository):
         self._lock_seen: tuple[tuple[int, int], float] | None = None
         try:
             self.objects = Repository(str(path))
-        except pygit2.GitError:
-            raise StateRepoError(
+        except pygit2.GitError as error:
+            raise unopened(path, error) or StateRepoError(
                 f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
             ) from None
         self.new = NewObjects(self.objects)
@@ -86,10 +88,11 @@ class LocalRepository(StateRepository):
                 f"with `git -C {path} repack -a -d`, then remove {borrowed}"
             )
         self.new.clean()
-        if MAIN not in self.objects.references:
+        self.tip()
+        if self.objects.is_shallow or _is_partial(self.objects):
             raise StateRepoError(
-                f"{path} has no branch '{MAIN_BRANCH}'; make a state repo with "
-                "`demandops init DIR --bare`"
+                f"{path} is a clone that lacks a part of the history or of the files; clone the "
+                "state repo again, without --depth and --filter"
             )
         if self.objects.branches.local[MAIN_BRANCH].is_checked_out():
             raise StateRepoError(
@@ -100,6 +103,19 @@ class LocalRepository(StateRepository):
             raise self._unreadable(f"its commit {self.tip()} is missing")
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
+    def tip(self) -> Oid:
+        """Return the newest commit; raise StateRepoError if there is no branch of its own."""
+        found = self.objects.references.get(self.main_reference)
+        if found is None:
+            raise missing_main(self.address)
+        if not isinstance(found.target, Oid):
+            raise StateRepoError(
+                f"the branch '{MAIN_BRANCH}' of {self.address} is only another name of "
+                f"{found.target}; make it a branch: git -C {self.address} update-ref --no-deref "
+                f"{MAIN} {found.target}"
+            )
+        return found.target
+
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Return the tip, which is always current; there is nothing to fetch."""
         return self.tip()
@@ -109,9 +125,9 @@ class LocalRepository(StateRepository):
 
         Return False if main is no longer at ``expected``, or if another writer locks main.
         """
-        reference = self.objects.references[MAIN]
-        if reference.target != expected:
+        if self.tip() != expected:
             return False
+        reference = self.objects.references[MAIN]
         try:
             with self.new.packed(commit):
                 reference.set_target(commit, "demandops")
@@ -169,3 +185,8 @@ class LocalRepository(StateRepository):
                     f"{self.address} cannot be written: {lock} cannot be removed "
                     f"({error.strerror}); remove it"
                 ) from None
+
+
+def _is_partial(repo: Repository) -> bool:
+    """Return whether a repository is a clone that was made with ``--filter``."""
+    return any(entry.name.endswith((".promisor", ".partialclonefilter")) for entry in repo.config)

@@ -30,6 +30,7 @@ from demandops.staterepo.git.repository import (
     RemoteAway,
     StateRepository,
     Unavailable,
+    missing_main,
 )
 from demandops.staterepo.git.slow_git import SlowGit
 
@@ -83,6 +84,8 @@ _REMEDIES = (
     ),
 )
 """Pairs: a pattern that matches git's reason, and the remedy for a person."""
+_AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
+"""Matches git's error if the remote also has a reference like ``refs/heads/refs/heads/main``."""
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to"}
 _CLONE_TIMEOUT_S = 3600
@@ -192,7 +195,7 @@ class RemoteRepository(StateRepository):
         self._folder.parent.mkdir(parents=True, exist_ok=True)
         partial = self._folder.with_name(self._folder.name + ".partial")
         shutil.rmtree(partial, ignore_errors=True)
-        with git.Repo.init(partial, bare=True) as repo:
+        with git.Repo.init(partial, bare=True, object_format="sha1") as repo:
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
                 config.set_value("gc", "auto", 0)
@@ -277,11 +280,30 @@ class RemoteRepository(StateRepository):
             options: options for the server (``git push --push-option``).
         """
         push_options = [f"--push-option={option}" for option in options]
-        expects = f"--force-with-lease={lease}"
-        out, err = self._run_git(
-            self._git, "push", "--porcelain", *push_options, expects, "origin", spec
-        )
+        command = ("push", "--porcelain", *push_options, f"--force-with-lease={lease}", "origin")
+        try:
+            out, err = self._run_git(self._git, *command, spec)
+        except git.GitCommandError as error:
+            commit, _, reference = spec.partition(":")
+            if not commit or not _AMBIGUOUS.search(str(error.stderr)):
+                raise
+            out, err = self._push_literally(command, Oid(hex=commit), reference)
         return f"{out}\n{err}"
+
+    def _push_literally(
+        self, command: Sequence[str], commit: Oid, reference: str
+    ) -> tuple[str, str]:
+        """Push a branch although another reference of the remote ends with the branch's name.
+
+        Git takes the name of a branch literally only if it comes from a pattern, and a pattern
+        needs a reference here.
+        """
+        pushed = f"refs/pushed/{reference}"
+        self.objects.references.create(pushed, commit, force=True)
+        try:
+            return self._run_git(self._git, *command, f"{pushed}*:{reference}*")
+        finally:
+            self.objects.references.delete(pushed)
 
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return the error to raise for a failed push.
@@ -319,10 +341,7 @@ class RemoteRepository(StateRepository):
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
         if "couldn't find remote ref" in text:
-            raise StateRepoError(
-                f"{self.address} has no branch '{MAIN_BRANCH}'; push one made by "
-                "`demandops init DIR`"
-            )
+            raise missing_main(self.address)
         if _NO_ROOM.search(text):
             raise self._disk_full()
         if _NO_CLONE.search(text):

@@ -11,6 +11,7 @@ import os
 import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from pathlib import Path
 
 import pygit2
 from pygit2 import Oid, Repository, Tree
@@ -83,6 +84,24 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
     if number in _BROKEN:
         return Unsound(f"{address} cannot be written: {what}; check its disk, then start again")
     return None
+
+
+def missing_main(address: str) -> StateRepoError:
+    """Return the error to raise if a state repo has no main branch."""
+    return StateRepoError(
+        f"{address} has no branch '{MAIN_BRANCH}'; if it was renamed or deleted, restore it; if "
+        "there is no state repo yet, push one made by `demandops init DIR`"
+    )
+
+
+def unopened(folder: Path, error: Exception) -> StateRepoError | None:
+    """Return the error to raise if Git cannot open a folder; None if it is no Git repository."""
+    if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
+        return None
+    return StateRepoError(
+        f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to another "
+        f"user, run `git config --global --add safe.directory {folder.resolve()}`"
+    )
 
 
 def access_error(error: Exception, address: str) -> Exception:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
@@ -95,8 +96,10 @@ def last_valid_claims(
         before = trees.parent_tree(commit)
         changed = [path for path in left if trees.differ(before, commit.tree, (path,))]
         if before is not None and changed and commit_log.is_by_generator(repo, commit):
-            claims |= {path: claim_at(commit.tree, path) for path in changed}
-            left.difference_update(changed)
+            for path in changed:
+                with suppress(InvalidInput):  # only a forged commit has an invalid claim
+                    claims[path] = claim_at(commit.tree, path)
+                    left.remove(path)
     return claims
 
 
@@ -134,6 +137,26 @@ def claims_by_people(
     booked = last_valid_claims(repo, last_valid_commit, to, written)
     changes = (ClaimChange(booked[path], claim) for path, claim in written.items())
     return [change for change in changes if change.before != change.after]
+
+
+def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
+    """Return the keys of the claims at ``to`` that people have added since a commit.
+
+    Merges, and commits that keep the trailers of a proposal, are left out. Return an empty set if
+    the repository lacks the commit ``since``.
+    """
+    if not since or since not in repo:
+        return set()
+    before, after = trees.commit_of(repo, since).tree, trees.commit_of(repo, to).tree
+    paths = {
+        path
+        for commit in commit_log.person_commits(repo, to, since)
+        if len(commit.parents) == 1
+        and commit_log.PROPOSAL not in commit_log.entry_of(commit).trailers
+        for path in changed_files(commit.parents[0].tree, commit.tree)
+    }
+    claims = (valid_claim_at(after, path) for path in paths if not trees.entry(before, path))
+    return {claim.key for claim in claims if claim}
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:

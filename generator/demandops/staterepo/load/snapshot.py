@@ -55,6 +55,8 @@ class Snapshot:
     problems: tuple[Fault, ...] = ()
     quarantined_files: tuple[str, ...] = ()
     other_config_source: ConfigSource | None = None
+    is_rendered: bool = True
+    """Whether a generator has written the files of this state; if not, all must be rendered."""
 
     @property
     def config_source(self) -> ConfigSource:
@@ -144,7 +146,9 @@ def advance(
         known = _last_valid_config(repo, before, to)
     config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
-    config_changed = world_changed or _must_render_all(repo, before.commit, to)
+    config_changed = (
+        world_changed or not before.is_rendered or _must_render_all(repo, before.commit, to)
+    )
     shutdowns, waits = _shutdowns(old, new, state.ledger), state.ledger.waiting
     if trees.differ(old, new, (waiting.WAITING_ROOT,)):
         waits = waiting.read_all(trees.texts(new, (waiting.WAITING_ROOT,)))
@@ -292,14 +296,15 @@ class ReadAhead:
         known = self._known
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)
-        if known.snapshot.commit != tip or known.snapshot.problems:
-            more, start = advance(repo, known.snapshot, tip), known.snapshot.commit
+        start = known.snapshot
+        if start.commit != tip or start.problems or not start.is_rendered:
+            more = advance(repo, start, tip)
             known = Advance(
                 more.snapshot,
                 tuple(dict.fromkeys((*known.subjects, *more.subjects))),
                 known.config_changed
                 or more.config_changed
-                or (start != before.commit and _must_render_all(repo, before.commit, tip)),
+                or (start.commit != before.commit and _must_render_all(repo, before.commit, tip)),
             )
         self._known, self._start = known, before.commit
         return known

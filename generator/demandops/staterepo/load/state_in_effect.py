@@ -16,7 +16,9 @@ old configuration stays in effect.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain, takewhile
 from urllib.parse import quote, unquote
 
 from pygit2 import Blob, GitError, Oid, Repository, Tree
@@ -100,21 +102,26 @@ def start_at(
 ) -> Snapshot:
     """Return the newest recorded state up to a commit, else the state of the newest valid commit.
 
+    A valid commit that a generator has followed is preferred to a newer one.
+
     Raises InvalidInput or StateRepoError if there never was a valid state.
     """
     record = record_at(repo, commit)
     tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
     if record.first("In-Force"):
-        try:
+        # the record may be forged, or name commits that people have removed from the history
+        with suppress(InvalidInput, StateRepoError):
             return recorded_state(repo, record, progress)
-        except (InvalidInput, StateRepoError) as error:  # the record is not from a generator
-            faults.append(error)
-    for ancestor in commit_log.first_parents(repo, record.commit):
+    newer = list(
+        takewhile(lambda one: str(one.id) != record.commit, commit_log.first_parents(repo, commit))
+    )
+    for ancestor in chain(commit_log.first_parents(repo, record.commit), newer):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in snapshots.ROOTS)
         if content not in tried:
             tried.add(content)
             try:
-                return snapshots.load(repo, ancestor.id, progress)
+                found = snapshots.load(repo, ancestor.id, progress)
+                return replace(found, is_rendered=ancestor not in newer)
             except (InvalidInput, StateRepoError) as error:
                 faults.append(error)
     raise faults[0]

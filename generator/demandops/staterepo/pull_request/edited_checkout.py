@@ -19,6 +19,7 @@ from demandops.plan.release_keys import ReleaseKey
 from demandops.render.changes import merge_preview
 from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
+from demandops.staterepo.git.repository import unopened
 from demandops.staterepo.load import state_in_effect
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
@@ -95,14 +96,22 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         revision: the merge target, by default ``origin/main``, else ``main``.
 
     Raises:
-        StateRepoError: there is no such commit, or it has no ancestor in common with HEAD.
+        StateRepoError: there is no such commit, or it has no ancestor in common with HEAD, or Git
+            cannot open the checkout, or the checkout lacks files.
     """
     try:
         repo = Repository(str(folder))
-    except pygit2.GitError:
+    except pygit2.GitError as error:
+        if reason := unopened(folder, error):
+            raise reason from None
         if revision is not None:
             raise StateRepoError(f"{folder} is not a Git checkout; leave out --base") from None
         return None
+    if "core.sparsecheckout" in repo.config and repo.config.get_bool("core.sparsecheckout"):
+        raise StateRepoError(
+            f"{folder} is a sparse checkout, which lacks files; check out all files with "
+            "`git sparse-checkout disable`"
+        )
     if repo.is_empty or repo.head_is_unborn:
         return None
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")

@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from pygit2 import Commit, Oid, Tree
+from pygit2 import Blob, Commit, Oid, Tree
+from pygit2.enums import FileMode
 
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.render.changes.changeset import FileReader
@@ -100,7 +101,8 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
     """Merge a proposal into main, and return the merge commit.
 
     Raises:
-        StateRepoError: main has other changes to the same files, or cannot be written.
+        StateRepoError: main has other changes to the same files, or cannot be written, or the
+            proposal has a file that is not plain text.
     """
     objects = repository.objects
     head = trees.commit_of(objects, proposal.commit)
@@ -118,6 +120,11 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
             raise StateRepoError(
                 f"{MAIN_BRANCH} and {proposal.branch} change the same files; wait until "
                 "a running generator has made the branch anew, then try again"
+            )
+        odd = next((path for path in proposed if not _is_plain(head.tree, path)), None)
+        if odd is not None:
+            raise StateRepoError(
+                f"{odd} in {proposal.branch} is not a plain text file; merge the branch with git"
             )
         read = _reader(head.tree)
         return {path: read(path) for path in proposed}, [tip.id, head.id]
@@ -163,6 +170,14 @@ def _faults(tree: Tree) -> set[Fault]:
     except InvalidInput as error:
         return {*error.faults}
     return set()
+
+
+def _is_plain(tree: Tree, path: str) -> bool:
+    """Return whether a path has nothing, or a file of text that is not executable."""
+    found = trees.entry(tree, path)
+    if not isinstance(found, Blob):
+        return found is None
+    return found.filemode == FileMode.BLOB and trees.text_of(found).encode() == found.data
 
 
 def _reader(tree: Tree) -> FileReader:

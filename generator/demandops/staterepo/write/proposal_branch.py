@@ -23,7 +23,7 @@ from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.remote_repository import RemoteRepository
-from demandops.staterepo.git.repository import MAIN, StateRepository
+from demandops.staterepo.git.repository import MAIN, PushDenied, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
 
@@ -74,11 +74,12 @@ class ProposalBranches:
         if self._remote is None:
             repo = Repository(self._repository.objects.path)
             names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
-            found = {name: str(repo.references[name].target) for name in [MAIN, *names]}
+            named = ((name, repo.references.get(name)) for name in [MAIN, *names])
+            found = {name: str(one.target) for name, one in named if one is not None}
         else:
             found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
-        named = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
-        return BranchHeads(named.pop(MAIN_BRANCH, ""), named)
+        heads = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
+        return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
         """Return whether ``branch`` exists, or raise RemoteAway.
@@ -123,7 +124,10 @@ class ProposalBranches:
         """Move or delete a branch; return the link that the server printed, or an empty text."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
-            self._set_reference(reference, commit, expected)
+            try:
+                self._set_reference(reference, commit, expected)
+            except (GitError, OSError) as error:
+                raise self._why_denied(branch) or error from None
             return ""
         try:
             spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
@@ -136,7 +140,18 @@ class ProposalBranches:
                 return ""  # the push succeeded, but the answer was lost
             if now != expected:
                 raise BranchMoved(branch) from None
-            raise self._remote.push_error(error) from None
+            raise self._why_denied(branch) or self._remote.push_error(error) from None
+
+    def _why_denied(self, branch: str) -> PushDenied | None:
+        """Return an error if a branch is called like a folder of ``branch``, else None."""
+        folders = (branch[:end] for end, letter in enumerate(branch) if letter == "/")
+        taken = next(filter(self.exists, folders), "")
+        if not taken:
+            return None
+        return PushDenied(
+            f"{self._repository.address} cannot have the branch {branch}, because it has a branch "
+            f"{taken}; delete or rename {taken}, then try again"
+        )
 
     def _set_reference(self, reference: str, commit: Oid | None, expected: str) -> None:
         references = self._repository.objects.references
@@ -194,7 +209,8 @@ def _link(output: str) -> str:
 class PendingProposal:
     """A proposal that awaits approval, with data from the messages of its commits.
 
-    ``commit`` is the newest commit. ``since`` is the time when the first demand was received.
+    ``commit`` is the newest commit of the branch, perhaps by a person. ``since`` is the time when
+    the first demand was received.
     """
 
     branch: str
@@ -215,7 +231,8 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     main = repository.tip()
     for name in sorted(name for name in repo.references if name.startswith(space)):
         try:
-            found = list(commit_log.commits(repo, repo.references[name].resolve().target, main))
+            head = repo.references[name].resolve().target
+            found = list(commit_log.commits(repo, head, main))
         except (KeyError, ValueError, TypeError, GitError, StateRepoError):
             _warn_of_unreadable(name)
             continue
@@ -225,7 +242,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
         entries = [entry for _, entry in proposed]
         yield PendingProposal(
             branch=f"{PREFIX}{name.removeprefix(space)}",
-            commit=entries[0].commit,
+            commit=str(head),
             summary=entries[0].summary,
             since=entries[-1].authored or entries[-1].time,
             requesters=_all_of(entries, "Requester"),
