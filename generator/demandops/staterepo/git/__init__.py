@@ -8,9 +8,18 @@ os.environ["GIT_NO_REPLACE_OBJECTS"] = "1"
 
 # A hook, or a command that git runs, has these variables. They would make git work on the
 # repository of the hook instead of the state repo.
-for _name in (
-    *("GIT_DIR", "GIT_COMMON_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_NAMESPACE"),
-    *("GIT_OBJECT_DIRECTORY", "GIT_ALTERNATE_OBJECT_DIRECTORIES", "GIT_QUARANTINE_PATH"),
-    *("GIT_SHALLOW_FILE", "GIT_GRAFT_FILE", "GIT_PREFIX"),
-):
+_OF_A_HOOK = (
+    "GIT_ALTERNATE_OBJECT_DIRECTORIES",
+    "GIT_COMMON_DIR",
+    "GIT_DIR",
+    "GIT_GRAFT_FILE",
+    "GIT_INDEX_FILE",
+    "GIT_NAMESPACE",
+    "GIT_OBJECT_DIRECTORY",
+    "GIT_PREFIX",
+    "GIT_QUARANTINE_PATH",
+    "GIT_SHALLOW_FILE",
+    "GIT_WORK_TREE",
+)
+for _name in _OF_A_HOOK:
     os.environ.pop(_name, None)
