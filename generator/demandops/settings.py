@@ -1,7 +1,7 @@
 """Constants of the program, and the locations of the program's own files.
 
-Files of a state repo name the versions below. A generator refuses a file with a newer version of
-the format, and a state repo with another render version.
+The versions below are written in the files of a state repo. A generator refuses a file with a newer
+version of the format, and a state repo with another render version.
 """
 
 from __future__ import annotations

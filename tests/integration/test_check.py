@@ -260,8 +260,9 @@ def test_a_first_bootstrap_is_told_and_not_printed(checkout: Path, check: Check)
     code, out, errors = check()
     assert code == 0
     assert (
-        "warning: bootstrap/c9.yaml: is new with the merge, but no controller applies it" in errors
-    )
+        "warning: bootstrap/c9.yaml: is new with the merge, but no controller applies bootstrap "
+        "files; "
+    ) in errors
     assert "  write  bootstrap/c9.yaml (new, " in out
     assert "kind: Namespace" not in out
 
@@ -279,7 +280,7 @@ def test_a_merge_that_changes_what_someone_applied_says_so(checkout: Path, check
         "bootstrap/c-its.yaml",
     ]
     assert errors.splitlines()[-1] == (
-        "warning: bootstrap/c-its.yaml: changes with the merge, but no controller applies it; "
-        "after the merge, an administrator of cluster 'c-its' must apply it: "
+        "warning: bootstrap/c-its.yaml: changes with the merge, but no controller applies "
+        "bootstrap files; after the merge, an administrator of cluster 'c-its' must run: "
         "git show main:bootstrap/c-its.yaml | kubectl apply -f -"
     )

@@ -163,14 +163,14 @@ def test_a_broker_and_a_topic_that_only_the_cluster_knows_are_told(migration: Mi
     assert told == [
         "warning: mqtt-connection-vehicle02-edge: its broker service-mqtt-broker-edge:1993 is not "
         "in inventory/brokers.yaml; add the broker there, or leave the field empty, so that the "
-        "program chooses one",
+        "generator chooses one",
         "warning: mqtt-connection-vehicle02-edge: earlier requests also listed "
         "/vehicles/vehicle02/ego_data; the connection's clients may still carry these topics, so "
         "add the needed ones to the map",
     ]
 
 
-NO_VERSION = "is not a number; the keys of requests are the versions of the resource"
+NO_VERSION = "is not a number; name each request by a version of the resource, like 3"
 UNKNOWN = (
     "is no file of the reference; give the bookkeeping and versioning files of the reference's "
     "operators, and its custom resources as `kubectl get -o yaml` prints them"

@@ -101,7 +101,8 @@ def test_edited_values_image_and_replicas_become_an_override_to_paste(
         "# yaml-language-server: $schema=../schemas/override.json\n"
         "apiVersion: demandops/v1\n"
         "kind: Override\n"
-        'reason: "Say here why; this replaces a manual edit of a generated file"\n'
+        'reason: "Say here why you need this override; it replaces a manual edit of a generated '
+        'file"\n'
         'owner: "Petra Platform"\n'
         "select:\n"
         "- applications:\n"
@@ -200,14 +201,14 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     assert code == 1
     stopped = "; to stop the release, merge overrides/{} as shown, or delete its claims in ledger/"
     assert errors.splitlines() == [
-        "error: .demandops/report.yaml: is written by the generator, which undoes the edit; "
-        "revert it",
+        "error: .demandops/report.yaml: is written by the generator, which would undo the edit; "
+        "revert the edit",
         f"error: {EDGE}/extra.yaml: is in a generated folder, from which the generator removes "
         "what no demand needs; delete it, and demand what you need with `demandops request`",
         f"error: {DETECTION}: {LOST}{stopped.format('od-edge-station00.yaml')}",
         f"error: {CLIENT}: {LOST}{stopped.format(Path(CLIENT).name)}",
-        "error: ledger/notes.yaml: is not the path of a claim, so the generator removes the file; "
-        "delete it",
+        "error: ledger/notes.yaml: is not the path of a claim, so the generator would remove the "
+        "file; do not add it",
     ]
     assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out
     assert out.count("deny: true") == 2

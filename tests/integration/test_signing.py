@@ -306,7 +306,7 @@ class TestVerify:
         rows = {row["commit"]: row for row in self.rows(demandops, state, first, 1)}
         assert rows[good]["holds"]
         assert rows[unsigned]["signature"] == (
-            "is not signed, but policy/allowed-signers requires it"
+            "is not signed, but policy/allowed-signers requires a signature"
         )
         assert rows[state.tip]["signature"] == (
             "is signed, but not by a key that policy/allowed-signers lists"
@@ -322,7 +322,7 @@ class TestVerify:
         state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged, FORGER)
         (row,) = self.rows(demandops, state, since, 1)
         assert row["touched"] == [SIGNERS]
-        assert row["signature"] == "is not signed, but policy/allowed-signers requires it"
+        assert row["signature"] == "is not signed, but policy/allowed-signers requires a signature"
 
     def test_a_signature_of_another_commit(
         self, demandops: Run, book: Run, state: Any, key: Path

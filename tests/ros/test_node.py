@@ -273,7 +273,8 @@ def test_bookkeeping_is_answered_over_ros(shared: Served, caller: Client) -> Non
     assert not unknown.ok
     assert unknown.message == (
         "'nonsense' is neither a commit of the state repo nor a time; `demandops log` lists the "
-        "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
+        "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h "
+        "(two hours ago)"
     )
 
 

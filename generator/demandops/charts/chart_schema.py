@@ -23,8 +23,9 @@ def composed(
 
     Args:
         title: the schema's title.
-        own: by name, the chart's properties that the library lacks or defines differently.
-        values: the text of the chart's ``values.yaml``, which describes its values.
+        own: name → property, for the chart's properties that the library lacks or defines
+            differently.
+        values: the text of the chart's ``values.yaml``, with the descriptions of the values.
         library: the schema of the library.
         shared: the text of the library's ``values.yaml``.
     """

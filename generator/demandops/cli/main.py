@@ -24,10 +24,7 @@ COMMANDS = {
     "approve": ("actions", "Approve a proposed demand: merge its branch in your own name."),
     "bookkeeping": ("views", "Show who requests which service and connection."),
     "check": ("repo", "Check edits of a state repo and show their consequences."),
-    "completion": (
-        "repo",
-        "Print the code that makes a shell complete commands.",
-    ),
+    "completion": ("repo", "Print the completion script for a shell."),
     "config": ("repo", "List, set and choose contexts: the fleets that you work with."),
     "decommission": ("actions", "Release all claims of a node or a requester."),
     "demand": ("demandops_ros", "Send a demand to a running node."),

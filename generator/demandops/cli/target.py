@@ -1,10 +1,15 @@
 """Which state repo a command works on, and with which access: options, environment, contexts.
 
-The first of these that is given decides: ``--state-repo``, ``--context``, the environment variable,
-the checkout around the current folder, the current context. If the variable names a relative folder
-that does not exist, a command in a checkout ignores the variable, and any other command fails. In a
-checkout, a command that writes uses the checkout's remote. The default signing key and clusters
-come from the same context as the state repo.
+The first of these that is given decides:
+
+1. ``--state-repo``
+2. ``--context``
+3. the environment variable. If it names a relative folder that does not exist, it is ignored inside
+   a checkout, and is an error outside.
+4. the checkout around the current folder. A command that writes uses the checkout's remote.
+5. the current context
+
+The default signing key and clusters come from the same context as the state repo.
 """
 
 from __future__ import annotations

@@ -54,9 +54,9 @@ def remaining_joins(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[
 def _rewritten(name: str) -> Fault:
     message = (
         "has requests, but no bookkeeping. The requests alone do not tell who holds the "
-        "connection, because the operator adds later requesters to the first request. Give "
-        "mqtt_bookkeeping.yml too. If this file is lost, write one that lists each requester as "
-        f"often as it joined: {name}: [vehicle00]"
+        "connection, because the reference's operator adds each later requester to the first "
+        "request. Give mqtt_bookkeeping.yml too. If this file is lost, write one that lists each "
+        f"requester as often as it joined, such as '{name}: [vehicle00]'"
     )
     return fault(name, message)
 
@@ -68,8 +68,8 @@ def _last_request_only(name: str, shutdown: bool) -> str:
             "files do not say who still holds it"
         )
     return (
-        f"{name}: the bookkeeping files do not say who holds it, so each requester of its last "
-        "request is imported once, and nobody else"
+        f"{name}: the bookkeeping files do not say who holds it, so only the requesters that its "
+        "last request lists are imported, each with one hold"
     )
 
 

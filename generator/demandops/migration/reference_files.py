@@ -32,9 +32,9 @@ _BOOKS = {
     "object_detection_bookkeeping": DETECTION,
     "object_fusion_bookkeeping": FUSION,
 }
-"""Name of a bookkeeping file → prefix of its resources, for a file that contains only ``{}``.
+"""Name of a bookkeeping file → prefix of its resources' names.
 
-Such a file says that nobody holds any of these resources.
+If the file contains only ``{}``, nobody holds a resource whose name has this prefix.
 """
 
 _NUMBER = re.compile(r"[0-9]{1,20}")
@@ -75,8 +75,8 @@ class _RosTopic(_Part):
 class _Ros2Mqtt(_Part):
     """The bridge at the source of a connection.
 
-    ``ros_topics`` lists the topics of the last request. Besides, there is an extra field for each
-    topic that the last or an earlier request listed.
+    ``ros_topics`` lists the topics of the last request. Each topic that any request so far listed
+    has an extra field.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -87,8 +87,8 @@ class _Ros2Mqtt(_Part):
 class _Mqtt2Ros(_Part):
     """The bridge at the target of a connection.
 
-    ``mqtt_topics`` lists the topics of the last request. Besides, there is an extra field for each
-    topic that the last or an earlier request listed.
+    ``mqtt_topics`` lists the topics of the last request. Each topic that any request so far listed
+    has an extra field.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -273,7 +273,7 @@ def _read_entry(found: ReferenceFiles, file: str, name: str, value: object) -> N
         entries = {}
         for version, request in value.items():
             if not _NUMBER.fullmatch(version):
-                message = "is not a number; the keys of requests are the versions of the resource"
+                message = "is not a number; name each request by a version of the resource, like 3"
                 raise InvalidInput([fault(f"{name}.{version}", message).within(file)])
             entries[int(version)] = parse(Request, request, f"{file}: {name}: {version}")
         _add(found.versions, name, dict(sorted(entries.items())), file)

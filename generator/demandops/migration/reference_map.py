@@ -59,7 +59,7 @@ class MappedTopic(CamelModel):
 
 
 class MappedConnection(CamelModel):
-    """An MQTT connection. If ``broker`` is empty, the program chooses a broker."""
+    """An MQTT connection. If ``broker`` is empty, the generator chooses a broker."""
 
     id: _Filled
     source: _Filled
@@ -198,6 +198,6 @@ class _Inventory:
                 return broker.node
         self.warnings.append(
             f"{name}: its broker {spec.host}:{spec.port} is not in {self._broker_files}; add the "
-            "broker there, or leave the field empty, so that the program chooses one"
+            "broker there, or leave the field empty, so that the generator chooses one"
         )
         return ""

@@ -31,9 +31,9 @@ class Join:
 def remaining(book: Counter[Hold], requests: Mapping[int, Request]) -> list[Join]:
     """Return the joins whose holds add up to ``book``, oldest first.
 
-    First, the requests are undone, from the newest back to the request that created the resource.
-    Then only the holds of the creating request are left. After that, the undone requests are
-    applied again, the oldest first, and each join stays separate.
+    ``book`` does not tell which requesters joined together, so the newest requests are undone until
+    only the holds of the request that created the resource are left. The undone requests are then
+    applied again, oldest first, and each join is kept separate.
 
     Args:
         book: the bookkeeping: how many times each hold counts.

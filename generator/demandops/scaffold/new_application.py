@@ -101,9 +101,10 @@ def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> 
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with a map from its input names to what these inputs read.
+    """Yield each service with a map from the name of each of its inputs to the input's source.
 
-    An input reads an input of the application, or an output of the service before.
+    The first service reads the application's inputs. Every other service reads the output of the
+    previous service.
     """
     inputs = {role: role for role in plan.inputs}
     for service in plan.services:
@@ -116,7 +117,7 @@ def _role(name: str) -> str:
 
 
 def _prefixes(plan: ApplicationPlan, config: Config) -> dict[str, str]:
-    """Return for each service a prefix of release names that nothing else uses."""
+    """Return an unused prefix of release names for each service."""
     taken = {kind.word for kind in CONNECTION_TYPES}
     taken |= {one.prefix for found in config.services.values() for one in found.values()}
     taken |= {one.prefix for one in config.definitions.values()}
@@ -285,10 +286,11 @@ change the launch file and the template.
 
 
 def _requester(plan: ApplicationPlan, config: Config) -> str:
-    """Return the requester of the example demand, whom the rules of the node's access domain allow.
+    """Return a requester for the example demand.
 
-    If no rule allows the example, the requester is one that the first rule names. Then a person
-    must extend the rules (:func:`closed_domain`).
+    If possible, the rules of the node's access domain allow the requester the demand. If no rule
+    allows the demand, the first rule names the requester, and a person must extend the rules
+    (:func:`closed_domain`).
     """
     domain = config.domain_of.get(plan.node)
     rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())

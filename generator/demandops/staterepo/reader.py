@@ -150,7 +150,7 @@ class Reader:
     def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
         """Return the problems that the generator reports at a snapshot's commit.
 
-        If it reports none, return the problems that were found when the snapshot was loaded.
+        If the commit has no report, return the problems that were found while loading the snapshot.
         """
         return self.problems(str(snapshot.commit)) or snapshot.problems
 
@@ -244,11 +244,14 @@ class Reader:
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release's file, even if the release was stopped; else None."""
+        """Return the path of a release's file; None if there never was such a release.
+
+        If the release was stopped, return its last path.
+        """
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
-        """Return the names of all releases that were stopped up to a commit."""
+        """Return the names of all releases that a commit up to ``revision`` stopped."""
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:

@@ -45,7 +45,7 @@ _FIRST_WITH_MARKS = 2
 """The first render version whose claims mark the further topics of a source."""
 
 _FOLDER_DEPTH = 3
-"""The commit's message counts files per folder ``clusters/<cluster>/<access domain>``."""
+"""How many parts the path ``clusters/<cluster>/<access domain>`` has."""
 
 
 @dataclass(frozen=True, slots=True)

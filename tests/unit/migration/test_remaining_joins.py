@@ -139,9 +139,9 @@ def test_the_versioning_of_a_connection_is_not() -> None:
         imported_goals.remaining_joins(files)
     assert str(refused.value) == (
         f"{CONNECTION}: has requests, but no bookkeeping. The requests alone do not tell who holds "
-        "the connection, because the operator adds later requesters to the first request. Give "
-        "mqtt_bookkeeping.yml too. If this file is lost, write one that lists each requester as "
-        f"often as it joined: {CONNECTION}: [vehicle00]"
+        "the connection, because the reference's operator adds each later requester to the first "
+        "request. Give mqtt_bookkeeping.yml too. If this file is lost, write one that lists each "
+        f"requester as often as it joined, such as '{CONNECTION}: [vehicle00]'"
     )
 
 
@@ -163,8 +163,8 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         "bookkeeping files do not say who still holds it"
     )
     assert warnings[1] == (
-        "mqtt-connection-vehicle01-edge: the bookkeeping files do not say who holds it, so each "
-        "requester of its last request is imported once, and nobody else"
+        "mqtt-connection-vehicle01-edge: the bookkeeping files do not say who holds it, so only "
+        "the requesters that its last request lists are imported, each with one hold"
     )
     assert warnings[-1] == (
         "od-edge-station00: is not imported, because no application holds its object list"

@@ -111,5 +111,6 @@ def test_neither_revision_nor_time(repo: pygit2.Repository) -> None:
         resolved(repo, "domain")
     assert str(told.value) == (
         "'domain' is neither a commit of the state repo nor a time; `demandops log` lists the "
-        "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
+        "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h "
+        "(two hours ago)"
     )

@@ -101,8 +101,8 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 
     The command commits the override to main in your own name, as git knows it. With --propose, it
     commits to a branch instead. The options from --application to --requester select what the
-    override applies to. If you give several of them, all must match. If you repeat one, one of its
-    values must match (docs/overrides.md).
+    override applies to. Different options must all match; of a repeated option, one value must
+    match (docs/overrides.md).
 
     \b
     Examples:

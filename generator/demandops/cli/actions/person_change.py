@@ -256,7 +256,7 @@ def _outcome(made: Published | None) -> str:
 def _lines(edit: Edit, data: Json) -> Iterator[str]:
     if data["outcome"] == "committed":
         yield f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}"
-        yield "a running generator carries the commit out; if none runs, the next one to start does"
+        yield "a running generator carries out this commit, or else the next generator that starts"
         yield from hint_to_pull()
     elif data["outcome"] == "proposed":
         yield f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()

@@ -126,8 +126,8 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    The caller has computed the consequences on top of the commit ``base``. The result corrects
-    these consequences if the rollback is refused, changes nothing, or is decided on a newer commit.
+    The caller knows the consequences on top of the commit ``base``. The data has consequences only
+    if the rollback was refused, had no effect, or was decided on another commit than ``base``.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:

@@ -1,4 +1,4 @@
-"""``demandops completion``: code with which a shell completes commands, options and names."""
+"""``demandops completion``: a script with which a shell completes commands, options and names."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ VARIABLE = "_DEMANDOPS_COMPLETE"
 @click.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]), metavar="bash|zsh|fish")
 def completion(shell: str) -> None:
-    """Print the code that makes a shell complete commands.
+    """Print the completion script for a shell.
 
-    The code completes commands, options, and the names of demands, nodes, releases, applications,
+    The script completes commands, options, and the names of demands, nodes, releases, applications,
     requesters, proposals and overrides. The names come from the state repo on which the completed
-    command would work. If this state repo is behind a URL, the code fetches nothing, but reads the
-    commit that was fetched last.
+    command would work. If this state repo is behind a URL, the script fetches nothing, but reads
+    the commit that was fetched last.
 
     \b
     Examples:

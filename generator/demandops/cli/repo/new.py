@@ -176,9 +176,9 @@ def policy(
 ) -> None:
     """Write a new access domain: who may demand what on which nodes.
 
-    A node may match the patterns of only one access domain. A new state repo has one domain,
-    whose pattern "*" matches every node. So first edit the patterns in
-    policy/access-domains.yaml: none of them may match a node of the new domain.
+    No node may match the patterns of two access domains. A new state repo has one domain, whose
+    pattern "*" matches every node. So first edit the patterns in policy/access-domains.yaml: none
+    of them may match a node of the new domain.
 
     \b
     Examples:

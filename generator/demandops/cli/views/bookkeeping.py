@@ -118,6 +118,6 @@ _CAPACITY = (Column("Node"), Column("Resource"), Column("Requested"), Column("Ca
 
 
 def _lines(topics: Mapping[str, list[str]], entry: ServiceEntry | ConnectionEntry) -> Iterator[str]:
-    """Yield each topic, with its requesters if they are only some of the entry's requesters."""
+    """Yield each topic, followed by its requesters if the entry has other requesters too."""
     for topic, who in topics.items():
         yield topic if who == entry.requesters else f"{topic} ({', '.join(who)})"

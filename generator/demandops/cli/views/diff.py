@@ -28,7 +28,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     """Show the differences between two commits.
 
     The command compares bookkeeping, releases and other files. A and B are commits, or times like
-    2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h.
+    2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
 
     \b
     Examples:

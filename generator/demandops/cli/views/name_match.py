@@ -169,9 +169,7 @@ def _demand_from(start: str, world: World) -> str | None:
         StateRepoError: if several demands have such an id.
     """
     found = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(start))
-    return (
-        _the_only_name(start, found, "demands have {} at the start of their id") if found else None
-    )
+    return _the_only_name(start, found, "demand ids begin with {}") if found else None
 
 
 def _the_only_name(

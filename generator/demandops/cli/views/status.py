@@ -78,11 +78,15 @@ def status(
 ) -> None:
     """Show the state of each release on its cluster.
 
-    The state is the commit that the cluster has applied, and the health of the release. The exit
-    code is 1 if a file is invalid, or if a generator has yet to write or remove a file. It is also
-    1 if a cluster with a kubeconfig in --clusters does not answer, or has an old bootstrap file, an
-    object that belongs to no release, or a release that is not healthy. The state of a cluster
-    without a kubeconfig is unknown, which is no fault.
+    The state is the commit that the cluster has applied, and the health of the release. The state
+    of a cluster without a kubeconfig in --clusters is unknown.
+
+    \b
+    The exit code is 1 if
+    - a file is invalid,
+    - a generator has yet to write or remove a file, or
+    - a cluster with a kubeconfig does not answer, or has an old bootstrap file,
+      an object that belongs to no release, or a release that is not healthy.
 
     \b
     Examples:
@@ -247,9 +251,9 @@ def _read(
     wanted: Mapping[str, Iterable[ObjectSelector]],
     patience_s: int,
 ) -> dict[str, ObjectCache]:
-    """Return a map from each cluster with a kubeconfig to a cache with its selected objects.
+    """Return, for each cluster that has a kubeconfig, a cache of the cluster's ``wanted`` objects.
 
-    Read all clusters at the same time, so that a slow cluster does not delay the others.
+    All clusters are read at the same time, so that a slow cluster does not delay the others.
     """
     stores = {
         name: ObjectCache(name, cluster, lambda: None)

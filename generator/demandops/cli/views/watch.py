@@ -25,10 +25,10 @@ from demandops.staterepo.reader import Reader
 
 _PAUSE_S = 2.0
 _COMMITS = 6
-_TITLES = 6
-"""The lines of the screen besides the three parts.
+_OTHER_LINES = 6
+"""How many lines are not for the three parts.
 
-Two are the title, three are the empty lines before the parts, and one stays free at the bottom.
+Two lines are the title, one before each part is empty, and one at the bottom stays free.
 """
 
 
@@ -87,7 +87,7 @@ def _screen(
     releases = sorted(status.rows, key=lambda row: (row["health"] == "healthy", row["name"]))
     commits = log_table(rows, now)
     last = _part("Latest commits", commits, width, height // 3)
-    room = height - _TITLES - len(last)
+    room = height - _OTHER_LINES - len(last)
     first = _part("Releases", releases_table(releases), width, room * 2 // 3)
     cells = [demands.cells(item, now)[: len(demands.columns)] for item in held]
     middle = _part("Demands", Table(demands.columns, cells), width, room - len(first))

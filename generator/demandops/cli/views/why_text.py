@@ -123,4 +123,4 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     if why and entry["why"]:
         yield f"    {entry['why']}"
     for each in entry["carries_out"]:
-        yield f"    carries out {each['commit'][:10]} by {each['author']}: {each['summary']}"
+        yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"

@@ -14,9 +14,9 @@ from demandops.staterepo.history.commit_log import entry_of
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Check the commits' signatures, and return the verdicts with the results of the check.
+    """Return the verdicts, each with the result of checking its commit's signature.
 
-    If a required signature is missing or not valid, ``holds`` becomes false.
+    If a required signature is missing or not valid, ``holds`` of the verdict is false.
     """
     found = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = allowed_signers.checks(

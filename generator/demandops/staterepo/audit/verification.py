@@ -67,9 +67,9 @@ class Verdict:
 
 
 class _Proof:
-    """The rendered files of a commit.
+    """The files that a commit should have, rendered again to compare with its committed files.
 
-    For a later commit, :meth:`advance` renders again only the releases that the commit affects.
+    For a later commit, :meth:`advance` renders only the releases that the commit affects.
     """
 
     def __init__(self, state: State, commit: Commit) -> None:

@@ -54,7 +54,8 @@ class Checkout(LocalRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         """Raise PushDenied, because the program only reads checkouts."""
         raise PushDenied(
-            f"{self.address} is a checkout, which commands only read; name its remote instead"
+            f"{self.address} is a checkout, and no command writes to a checkout; name the "
+            "checkout's remote instead"
         )
 
 

@@ -61,9 +61,9 @@ class LocalRepository(StateRepository):
         )
 
     def renew_if_damaged(self) -> bool:
-        """Check the repository with git; return False, or raise StateRepoError if it is damaged.
+        """Raise StateRepoError if git finds the repository damaged, or return False.
 
-        A repository on this disk has no remote from which it could be cloned again.
+        A repository on this disk is never renewed, because it has no remote to clone from.
         """
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],

@@ -48,9 +48,10 @@ Entries = dict[bytes, bytes]
 The name of a subfolder ends in a slash, so that sorting by name gives Git's order.
 """
 _REMEMBERED = 32
-"""How many folders to remember: the newest ones, because demands often change these again.
+"""How many folders to remember.
 
-A remembered folder never becomes outdated, because an id always means the same content.
+The newest folders are kept, because demands often change these again. A remembered folder never
+becomes outdated, because an id always means the same content.
 """
 
 
@@ -129,7 +130,7 @@ class NewObjects(pygit2.OdbBackend):
         If ``since`` is no commit of the repository, the pack has all objects of ``commit``.
 
         The repository has these objects, but they may not be durable, because an earlier sync may
-        have failed. While the block runs, git's housekeeping does not remove the pack.
+        have failed. While the ``with`` block runs, git's housekeeping does not remove the pack.
         """
         without = f"^{since}\n" if since and since in self.repo else ""
         with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n{without}")):
@@ -137,11 +138,11 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
-        """Build a pack, move the pack into place, move its index into place, then run the block.
+        """Build a pack, move the pack and then its index into place, and run the ``with`` block.
 
-        The pack comes first, because git removes an index without a pack. While the block runs, a
-        .keep file protects the pack. The .keep file begins like an index, so that :meth:`clean`
-        recognizes it.
+        The pack comes first, because git removes an index without a pack. While the ``with`` block
+        runs, a .keep file protects the pack. The .keep file begins like an index, so that
+        :meth:`clean` recognizes the .keep file.
         """
         packs = self._packs
         with _locked(packs, fcntl.LOCK_SH), _folder_until_done(self.repo.path) as folder:
@@ -217,7 +218,7 @@ class NewObjects(pygit2.OdbBackend):
         return iter(self._known)
 
     def exists_cb(self, oid: Oid) -> bool:
-        """Return whether this is a new object."""
+        """Return whether there is a new object with this id."""
         return oid in self._known
 
     def read_cb(self, oid: Oid) -> tuple[int, bytes]:

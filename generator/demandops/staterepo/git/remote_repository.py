@@ -96,10 +96,7 @@ _NO_CLONE = re.compile(
     r"detected dubious ownership in repository at '.*/clone\.git')",
     re.MULTILINE,
 )
-"""Matches git's error if git cannot read the clone in which it runs.
-
-If git finds no remote in the clone's configuration, git's error is about ``origin``.
-"""
+"""Matches git's errors about its own clone: unreadable, or without the remote ``origin``."""
 _NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
 """Matches git's error if git cannot read a file, here or on the server.
 
@@ -444,13 +441,13 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 def _reason(text: str) -> str:
     """Return the last line of git's error output that gives a reason."""
     text = text.replace("stderr: '", "")  # GitPython's prefix
-    lines = [_without_open_quote(line) for line in text.splitlines() if line.strip(" '\"")]
+    lines = [_without_last_quote(line) for line in text.splitlines() if line.strip(" '\"")]
     telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines
     fatal = [line for line in telling if line.startswith(("fatal:", "error:", "remote:", "!"))]
     return (fatal or telling or ["git gave no reason"])[-1].rstrip(".")
 
 
-def _without_open_quote(line: str) -> str:
+def _without_last_quote(line: str) -> str:
     """Return a line without the quotation mark that GitPython puts at the end of git's output."""
     line = line.strip(' "')
     return line.removesuffix("'") if line.count("'") % 2 else line

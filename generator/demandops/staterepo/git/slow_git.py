@@ -36,9 +36,6 @@ class SlowGit:
                 listener(f"{self._what}, {self._told} s")
 
     def ends(self) -> None:
-        """Report that git has ended.
-
-        If this run called the listener, call it again with an empty text, to clear its output.
-        """
+        """Call the listener with an empty text, if this run of git called the listener before."""
         for listener in _listeners if self._told else ():
             listener("")

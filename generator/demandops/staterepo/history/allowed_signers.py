@@ -34,7 +34,7 @@ class Check(NamedTuple):
 _good: dict[str, Check] = {}
 """Commit → result of the check, for each commit whose signature was found valid.
 
-A result stays true, because a commit, its signature and its parent never change.
+A result stays true, because neither a commit, its signature nor its parent's list of keys changes.
 """
 
 
@@ -90,7 +90,7 @@ def _fault(signature: str, state: str) -> str:
     ``state`` is the letter that git prints for the signature (``%G?``).
     """
     if not signature:
-        return f"is not signed, but {ALLOWED_SIGNERS} requires it"
+        return f"is not signed, but {ALLOWED_SIGNERS} requires a signature"
     if state == "B":
         return "has a signature of another commit"
     if state != "G" or not signature.lstrip().startswith(_SSH):

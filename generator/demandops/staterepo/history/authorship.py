@@ -37,7 +37,7 @@ class Person(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether git named the address. If not, the address was made from the login."""
+        """Whether git knows the address. If not, the address is ``<login>@demandops.invalid``."""
         return not self.email.endswith(_NO_ADDRESS)
 
     def __str__(self) -> str:
@@ -93,11 +93,12 @@ def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
 
 
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
-    """Return the author of a follow commit: the people whose commits it renders.
+    """Return the author of a follow commit that renders the commits ``causes``.
 
-    For one person, the author has the person's name and address, so that ``git log --author``
-    finds the follow commit too. For several people, the address is the generator's. If there are
-    no ``causes``, the author is the generator.
+    If one person made ``causes``, the author has the person's name and address, so that
+    ``git log --author`` finds the follow commit too. If several people made ``causes``, the author
+    has their names and the generator's address. If ``causes`` is empty, the author is the
+    generator.
     """
     if not causes:
         return commit_message.generator_signature(now)

@@ -27,8 +27,9 @@ PROPOSAL = "Proposal"
 """The trailer that names the branch on which a commit was proposed for approval."""
 
 GENERATOR_NAME = "DemandOps generator"
+"""The committer's name in every commit by a generator."""
 GENERATOR_EMAIL = "generator@demandops.invalid"
-"""Name and address of the committer of every commit by a generator."""
+"""The committer's address in every commit by a generator."""
 
 _LAST_SECOND = 253402300799
 """The last second of the year 9999."""
@@ -46,12 +47,11 @@ class LogEntry:
     trailers: dict[str, list[str]]
     why: str = ""
     by_generator: bool = False
-    """Whether the generator is the committer. If so, generated files should match the ledger.
+    """Whether the generator is the committer, so that generated files should match the ledger.
 
-    The trailers alone do not prove this, because anybody may write them. The value is False for a
-    commit of a proposal: a person merges the proposal, perhaps onto other changes, so the
-    generator must read the files again. :func:`is_by_generator` also checks the signature, if one
-    is required.
+    False for a commit of a proposal, because a person may merge the proposal onto other changes.
+    Anybody can commit under the generator's name, so :func:`is_by_generator` also checks the
+    signature, if a signature is required.
     """
     authored: datetime | None = None
     """The author's time; for a demand's commit, the time when the demand was received."""
@@ -110,9 +110,9 @@ def is_by_generator(repo: Repository, commit: Commit) -> bool:
 def commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield each commit that ``tip`` includes and ``after`` does not, with its log entry.
+    """Yield ``tip`` and its ancestors, the newest first, each with its log entry.
 
-    The newest commit comes first.
+    If the commit ``after`` is given, leave out this commit and its ancestors.
     """
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     if after is not None:

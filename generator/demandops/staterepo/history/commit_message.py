@@ -59,10 +59,10 @@ def generator_signature(time: datetime) -> pygit2.Signature:
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
-    """Return the author of a demand's commit: the requesters.
+    """Return the author of the commit of a demand, a rollback or a decommission.
 
-    The author of a rollback or a decommission is the person who ran the command. The author's time
-    is the time when the demand was received.
+    The author of a demand is its requesters. The author of a rollback or a decommission is the
+    person who ran the command. ``received`` is the author's time.
     """
     request = decision.request
     if isinstance(request, Restoration):
@@ -88,7 +88,7 @@ def of_decision(
         [one_line(title, _MAX_SUBJECT)],
         [f"Why: {why}"],
         _desired_state(decision.releases),
-        _list("Listed, but not held by the requester:", decision.changes.not_held),
+        _list("The request lists what the requester does not hold:", decision.changes.not_held),
         _list("Warnings:", decision.warnings),
     ]
     keys = [change.key for change in claims]
@@ -289,7 +289,7 @@ def of_scale_down(
     names = ", ".join(release.name for release in change.releases) or f"{service} on {node}"
     paragraphs = [
         [one_line(f"Scale down {names}", _MAX_SUBJECT)],
-        ["Why: no demand has needed the replicas for as long as downAfter says."],
+        ["Why: downAfter has passed since a demand last needed the replicas."],
         _desired_state(change.releases) if change.releases else ["Desired state: unchanged."],
     ]
     trailers = [
@@ -302,7 +302,7 @@ def of_scale_down(
 
 
 def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
-    """Return a trailer for each override, given by the path of its file."""
+    """Return a trailer for each override; ``paths`` are the overrides' files."""
     return [("Override", path) for path in sorted(set(paths))]
 
 

@@ -24,7 +24,7 @@ _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U00(?:0[0-9a-f]|10)[0-9a-f]{4}|[nrt\\
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-"""Matches a quoted value, which has an escape: only values that need one are quoted."""
+"""Matches a quoted value. It has an escape, because values without escapes are not quoted."""
 
 
 @dataclass(frozen=True, slots=True)

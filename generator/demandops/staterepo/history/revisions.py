@@ -18,7 +18,7 @@ from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.history import commit_log
 
-TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h"
+TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago)"
 """Examples of the times that :func:`parse_time` accepts."""
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}")

@@ -59,8 +59,8 @@ class ConfigSource:
 class LastValidConfig:
     """A commit's configuration, with the last valid versions of its invalid files.
 
-    ``config`` is None if the configuration is not valid even with these versions. ``source`` is
-    then the source of the configuration that was in effect before.
+    ``source`` is the source of ``config``. ``config`` is None if the configuration is not valid
+    even with these versions; ``source`` is then that of the configuration in effect before.
     """
 
     config: Config | None
@@ -154,7 +154,8 @@ def _with_files_merged_together(
     """Return the broken files, and all files that apply only together with them.
 
     A file applies only together with all files of each commit that changed the file, and with all
-    files of its application definition. The search goes on with each file that is found.
+    files of its application definition. Each of these files in turn applies only together with
+    others, which are returned too.
     """
     together = set(broken)
     merges = [

@@ -83,11 +83,16 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
 def last_valid_claims(
     repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
-    """Return a map from path to the claim that the generator last wrote, without manual edits.
+    """Return a map from each of ``paths`` to the last valid claim there, or None for no claim.
 
-    The claim is None if the generator wrote none, or removed it. ``last_valid_commit`` is the
-    newest commit with only valid files. If the generator has not changed a file since this commit,
-    the map has the claim at this commit.
+    If the generator has changed the file since ``last_valid_commit``, this is the claim that it
+    wrote last. If not, this is the claim at ``last_valid_commit``.
+
+    Args:
+        repo: the repository.
+        last_valid_commit: the newest commit with only valid files.
+        to: the newest commit to consider.
+        paths: the paths of claim files.
     """
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
@@ -122,9 +127,9 @@ def claims_by_people(
 
     Args:
         repo: the repository.
-        last_valid_commit: the newest commit with only valid files; older changes are left out.
+        last_valid_commit: the newest commit with only valid files; only later changes count.
         to: the newest commit to consider.
-        known: the claims that were in effect before; a claim that equals one of these is left out.
+        known: the ledger in effect until now; a claim that is the same there is left out.
     """
     paths = {
         path

@@ -45,7 +45,10 @@ class Problem:
 
 
 Origin = Callable[[str], tuple[str, str] | None]
-"""Gets a file's path; returns id and author of the commit that caused the file's fault, or None."""
+"""A function from a file's path to the commit that caused the file's fault: its id and author.
+
+The function returns None if it finds no commit.
+"""
 
 
 def with_origins(
@@ -53,9 +56,9 @@ def with_origins(
 ) -> tuple[Problem, ...]:
     """Return a problem for each fault.
 
-    A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds them.
-    If :func:`write` leaves a problem out of the report, the problem gets no commit and no author:
-    the report could not keep them, so the generator would search for them again at each demand.
+    A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds the
+    commit and the author. A problem for which the report has no room gets no commit and no author,
+    because the generator would have to search for these again at each demand.
     """
     existing = {(old.file, old.field, old.message): old for old in known if old.since}
     found = sorted({(fault.file, fault.field, fault.message) for fault in faults})

@@ -64,9 +64,11 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a commit that is made on top of this one.
+        """Return the snapshot of a commit whose parent is this snapshot's commit.
 
-        ``state`` is the state at the new commit.
+        Args:
+            commit: the new commit.
+            state: the state at the new commit.
         """
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
@@ -136,7 +138,7 @@ def advance(
         repo: the repository.
         before: the earlier snapshot.
         to: the later commit.
-        recorded: the source of the configuration in effect at ``to``, if it is known.
+        recorded: the recorded source of the configuration in effect at ``to``, if any.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
     state, known = before.state, LastValidConfig(None, before.config_source, ())
@@ -279,8 +281,8 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 class ReadAhead:
     """Remembers the last advance, so that the next attempt to publish reads only newer commits.
 
-    If each attempt read all commits since the published snapshot, faster writers could publish
-    first every time.
+    If each attempt had to read all commits since this generator's last publication, other
+    generators could publish first every time.
     """
 
     def __init__(self) -> None:

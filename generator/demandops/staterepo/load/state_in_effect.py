@@ -7,10 +7,10 @@ all files were valid. ``Configuration`` names the commit whose configuration is 
 start from these trailers. They then apply people's later changes with the same code as a running
 generator.
 
-People's changes that cannot be planned are not applied (quarantine). A claim may be refused, or it
-may be impossible to plan, for example because it names an unknown node. Then its file stays as it
-is, and the last valid version of the file is in effect. If the new configuration is the reason, the
-old configuration stays in effect.
+If a person's change of a claim is refused or cannot be planned, for example because the claim names
+an unknown node, the change is quarantined: the generator leaves the file alone, but the file's last
+valid version is in effect. If the new configuration is at fault, the old configuration stays in
+effect.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from demandops.subject import Subject
 _NONE = "none"
 _HELD_BACK = "Held-Back"
 _TO_CHECK = Fault("invalid", "", "must be checked again")
-"""A placeholder for a problem that is not known until the next commits are read."""
+"""A placeholder for the problems of a recorded state, until the files are checked again."""
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
@@ -100,11 +100,12 @@ def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the newest recorded state up to a commit, else the state of the newest valid commit.
+    """Return the state in effect at the generator's newest commit at or before ``commit``.
 
-    A valid commit that a generator has followed is preferred to a newer one.
+    If there is no such commit, or its state is not valid, return the state of the newest commit up
+    to there whose files are all valid; if there is none, of the newest valid one after it.
 
-    Raises InvalidInput or StateRepoError if there never was a valid state.
+    Raises InvalidInput or StateRepoError if no commit is valid.
     """
     record = record_at(repo, commit)
     tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
@@ -193,12 +194,14 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """People's changes, and the faults of the changes with the new and with the old configuration.
+    """The faults of people's changes with the new and with the old configuration, by subject.
 
-    If a subject can be planned with neither configuration, its claims are at fault. If it can be
-    planned with the old configuration but not with the new one, the new configuration is at fault.
-    If a claim that a person wrote is refused, that claim is at fault. ``refused`` has the faults of
-    the claims that are refused with the new configuration.
+    ``with_new``: why a subject cannot be planned with the new configuration.
+    ``with_old``: why a subject cannot be planned, or is refused, with the old configuration.
+    ``refused``: why a person's claim on the subject is refused with the new configuration.
+
+    If a subject has a fault with the new configuration only, the configuration is at fault. If it
+    has a fault with both, its claims are at fault. A refused claim is at fault itself.
     """
 
     repo: Repository
@@ -208,17 +211,17 @@ class Judgement:
     with_old: Faults
     refused: Faults
     old: State
-    """The new ledger with the configuration that was in effect before."""
+    """The configuration that was in effect before, with the new ledger."""
 
     def with_new_config(self) -> Advance:
-        """Return ``advance`` without the changes at fault; the new configuration is in effect."""
+        """Return the advance to the new configuration, without the claims at fault."""
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
-        return self._without(self.advance, _merged(faults, self.refused))
+        return self._quarantined(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return ``advance`` without the changes at fault; the old configuration is in effect.
+        """Return the advance that keeps the old configuration, without the claims at fault.
 
         ``faults`` are the reasons why the new configuration is refused.
         """
@@ -231,10 +234,10 @@ class Judgement:
             last_valid_commit=self.before.last_valid_commit,
             other_config_source=self.before.config_source,
         )
-        return self._without(replace(accepted, snapshot=snapshot), self.with_old)
+        return self._quarantined(replace(accepted, snapshot=snapshot), self.with_old)
 
-    def _without(self, accepted: Advance, faults: Faults) -> Advance:
-        """Return ``accepted``, but with the last valid claims on the subjects in ``faults``."""
+    def _quarantined(self, accepted: Advance, faults: Faults) -> Advance:
+        """Return ``accepted`` with the last valid claims on each subject that has a fault."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)
@@ -304,7 +307,7 @@ def judge(
         return found
 
     with_new = faults_in(state)
-    refused = refused_in(state) if held_back is None else _recorded(advance, held_back)
+    refused = refused_in(state) if held_back is None else _placeholders(advance, held_back)
     if state.config == old.config:
         return Judgement(repo, before, advance, with_new, with_new, refused, old)
     with_old = _merged(faults_in(old), refused_in(old))
@@ -315,11 +318,8 @@ def _merged(one: Faults, other: Faults) -> Faults:
     return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
 
 
-def _recorded(advance: Advance, held_back: Collection[str]) -> Faults:
-    """Return a map from subject to a placeholder fault.
-
-    The map has each subject of which a claim file is in ``held_back``.
-    """
+def _placeholders(advance: Advance, held_back: Collection[str]) -> Faults:
+    """Return a placeholder fault for each subject that has a claim file in ``held_back``."""
     ledger = advance.snapshot.state.ledger
     return {
         subject: (_TO_CHECK,)

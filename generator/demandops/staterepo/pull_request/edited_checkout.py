@@ -46,7 +46,7 @@ class Base:
     If a file is not valid, ``state`` has its last valid version.
     """
     newer: int = 0
-    """How many commits the merge target has that the checkout lacks."""
+    """How many commits of the merge target the checkout lacks."""
     merged: Mapping[str, str] = field(default_factory=dict)
     """The merge target's generated files, if the target has commits that the checkout lacks.
 

@@ -37,7 +37,7 @@ _IMAGE_KEYS = ("repository", "tag", "digest")
 _REFERENCE = re.compile(
     r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:[0-9a-f]{64}))?"
 )
-_REASON = "Say here why; this replaces a manual edit of a generated file"
+_REASON = "Say here why you need this override; it replaces a manual edit of a generated file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +115,9 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
         unchanged = f" (this override does not change {listed})" if left else ""
         return f"{_LOST}, and merge {suggestion.file} as shown{unchanged}"
     if path.startswith(f"{NOTES_ROOT}/"):
-        return "is written by the generator, which undoes the edit; revert it"
+        return "is written by the generator, which would undo the edit; revert the edit"
     if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:
-        return "is not the path of a claim, so the generator removes the file; delete it"
+        return "is not the path of a claim, so the generator would remove the file; do not add it"
     if added:
         return (
             "is in a generated folder, from which the generator removes what no demand needs; "

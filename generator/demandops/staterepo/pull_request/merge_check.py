@@ -184,7 +184,10 @@ class _Edit:
 
     @property
     def before(self) -> Mapping[str, str]:
-        """The files before the edit, or the edited files if the files before it are not known."""
+        """The files at the commit that the edit started from.
+
+        If this commit is not known, the edited files.
+        """
         return self.start.files if self.start else self.files
 
     @property
@@ -193,8 +196,8 @@ class _Edit:
         return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
 
     @property
-    def generated(self) -> dict[str, str]:
-        """The generated files before the edit."""
+    def generated_before(self) -> dict[str, str]:
+        """The generated files in :attr:`before`, without READMEs."""
         return {
             path: text
             for path, text in self.before.items()
@@ -204,11 +207,11 @@ class _Edit:
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
         """Return the generated files before the merge, as path → text.
 
-        ``wanted`` has the generated files after the merge. The result has the files before the
-        edit. But if the merge target already equals ``wanted`` at a path, the merge changes nothing
-        at this path, so the result equals ``wanted`` too.
+        ``wanted`` has the generated files after the merge. At paths where the merge target already
+        equals ``wanted``, the result equals ``wanted`` too. At all other paths, the result is as at
+        the commit that the edit started from.
         """
-        found, there = self.generated, self.start.merged if self.start else {}
+        found, there = self.generated_before, self.start.merged if self.start else {}
         for path in {*there, *found} if there else ():
             if there.get(path) == wanted.get(path):
                 found.pop(path, None)
@@ -267,7 +270,7 @@ class _Edit:
     def rendered(self, state: State) -> dict[str, str]:
         """Return every generated file as path → text, or raise InvalidInput with all faults."""
         try:
-            return rendered_files(state, self.generated)
+            return rendered_files(state, self.generated_before)
         except InvalidInput as error:
             found = merge_preview.render_faults(state, state.engine, self.changed)
             raise InvalidInput(found or error.faults) from None
@@ -280,8 +283,8 @@ class _Edit:
                 cluster = path.removeprefix(f"{BOOTSTRAP_ROOT}/").removesuffix(".yaml")
                 change = "changes" if path in before else "is new"
                 message = (
-                    f"{change} with the merge, but no controller applies it; after the merge, an "
-                    f"administrator of cluster '{cluster}' must apply it: "
+                    f"{change} with the merge, but no controller applies bootstrap files; after "
+                    f"the merge, an administrator of cluster '{cluster}' must run: "
                     f"git show main:{path} | kubectl apply -f -"
                 )
                 yield fault("", message).within(path)

@@ -55,8 +55,8 @@ def render_charts(
     Args:
         folder: the checkout, whose configuration must be valid.
         state: the state after the merge.
-        changed: the paths that the edit changes, or None if that is unknown.
-        wanted: the paths of the generated files that the merge changes.
+        changed: the paths that the pull request changes, or None if they are unknown.
+        wanted: the paths of the generated files that will change because of the merge.
     """
     config = state.config
     used = {service.chart for services in config.services.values() for service in services.values()}

@@ -78,7 +78,7 @@ class CommitBatch:
         self.frees = False
         """Whether a demand freed room on a node since the caller last set this to false."""
         self.followed = ""
-        """One line for the log about the commit that renders people's changes; empty if none."""
+        """The log line about the follow commit, which renders people's changes; empty if none."""
 
     @property
     def is_empty(self) -> bool:
@@ -284,7 +284,7 @@ class CommitBatch:
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
-        """Return all generated files that differ from the current ones, and the files of ``more``.
+        """Render all files; return those that differ from the batch's newest commit, and ``more``.
 
         Raises Refused or InvalidInput if a release cannot be planned or rendered.
         """

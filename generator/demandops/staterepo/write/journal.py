@@ -45,10 +45,12 @@ class DamagedJournal(StateRepoError):
 class ProposalRecord:
     """The journal's record of a proposal: what a restarted process needs to continue it.
 
-    ``commits`` lists the commits at which the branch may be, newest last. ``base`` is the commit of
-    main on which the newest of them was made. ``pushed`` is true if the branch was pushed. If
-    such a branch is missing, somebody has deleted it. ``link`` is the address of the branch's merge
-    request. ``withdrawn`` is the reason why the demand was withdrawn, or empty.
+    ``commits``: where the generator left the branch, newest last. There may be two commits, because
+    the push of the newest may have failed.
+    ``base``: the commit of main on which the newest of ``commits`` was made.
+    ``pushed``: whether the branch was pushed. If a pushed branch is missing, somebody deleted it.
+    ``link``: the address of the branch's merge request.
+    ``withdrawn``: the reason why the demand was withdrawn, or empty.
     """
 
     branch: str

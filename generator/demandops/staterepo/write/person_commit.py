@@ -34,7 +34,7 @@ Files = Mapping[str, str | None]
 
 @dataclass(frozen=True, slots=True)
 class Author:
-    """The person who commits, the time, and the message's summary and reason."""
+    """Who commits and when, with the summary and the reason of the commit's message."""
 
     person: Person
     now: datetime
