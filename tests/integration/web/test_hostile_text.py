@@ -1,4 +1,4 @@
-"""Text from outside adds no HTML and no command to the page, and hides no characters there."""
+"""Text from outside adds no HTML and no command to the page; its hidden characters are shown."""
 
 from __future__ import annotations
 
