@@ -191,7 +191,7 @@ class Experiment:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
 
     def _released(self, since: str, expected: int) -> bool:
-        """Return whether ``expected`` commits are made and only the initial deployment is booked."""
+        """Return whether all commits are made, and only the initial deployment is booked."""
         return len(self._commits(since)) >= expected and not self._bookkeeping(self._world.tip())
 
     def _is_settled(self, number: int, since: str) -> bool:

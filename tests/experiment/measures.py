@@ -65,7 +65,7 @@ def _step(outcome: Outcome, event: Event, formed: Formed) -> Step:
 
 
 def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
-    """Return the pods of the vehicle's connection in one visit; the event begins or ends the visit."""
+    """Return the pods of the vehicle's connection; the event is the start or end of its visit."""
     carrier = outcome.settings.connections
     pods = [pod for pod in outcome.pods if fleet.is_client(pod.service, event.vehicle, carrier)]
     if event.joins:

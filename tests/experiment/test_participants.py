@@ -1,4 +1,4 @@
-"""The program `participants` stops the vehicles at a given time, then lets them drive on."""
+"""The program `participants` stops the vehicles at given times, and lets them drive on."""
 
 from __future__ import annotations
 

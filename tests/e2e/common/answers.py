@@ -100,7 +100,7 @@ def push_chart(world: World, added: str) -> dict[str, str]:
 
 
 class Answers:
-    """A demand is answered when it is reconciled or healthy, as its ``answer`` asks.
+    """A demand is answered when it is reconciled or healthy; its field ``answer`` says which.
 
     If the demand cannot become so, the answer says why.
     """

@@ -19,7 +19,7 @@ EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
 CLUSTER = "c-its"
 """The cluster of the skeleton."""
 NAMESPACE = "perception"
-"""The namespace of the skeleton's access domain; both have one name."""
+"""The skeleton's access domain, and the domain's namespace."""
 
 STEPS = range(1, len(paper.STEPS) + 1)
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")

@@ -120,7 +120,7 @@ class Processes:
         os.killpg(process.pid, number)
 
     def stop_all(self) -> None:
-        """Stop all components, the newest first; an interrupt meanwhile kills all that still run."""
+        """Stop all components, the newest first; an interrupt meanwhile kills all that are left."""
         try:
             for batch in reversed(self._batches):
                 self._stop_batch(batch)

@@ -267,7 +267,7 @@ FOREIGN = [
     '100644 "inventory/\\377/\\377.yaml"',
     "100644 policy/" + "deep/" * 3000 + "evil.yaml",
 ]
-"""Modes and paths, as ``git fast-import`` reads them, that a state repo should not have."""
+"""Entries that a state repo should not have: mode and path, as ``git fast-import`` reads them."""
 
 
 def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_called(

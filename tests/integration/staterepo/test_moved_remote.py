@@ -57,8 +57,8 @@ EITHER = pytest.mark.parametrize(
 )
 """While a person changes the repo, the generator runs and uses a remote, or is stopped.
 
-The stopped generator uses the repo in place. Two combinations are enough, because address and
-running do not affect each other.
+The stopped generator uses the repo in place. Two combinations are enough, because ``address``
+and ``running`` do not affect each other.
 """
 
 

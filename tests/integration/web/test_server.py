@@ -108,7 +108,7 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
 def test_requests_for_earlier_commits_keep_no_other_request_waiting(
     served: WebServer, follower: Follower
 ) -> None:
-    """60 requests for earlier commits, more than there are threads, wait for the loading lock."""
+    """60 requests for earlier commits wait for the loading lock. The server has fewer threads."""
     with ExitStack() as stack:
         stack.enter_context(follower._loading)
         for _ in range(60):
