@@ -18,7 +18,7 @@ pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.ste
 
 @pytest.fixture(autouse=True)
 def limited() -> None:
-    """Switch the tests' time limit off, because each wait in these tests has its own time-out."""
+    """Set no time limit for these tests, because each of their waits has its own time-out."""
 
 
 @pytest.fixture(scope="session")

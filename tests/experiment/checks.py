@@ -90,13 +90,13 @@ def _inputs(outcome: Outcome) -> Iterator[str]:
             yield f"after '{formed}', the fusion never read {sorted(wanted)}"
     fusions = [pod for pod in outcome.pods if pod.service == FUSION]
     starts = [len(container.starts) for pod in fusions for container in pod.containers]
-    stays = _stays([formed.joins for formed in outcome.formed])
-    if len(fusions) != stays or set(starts) != {1}:
-        yield f"{len(fusions)} pods in place of {stays}, with {starts} starts of containers"
+    periods = _busy_periods([formed.joins for formed in outcome.formed])
+    if len(fusions) != periods or set(starts) != {1}:
+        yield f"{len(fusions)} pods in place of {periods}, with {starts} starts of containers"
 
 
-def _stays(joins: Iterable[bool]) -> int:
-    """Return how often a vehicle joined while no other vehicle was near."""
+def _busy_periods(joins: Iterable[bool]) -> int:
+    """Return the number of periods in which at least one vehicle was near."""
     count = inside = 0
     for joined in joins:
         count += joined and inside == 0

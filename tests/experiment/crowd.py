@@ -76,7 +76,7 @@ def rules(near: Near) -> str:
 def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> list[Event]:
     """Return the events before `until`, sorted by time.
 
-    `passing` has the condition of the intersection that each vehicle passes.
+    `passing` maps each vehicle to the condition that it is near the intersection on its way.
     """
     own: defaultdict[Near, list[Pose]] = defaultdict(list)
     for pose in poses:

@@ -35,7 +35,7 @@ from .standins.image import image
 ROOT = Path(__file__).resolve().parents[2]
 _PATIENCE_S = 120.0
 _STAND_S = 0.5
-"""Vehicles that must wait stop this many seconds before the pose that causes the next event."""
+"""If the vehicles must wait, they stop this many seconds before the pose that causes an event."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
 
 
@@ -191,7 +191,7 @@ class Experiment:
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
 
     def _released(self, since: str, expected: int) -> bool:
-        """Return whether all demands are committed, and only the initial deployment is booked."""
+        """Return whether all commits are made, and only the initial deployment is booked."""
         return len(self._commits(since)) >= expected and not self._bookkeeping(self._world.tip())
 
     def _is_settled(self, number: int, since: str) -> bool:
@@ -216,7 +216,7 @@ class Experiment:
         return any(at >= event.at and own & set(seen) for at, seen in list(self._edge.tracks))
 
     def _runs(self, event: Event) -> bool:
-        """Return whether a communication client of the vehicle's connection to the edge runs."""
+        """Return whether a client is running for the vehicle's connection to the edge."""
         carrier = self._settings.connections
         running = [pod for pod in list(self._runner.pods.values()) if pod.ended is None]
         return any(fleet.is_client(pod.service, event.vehicle, carrier) for pod in running)
@@ -252,7 +252,7 @@ class Experiment:
         return {row: who for row, who in rows.items() if not row.endswith(" to cloud")}
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield a demand for each vehicle that a commit adds to or removes from the requesters."""
+        """Yield a demand for each vehicle that joins or leaves the requesters in a commit."""
         stages, inside = self._cloud.commits(), set()
         for commit in self._commits(since):
             read = self._bookkeeping(commit)
@@ -332,9 +332,9 @@ _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 
 
 def _stand(happens: list[float], number: int) -> float:
-    """Return the time at which the vehicles must stop after the first `number` causes of events.
+    """Return when the vehicles must stop so that they cause only the first `number` events.
 
-    The time is shortly before the next cause, or infinity if there is no further cause.
+    The time is shortly before the cause of the next event, or infinity if no event is left.
     """
     if number == len(happens):
         return math.inf

@@ -89,7 +89,7 @@ CLIENTS: dict[Carrier, int] = {"mqtt": 2, "zenoh": 1}
 
 
 def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
-    """Return whether a service is a client of only this vehicle's connection to the edge."""
+    """Return whether a service is a client for this vehicle's connection to the edge alone."""
     if carrier == "zenoh":
         return service == f"zenoh-{vehicle}"
     return service.startswith(f"mqtt-{vehicle}-edge")

@@ -170,9 +170,9 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demand of each commit after ``since``, read from the commit's trailers.
+        """Yield the demand of each commit after ``since``.
 
-        The bookkeeping is read only at some of the commits (:data:`_LOOKS`).
+        At about :data:`_LOOKS` of the commits, the demand has the bookkeeping too.
         """
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}

@@ -1,4 +1,4 @@
-"""Pure functions over a run: the times of each event, and what running on demand saves."""
+"""Pure functions over a run: the times of each event, and what is saved by services on demand."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ STAGES = ("demand", "commit", "pods", "fused")
 class Step:
     """An event, and the times of its consequences; None for a consequence that did not come.
 
-    If the vehicle joins: `demand` is when its demand was accepted, `commit` is when the commit was
-    published, `pods` is when the last pod of its connection got its node, `first` is when the first
-    fused message had its ego data, and `gone` is when all these pods had ended. If the vehicle
-    leaves, `pods` is when all these pods had ended, and `first` and `gone` are None.
+    - `demand`: the demand was accepted.
+    - `commit`: the demand's commit was published.
+    - `pods`: after a join, the last pod of the vehicle's connection got its node; after a leave,
+      all pods of the connection had ended.
+    - `first`: the first fused message had the vehicle's ego data; None after a leave.
+    - `gone`: after a join, all pods of the connection had ended; None after a leave.
     """
 
     event: Event
@@ -39,7 +41,7 @@ class Step:
 
 
 def steps(outcome: Outcome) -> list[Step]:
-    """Return the events with their consequences, except events that formed no demand."""
+    """Return each event that led to a demand, with the times of its consequences."""
     formed: defaultdict[str, list[Formed]] = defaultdict(list)
     for one in outcome.formed:
         formed[str(one)].append(one)
@@ -63,7 +65,7 @@ def _step(outcome: Outcome, event: Event, formed: Formed) -> Step:
 
 
 def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
-    """Return the pods of the vehicle's connection in the visit that the event begins or ends."""
+    """Return the pods of the vehicle's connection; the event is the start or end of its visit."""
     carrier = outcome.settings.connections
     pods = [pod for pod in outcome.pods if fleet.is_client(pod.service, event.vehicle, carrier)]
     if event.joins:
@@ -84,7 +86,7 @@ def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | 
 
 @dataclass(frozen=True)
 class Saving:
-    """The mean of a quantity during the drive, for services on demand and services always on."""
+    """The mean of a quantity during the drive: with services on demand, and with all always on."""
 
     name: str
     unit: str
@@ -93,12 +95,12 @@ class Saving:
 
     @property
     def saved(self) -> float:
-        """The share of the always-on quantity that running on demand saves."""
+        """How much services on demand save, as a share of ``always``."""
         return 1 - self.on_demand / self.always if self.always else 0.0
 
 
 def savings(outcome: Outcome) -> list[Saving]:
-    """Return what the services took during the drive, and what they would take if always on.
+    """Return what the services used during the drive, and what they would use if always on.
 
     "Always on" means: each service that ran at all runs during the whole drive, and each topic that
     was carried to the edge is carried with all its messages.

@@ -40,7 +40,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Formed:
-    """A demand of the detector: its commit, and when it reached each stage.
+    """A demand that the detector formed: its commit, and when it reached each stage.
 
     `bookkeeping` has the requesters of each service and connection after the commit; None if it was
     not read at this commit.

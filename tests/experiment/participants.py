@@ -2,11 +2,11 @@
 
 Call: `python -m tests.experiment.participants PLAN`.
 
-PLAN is a JSON file with the fields of `Plan`. The program publishes from its start, with all
-vehicles at rest. Each line on standard input is a time, in seconds of driving. The vehicles drive
-until that time, then stand until the next line; they publish all the time. With the first line they
-set off. At its end, the program prints a line of JSON: the messages and bytes of each topic since
-the vehicles set off, and for how many seconds the vehicles stood.
+PLAN is a JSON file with the fields of `Plan`. The vehicles publish from the program's start to its
+end, also while they stand. Each line on standard input is a time, in seconds of driving. At the
+first line the vehicles set off. They drive until the line's time, then stand until the next line.
+When the program ends, it prints a line of JSON: the messages and bytes of each topic since the
+vehicles set off, and for how many seconds the vehicles stood.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ from .running_pod import Container, RunningPod, path_in_pod, program_of
 _TICK_S = 0.1
 _WATCH_S = 60
 _NOT_YET = (LookupError, ApiException, HTTPError, OSError)
-"""Errors when an object does not exist yet, or when the API server cannot be reached."""
+"""The errors for an object that does not exist yet, or an API server that cannot be reached."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105 - a folder
 

@@ -22,11 +22,11 @@ VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
 STATION = "station00"
 
 LEAD_S = 2.0
-"""How many seconds after the start of the drive a recording begins."""
+"""A recording begins this many seconds after the vehicles set off."""
 MIDDLES = ((0.0, 0.0), (1000.0, 0.0), (0.0, 1000.0))
 SPACING_S = 1.2
 _SILENCE_S = 0.6
-"""A recorded vehicle is silent while its nearest recorded pose is more than this time away."""
+"""A recorded vehicle is silent when none of its poses was recorded within this many seconds."""
 
 _PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
 """The order of events in the paper: `0` means that vehicle 0 joins, `-0` that it leaves."""
@@ -48,7 +48,7 @@ class Way(Protocol):
 
     @property
     def label(self) -> str:
-        """The text about this way in the report."""
+        """What the report says of the way, such as ``30 km/h``."""
 
     def position(self, time: float) -> tuple[float, float]:
         """Return the vehicle's position at a time."""
@@ -107,7 +107,7 @@ class Route:
 
 @dataclass(frozen=True)
 class Track:
-    """A recorded way: points of time, x and y, with straight lines between them.
+    """A recorded way: points, each with a time, an x and a y, and straight lines between them.
 
     Until the time of the first point, the vehicle waits at that point. It is silent in the gaps of
     the recording.
@@ -156,8 +156,8 @@ def tracks(
 def four(seed: int, gap: float) -> tuple[Route, ...]:
     """Return the routes of four vehicles, with about ``gap`` seconds from one event to the next.
 
-    Seed 0 has the paper's order of events. Every other seed has an order of its own. Arms and exact
-    times depend on the seed.
+    Seed 0 has the paper's order of events. Every other seed has an order of its own. The seed also
+    decides the exact times, and by which arms of the intersection each vehicle comes and leaves.
     """
     chance = random.Random(seed)
     order = _PAPER if seed == 0 else _shuffled(chance)
@@ -196,8 +196,8 @@ def many(seed: int, count: int) -> tuple[Route, ...]:
 def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
     """Return the routes, changed so that ``vehicle`` falls silent while it is near.
 
-    The vehicle falls silent in the middle of the longest time without other events. Close to
-    another event, all vehicles may stand, and a vehicle that stands does not fall silent.
+    The vehicle falls silent in the middle of the longest time without other events. Shortly before
+    an event, the experiment may stop all vehicles, and a stopped vehicle goes on sending.
     """
     (lost,) = (route for route in routes if route.vehicle == vehicle)
     moments = sorted(

@@ -1,4 +1,4 @@
-"""The participants' program stops the vehicles where it must, and lets them drive on from there."""
+"""The program `participants` stops the vehicles at given times, and lets them drive on."""
 
 from __future__ import annotations
 

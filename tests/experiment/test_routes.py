@@ -1,4 +1,4 @@
-"""The routes and the events that follow from them, without ROS and without a cluster."""
+"""The vehicles' routes, and the events that the routes cause, without ROS and a cluster."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def ask(demandops: Run, state: Any) -> Run:
     return call
 
 
-def test_what_the_page_says_of_git_alone(played: Any) -> None:
+def test_git_finds_commits_as_the_docs_say(played: Any) -> None:
     """The git commands of ``docs/audit.md`` find commits by author, trailer, message and path."""
 
     def log(*args: str) -> list[str]:
@@ -289,7 +289,7 @@ class TestLogFilters:
         ]
 
     def test_a_node_that_only_a_claim_names(self, ask: Run, played: Any, request_json: Run) -> None:
-        """A further requester of a running service changes only the ledger."""
+        """The second demand needs what already runs, so its commit changes only the ledger."""
         request_json(perception(id="first"))
         before = played.tip
         request_json(perception(id="second"))

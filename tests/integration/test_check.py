@@ -226,8 +226,8 @@ def test_json_names_file_field_and_message(checkout: Path, check: Check) -> None
     assert (found["releases"], found["files"], found["bookkeeping"]) == (None, None, None)
 
 
-def test_the_generators_notes_are_not_edited_by_hand(checkout: Path, check: Check) -> None:
-    """A report that exists is no fault, but a person's change of it is one."""
+def test_a_person_may_not_change_the_generators_reports(checkout: Path, check: Check) -> None:
+    """`check` accepts a report that is committed, and refuses its deletion by a person."""
     report = checkout / ".demandops" / "reports" / "problems.yaml"
     report.parent.mkdir(parents=True)
     report.write_text("problems: []\n")

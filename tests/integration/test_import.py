@@ -30,9 +30,9 @@ class Migration:
             self.reference.send(yaml.safe_load(path.read_text()))
         self.files = {path.stem: path for path in self.reference.write(folder / "reference")}
 
-    def run(self, *args: str | Path, files: str = "", stdin: str = "") -> Ran:
-        """Run `import` with those files of the reference whose names contain ``files``."""
-        chosen = [path for name, path in self.files.items() if files in name]
+    def run(self, *args: str | Path, named: str = "", stdin: str = "") -> Ran:
+        """Run `import` with the reference's files that have ``named`` in their names."""
+        chosen = [path for name, path in self.files.items() if named in name]
         how = ["--state-repo", self.repo, "--map", self.map]
         return self._demandops("import", *chosen, *how, *args, stdin=stdin)
 
@@ -75,7 +75,7 @@ def test_an_imported_ledger_is_that_of_the_demands_themselves(
 
 def test_counts_alone_end_with_as_many_shutdowns(migration: Migration) -> None:
     migration.propose()
-    assert migration.run(files="bookkeeping").code == 0
+    assert migration.run(named="bookkeeping").code == 0
     assert len(claims(migration.repo, "station00/edge")) == 2
     for path, left in zip(EXPERIMENT[6:], (True, False), strict=True):
         assert migration.request(path).code == 0
@@ -122,7 +122,7 @@ def test_a_second_import_changes_nothing(migration: Migration) -> None:
 
 
 def test_without_the_resources_a_person_fills_in_the_map(migration: Migration) -> None:
-    assert migration.run(files="bookkeeping").code == 0
+    assert migration.run(named="bookkeeping").code == 0
     proposed = yaml.safe_load(migration.map.read_text())
     assert proposed["connections"][STATION] == {
         "id": "station00/edge",
@@ -131,7 +131,7 @@ def test_without_the_resources_a_person_fills_in_the_map(migration: Migration) -
         "broker": "",
         "topics": [{"source": "", "target": ""}],
     }
-    refused = migration.run(files="bookkeeping")
+    refused = migration.run(named="bookkeeping")
     where, told = f"error: {migration.map}:", re.sub(r"(?<=yaml):\d+:", ":", refused.err)
     assert refused.code == 1
     assert told != refused.err
@@ -209,20 +209,20 @@ UNKNOWN = (
     ],
 )
 def test_what_cannot_be_read_is_refused(migration: Migration, text: str, message: str) -> None:
-    refused = migration.run("-", files="fusion_bookkeeping", stdin=text)
+    refused = migration.run("-", named="fusion_bookkeeping", stdin=text)
     assert refused.code == 1
     assert refused.err == f"error: standard input: {message}\n"
     assert not migration.map.exists()
 
 
 def test_an_import_that_finds_no_demands_fails(migration: Migration) -> None:
-    refused = migration.run("-", files="no such file", stdin="{}")
+    refused = migration.run("-", named="no such file", stdin="{}")
     assert (refused.code, refused.err) == (
         1,
         "error: nothing to import: "
         "no file or resource names a requester of an application or of a connection\n",
     )
-    assert "nothing to import: give FILE or --cluster" in migration.run(files="no such file").err
+    assert "nothing to import: give FILE or --cluster" in migration.run(named="no such file").err
 
 
 def test_resources_are_read_from_a_cluster(migration: Migration, tmp_path: Path) -> None:
@@ -242,15 +242,15 @@ def test_resources_are_read_from_a_cluster(migration: Migration, tmp_path: Path)
         head = {"apiVersion": "demandops/v1", "kind": "ClusterAccess"}
         access.write_text(yaml.safe_dump(head | {"clusters": clusters}))
         where = ["--clusters", access, "--namespace", "its", "--cluster"]
-        assert migration.run(*where, "c-its", files="bookkeeping").code == 0
+        assert migration.run(*where, "c-its", named="bookkeeping").code == 0
         by_files = migration.map.rename(tmp_path / "by-cluster.yaml").read_text()
-        unknown = migration.run(*where, "other", files="bookkeeping")
+        unknown = migration.run(*where, "other", named="bookkeeping")
     assert migration.run().code == 0
     assert yaml.safe_load(by_files) == yaml.safe_load(migration.map.read_text())
     assert (
         "--cluster: 'other' has no kubeconfig in the file of --clusters; "
         "clusters that have one: c-its"
     ) in unknown.err
-    away = migration.run(*where, "c-its", files="bookkeeping")
+    away = migration.run(*where, "c-its", named="bookkeeping")
     assert away.code == 1
     assert away.err.startswith("error: cluster c-its: cannot be read: ")

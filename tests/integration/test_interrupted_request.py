@@ -15,10 +15,13 @@ from tests.kit import rig
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_request_that_is_interrupted_says_what_has_an_answer(
+def test_an_interrupted_request_says_which_demands_are_answered(
     bare: Path, data_home: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int
 ) -> None:
-    """Once a batch is booked, a folder in place of the branch's lock file prevents more commits."""
+    """After a batch is booked, a folder in place of the branch's lock file stops more commits.
+
+    So some demands have no answer when the interrupt comes.
+    """
     file = tmp_path / "demands.yaml"
     file.write_text(yaml.safe_dump_all(rig.goal(each) for each in range(60)))
     lock = bare / "refs" / "heads" / "main.lock"

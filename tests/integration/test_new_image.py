@@ -1,4 +1,4 @@
-"""`demandops new image` writes valid pipelines, and a script whose branch passes `check`."""
+"""`demandops new image` writes valid pipelines and a script; the script's branch passes `check`."""
 
 from __future__ import annotations
 

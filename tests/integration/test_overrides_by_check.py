@@ -114,10 +114,10 @@ def test_a_release_that_is_held_keeps_the_controller_from_being_changed(
     assert demandops("upgrade", "--state-repo", state.path, "--gitops", "argocd").code == 0
 
 
-def test_an_upgrade_takes_in_what_people_changed_before_it(
+def test_an_upgrade_honours_a_persons_commit_that_no_generator_has_followed(
     demandops: Run, state: Any, book: Callable[..., Any]
 ) -> None:
-    """One commit deletes an application's claims and adds an override that keeps it running."""
+    """The commit deletes an application's claims; its override keeps the application running."""
     book()
     keep = override({"applications": ["*"]}, keep=True)
     claims = dict.fromkeys(state.files("ledger/applications/"))

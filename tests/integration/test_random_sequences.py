@@ -1,7 +1,7 @@
 """Long random sequences of requests give the same bookkeeping in a real state repo as in a model.
 
-The model in ``tests/model`` takes the same requests. After each call, and at commits in between,
-the bookkeeping of both must be equal.
+The model in ``tests/model`` takes the same requests. After each call of `demandops request`, and
+at some of the commits that the calls made, both must have the same bookkeeping.
 """
 
 from __future__ import annotations
@@ -50,7 +50,6 @@ class CommandLine:
 
 @pytest.fixture
 def command(demandops: Run, state: GitRepo) -> CommandLine:
-    """The command line for a new bare state repo."""
     return CommandLine(state, demandops)
 
 

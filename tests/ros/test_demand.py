@@ -189,7 +189,7 @@ def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
 
 @pytest.fixture
 def short_leases(shared: Served) -> Iterator[None]:
-    """Let the leases in the access domain end after two seconds, during the test."""
+    """While the test runs, leases in the access domain last two seconds by default."""
     repo = GitRepo(Path(shared.state_repo))
     text = repo.files(POLICY)[POLICY]
     policy = yaml.safe_load(text)

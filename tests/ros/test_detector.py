@@ -61,7 +61,7 @@ class Fleet:
         """The simulated time stops here until the detector has reported a later time."""
         self._since = 0.0
         self.is_timeless = False
-        """Whether the fleet stops publishing the simulated time."""
+        """If true, the fleet does not publish the simulated time."""
         self.node.create_timer(0.1, self._publish)
 
     def _hear(self, message: Any) -> None:
@@ -101,7 +101,7 @@ class Fleet:
         self._clock.publish(message)
 
     def entities(self) -> str:
-        """Return the number of entities in the detector's report; empty before a report."""
+        """Return the detector's number of entities, as text; empty before its first report."""
         status = self.statuses.get("demandops_detector: data")
         return {pair.key: pair.value for pair in status.values}["entities"] if status else ""
 
@@ -131,7 +131,8 @@ class Fleet:
 def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
     """A starter that runs each command in a new process, as a person does.
 
-    A detector from a warm process starts so fast that it still receives older bookkeeping.
+    A detector that is forked from a process with imported modules starts too fast: the detector
+    still receives old bookkeeping.
     """
     started = Servers(tmp_path, ros_domain)
     yield started

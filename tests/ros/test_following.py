@@ -129,7 +129,7 @@ def test_a_push_that_the_webhook_reports_is_followed_at_once(
 
 
 def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, bare: Path) -> None:
-    """Nothing polls the remote, so the page can learn of the commit only from the node."""
+    """Nothing polls the remote, so the page can learn of the node's commit only from the node."""
     args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
     served = serve(f"file://{bare}", *args)
     client.ready()

@@ -103,7 +103,7 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
 def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> None:
     """If the executor's thread were still in ROS, Python would abort at the end of the process.
 
-    One program closes the thread itself, the other leaves that to the end of the process.
+    One of the two programs closes the thread; the other just ends.
     """
     program = (
         "import rclpy, time; from demandops_ros.ros_process import ExecutorThread\n"

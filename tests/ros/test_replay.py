@@ -117,10 +117,10 @@ STATE_FIELDS = "string model\nfloat64[] continuous_state\n"
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
-def test_a_bag_of_ego_data_is_read_by_the_definitions_in_it(
+def test_a_bag_is_read_with_the_message_definitions_that_it_contains(
     demandops: Run, tmp_path: Path, plugin: StoragePlugin
 ) -> None:
-    """The package of EgoData is not installed, so the test defines the fields that it needs."""
+    """The package of EgoData is not installed, so the test writes definitions into the bag."""
     types = get_typestore(Stores.ROS2_KILTED)
     types.register(get_types_from_msg(STATE_FIELDS, "perception_msgs/msg/ObjectState"))
     types.register(get_types_from_msg(EGO_FIELDS, EGO))

@@ -311,8 +311,8 @@ class History:
     def set_clocks(self) -> None:
         """Set the wall clocks forward or back; after the first step back, only further back.
 
-        A step forward could undo a step back, so a machine might notice neither. The machine might
-        then end a lease early that another machine recorded between the two steps.
+        A step forward could cancel a step back. If another machine recorded a lease between the
+        two steps, a machine that noticed no step might end the lease too early.
         """
         self.oracle.check()
         self.oracle.counts["faults"] += 1
@@ -373,7 +373,7 @@ class History:
             self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
 
     def _come_down(self) -> None:
-        """Delete the record of the replicas that a service keeps."""
+        """Let a service come down: delete the record of the replicas that it keeps."""
         self.oracle.check()
         if found := sorted(self._files(KEPT_REPLICAS).items()):
             path, text = self.chance.choice(found)

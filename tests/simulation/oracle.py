@@ -68,7 +68,7 @@ class Asked:
 
 
 class Oracle:
-    """Follows main and the answers, and fails when the model does not allow one of them."""
+    """Fails if the model does not allow a commit of main or an answer."""
 
     def __init__(self, world: World) -> None:
         self.world = world
@@ -139,7 +139,7 @@ class Oracle:
     def _book(self, commit: pygit2.Commit, by: tuple[Machine, float, float] | None) -> None:
         self.counts["commits"] += 1
         claims = claims_of(self.claims(str(commit.id)).values())
-        records = _records_in(commit)
+        records = _kept_replicas(commit)
         self.books.told = {
             subject: what["node"] for (_, subject), (what, _) in claims.items() if "node" in what
         }
@@ -189,7 +189,7 @@ class Oracle:
                 )
                 for one, topics in running.items()
             )
-            found = sorted(_counters(commit))
+            found = sorted(_rendered_instances(commit))
             assert found == expected, f"after {commit.message}\n{found} run, not {expected}"
 
     def _time_of_own_work(
@@ -321,7 +321,7 @@ class Oracle:
                 self._last[asked.machine] = place
 
     def _assert_possible(self, asked: Asked, outcome: str) -> None:
-        """Fail unless the model allows the outcome in a state between the demand and its answer."""
+        """Fail unless the outcome is right for the model at some time since the demand was made."""
         said = self._possible(asked)
         told = f"{asked.goal} was answered {outcome} {asked.ticket.future.exception() or ''}"
         assert outcome in said, f"{told}, but the model says {said}"
@@ -337,7 +337,7 @@ class Oracle:
     # ---- machines ----
 
     def _check_resumed(self, machine: Machine) -> None:
-        """Fail if a machine lost a demand in a crash; watch the answers to its other demands."""
+        """Fail if a restarted machine lost a demand; watch the answers to those that it resumed."""
         self._last.pop(machine, None)
         assert machine.generator is not None
         tickets = machine.generator._demands._tickets
@@ -389,8 +389,8 @@ def _made(commit: pygit2.Commit) -> datetime:
     return datetime.fromtimestamp(commit.commit_time, timezone.utc)
 
 
-def _records_in(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    """Return, for each instance, until when it keeps each number of replicas."""
+def _kept_replicas(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
+    """Return the numbers of replicas that each instance keeps, each with the time of its end."""
     return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
 
 
@@ -403,15 +403,15 @@ def _record(text: str) -> tuple[Instance, dict[int, datetime]]:
     }
 
 
-def _counters(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
+def _rendered_instances(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
     """Yield namespace, version, topics and replicas of each rendered instance."""
     for path, blob in trees.blobs(commit.tree, ["clusters"]):
         if Path(path).name.startswith("ta-"):
-            yield _counter(trees.text_of(blob))
+            yield _rendered_instance(trees.text_of(blob))
 
 
 @lru_cache(maxsize=1024)
-def _counter(text: str) -> tuple[str, str, list[str], int]:
+def _rendered_instance(text: str) -> tuple[str, str, list[str], int]:
     release = plain_yaml.load(text)
     values, tag = release["spec"]["values"], release["spec"]["values"]["image"]["tag"]
     version, topics = tag if tag == NEXT else "", sorted(values["inputs"]["egoData"])

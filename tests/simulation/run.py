@@ -59,14 +59,13 @@ def main() -> int:
     total = Counter(before) + counts
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(total, indent=2) + "\n")
-    print("this run:", told(counts))
-    print("all runs:", told(total))
+    print("this run:", as_line(counts))
+    print("all runs:", as_line(total))
     print(f"{counts['histories'] / minutes:.0f} histories in each minute of processor time")
     return 1 if counts["failures"] else 0
 
 
-def told(counts: Counter[str]) -> str:
-    """Return the counts as one line of text."""
+def as_line(counts: Counter[str]) -> str:
     names = (
         "histories",
         "demands",

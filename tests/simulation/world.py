@@ -77,7 +77,7 @@ class Machine(Runtime):
         self.world.on_start(self)
 
     def failed(self, name: str, error: Exception) -> None:
-        """Record an unexpected error as the failure of the world."""
+        """Let the history fail after an unexpected error."""
         super().failed(name, error)
         if not isinstance(error, DemandOpsError):
             self.world.failure = self.world.failure or error
@@ -167,7 +167,7 @@ class Clone(RemoteRepository):
         super().__init__(machine.name, folder, lambda text: None, allow_offline)
 
     def tidy(self) -> None:
-        """Do nothing, because all clones share one folder of objects."""
+        """Do not repack, because all clones share one folder of git objects."""
 
     def _clone(self, notify: Callable[[str], None]) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)

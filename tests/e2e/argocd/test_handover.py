@@ -43,25 +43,25 @@ def test_every_pod_stays_there_and_back(
         flux.wait_lines(WITHOUT_DEMANDS)
         world.step(1, expected.after(1))
         flux.wait_releases()
-        before = flux.pods()
+        before = flux.uids()
 
         from_flux(flux)
         argocd = to_argocd(world)
         argocd.wait_lines(expected.after(2))
         forget_flux(flux)
-        assert {name: argocd.pods()[name] for name in before} == before
+        assert {name: argocd.uids()[name] for name in before} == before
         sent = world.demand(expected.demand(3))
         argocd.wake()
         argocd.wait_applied(sent.commit)
         argocd.wait_lines(expected.after(3))
         argocd.wait_releases()
 
-        before = argocd.pods()
+        before = argocd.uids()
         forget_argocd(argocd)
         to_flux(world)
         flux.wait_lines(expected.after(4))
         flux.wait_releases()
-        assert {name: flux.pods()[name] for name in before} == before
+        assert {name: flux.uids()[name] for name in before} == before
         for step in (5, 6, 7, 8):
             world.step(step, expected.after(step))
     finally:

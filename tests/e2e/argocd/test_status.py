@@ -19,5 +19,5 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 class TestArgoCD(Answers):
     def read_repaired_chart(self, world: Any) -> None:
-        """Refresh the Application, because Argo CD reads a chart folder only every few minutes."""
+        """Make Argo CD read the chart now; by itself, Argo CD reads it only every few minutes."""
         world.domain.refresh("od-edge-vehicle00")

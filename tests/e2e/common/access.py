@@ -1,4 +1,4 @@
-"""The access file of a cluster and a kubeconfig with few rights."""
+"""A cluster's access file, and a kubeconfig with few rights."""
 
 from __future__ import annotations
 

@@ -100,9 +100,9 @@ def push_chart(world: World, added: str) -> dict[str, str]:
 
 
 class Answers:
-    """A demand is answered once it is reconciled or healthy.
+    """A demand is answered when it is reconciled or healthy; its field ``answer`` says which.
 
-    If neither ever happens, the answer says why.
+    If the demand cannot become so, the answer says why.
     """
 
     def read_repaired_chart(self, world: World) -> None:
@@ -157,7 +157,7 @@ class Answers:
     def test_not_answered_before_it_is_healthy(
         self, world: World, requester: DemandClient, edge_is_full: Callable[[], None], rig: Rig
     ) -> None:
-        """The demand is reconciled at once, and healthy only when the edge accepts pods again."""
+        """While the edge accepts no pods, the demand is reconciled but not answered."""
         reconciled = threading.Event()
 
         def on_stage(stage: str, text: str) -> None:

@@ -17,8 +17,9 @@ from examples.experiment import paper
 EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
 
 CLUSTER = "c-its"
+"""The cluster of the skeleton."""
 NAMESPACE = "perception"
-"""The cluster and the access domain of the skeleton."""
+"""The skeleton's access domain, and the domain's namespace."""
 
 STEPS = range(1, len(paper.STEPS) + 1)
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
@@ -60,7 +61,7 @@ def target_end(node: str) -> str:
 
 
 def after(step: int, nodes: Collection[str] = NODES) -> frozenset[str]:
-    """Return a line for each object that must exist after a step on a cluster with these nodes."""
+    """Return a line for each object that a cluster with these nodes must have after a step."""
     rows = paper.expected(step) if step else {}
     lines = [line for row in rows for node, line in _of_row(row, rows) if node in nodes]
     return WITHOUT_DEMANDS | frozenset(lines)

@@ -1,4 +1,4 @@
-"""Manifests that a mistake or an attacker might commit to the folder of an access domain."""
+"""Manifests that a careless person or an attacker might commit to an access domain's folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Manual changes of a cluster, and a goal of another requester."""
+"""Changes that a test makes to a cluster by hand, and a goal with chosen requesters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .namespace import Namespace
 
 
 def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """Copy a goal; return the copy, in which this vehicle and station00 are the requesters."""
+    """Return a copy of the goal whose requesters are ``vehicle`` and station00."""
     requesters = {"requester_ids": [vehicle, "station00"]}
     apps = [
         app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
@@ -41,7 +41,7 @@ def overwrite(namespace: Namespace, config: str, key: str) -> None:
 def wait_restored(
     namespace: Namespace, template: dict[str, Any], data: dict[str, str], *names: str
 ) -> None:
-    """Wait until a Deployment has this pod template again, and a ConfigMap this data.
+    """Wait until a Deployment has `template` again and a ConfigMap has `data` again.
 
     `names` are the names of the Deployment and the ConfigMap.
     """

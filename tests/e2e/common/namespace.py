@@ -99,11 +99,11 @@ class Namespace:
         sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
         return metadata["uid"], metadata["generation"], *pods, *sets
 
-    def pods(self) -> dict[str, tuple[object, ...]]:
+    def uids(self) -> dict[str, tuple[object, ...]]:
         """Return the UIDs of each Deployment, its pods and ReplicaSets, by the Deployment's name.
 
-        The generation is left out: it changes when another controller applies the Deployment and
-        writes a default value explicitly.
+        `identity` has the Deployment's generation too. The generation changes when another
+        controller applies the Deployment and writes a default value explicitly.
         """
         found = {}
         for item in self.find("Deployment"):
@@ -134,7 +134,7 @@ class Namespace:
         raise NotImplementedError
 
     def wait_checked(self, commit: str) -> None:
-        """Wait until the controller has compared every release with a commit."""
+        """Wait until the controller has compared every release with the given commit."""
         raise NotImplementedError
 
     def folder_trouble(self) -> str:
@@ -148,7 +148,7 @@ class Namespace:
     def restore(self, *releases: str) -> None:
         """Make the controller restore these releases, or the domain's folder if none is named.
 
-        The default does nothing, which is right for a controller that restores them by itself.
+        A subclass overrides this empty method if its controller does not restore by itself.
         """
 
     # --- waiting ----------------------------------------------------------------------------

@@ -183,7 +183,7 @@ class StateRepo(Generic[Domain]):
         return self.follow(self.demand(demand(number)), wanted, wake=wake)
 
     def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
-        """Wait until the only cluster has exactly these lines after a goal that succeeded.
+        """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted.
 
         Return the times at which the goal reached its stages. With `wake`, trigger the controller
         first.

@@ -64,7 +64,7 @@ def test_eight_steps_and_the_fusion_is_never_restarted(world: World, say: Report
 def test_a_service_that_cannot_start_is_reconfigured_and_removed(
     world: World, edge_is_full: object
 ) -> None:
-    """Later demands do not wait for the service, although Helm waits five minutes by default."""
+    """Later demands are applied without delay, although Helm waits five minutes by default."""
     domain = world.domain
     for step in (1, 2, 3):
         sent = world.demand(expected.demand(step))
@@ -225,7 +225,7 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
     ]
     world.step(1, expected.after(1))
     domain.wait_releases()
-    before, releases = domain.pods(), domain.releases()
+    before, releases = domain.uids(), domain.releases()
     assert before
     assert len(releases) == 3
 
@@ -235,29 +235,26 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
     domain.kube.wait(  # each retry clears the error for a moment
         f"the controller to fail on each {foreign}", lambda: foreign in domain.folder_trouble()
     )
-    assert domain.pods() == before
+    assert domain.uids() == before
     assert domain.releases() == releases
 
     demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", domain.GITOPS)
     domain.wake()
     domain.wait_applied(world.tip())
-    assert domain.pods() == before
+    assert domain.uids() == before
     for step in (2, 3):
         world.step(step, expected.after(step))
 
 
-def _controller(rig: Rig) -> list[str]:
-    """Create the golden manifests' namespace; return kinds that these manifests must include.
-
-    These are the kinds that the GitOps controller itself defines, and Deployment.
-    """
+def _prepare_golden(rig: Rig) -> list[str]:
+    """Create the golden manifests' namespace; return kinds that the manifests must include."""
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
     return [*PARTS[rig.gitops].KINDS, "Deployment"]
 
 
 def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
     """The manifests use the controller's own kinds, whose CRDs the API server knows."""
-    kinds = _controller(rig)
+    kinds = _prepare_golden(rig)
     manifests = list(golden(rig.gitops))
     assert {*kinds, "Role"} <= {manifest["kind"] for manifest in manifests}
     rig.kube.apply(*manifests, dry_run=True)
@@ -265,7 +262,7 @@ def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
 
 def test_the_dry_run_refuses_an_unknown_field(rig: Rig) -> None:
     """Without this check, `test_the_server_takes_every_golden_manifest` might prove nothing."""
-    for kind in _controller(rig):
+    for kind in _prepare_golden(rig):
         broken = copy.deepcopy(next(item for item in golden(rig.gitops) if item["kind"] == kind))
         broken["spec"]["interwal"] = "1m"
         with pytest.raises(Exception, match="field not declared in schema"):

@@ -35,7 +35,7 @@ class Times:
 
 
 class Table:
-    """A table of the times of several demands, each with a title."""
+    """A table of times with one titled row for each demand."""
 
     def __init__(self, heading: str) -> None:
         self._heading = heading

@@ -25,7 +25,7 @@ CLUSTERS, INVENTORY = "inventory/clusters.yaml", "inventory/nodes.yaml"
 
 @pytest.fixture(scope="module")
 def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """The vehicles' own cluster, which reads the same Git server as the first one."""
+    """A second cluster, for the vehicles; both clusters read the Git server of `rig`."""
     cluster = Rig(FLEET, nodes=VEHICLES, git_of=rig, report=say)
     if rig.existing and cluster.existing == rig.existing:
         pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} does not name a second cluster")

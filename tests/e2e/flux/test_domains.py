@@ -1,6 +1,6 @@
 """An access domain's service account can change only the domain's own namespace.
 
-Each case commits to the domain's folder what a mistake or an attacker might commit.
+Each case commits to the domain's folder what a careless person or an attacker might commit.
 """
 
 from __future__ import annotations
@@ -183,8 +183,8 @@ def test_what_the_cluster_refuses_of_a_commit_is_reported(world: World, slip_in:
     assert world.domain.kube.get("Deployment", "foreign", world.domain.namespace) is None
 
 
-def test_without_the_mark_the_hosts_network_is_refused(world: World) -> None:
-    """The operator applies the bootstrap file of a policy that no longer allows host-network."""
+def test_the_hosts_network_is_refused_once_the_policy_forbids_it(world: World) -> None:
+    """The operator must apply the bootstrap file, because it brings the policy to the cluster."""
     domain = world.domain
     nodes = world.file(NODES).replace("    type:", "    hostNetwork: false\n    type:")
     policy = world.file(POLICY).replace("podSecurity: host-network", "podSecurity: baseline")

@@ -28,18 +28,18 @@ def test_an_upgrade_from_the_first_version_restarts_the_fusion_alone(
     domain = world.bootstrap(CLUSTER, rig)
     domain.wait_lines(expected.after(3))
     domain.wait_releases()
-    before = domain.pods()
+    before = domain.uids()
     assert before
 
     demandops(world.folder, "upgrade", "--state-repo", world.push_url)
     domain.wake()
     domain.wait_applied(world.tip())
     domain.wait_releases()
-    after = domain.pods()
+    after = domain.uids()
     assert after.keys() == before.keys()
     assert {name for name in before if after[name] != before[name]} == {expected.FUSION}
     world.bootstrap(CLUSTER, rig)  # the upgrade requires this
-    assert domain.pods() == after
+    assert domain.uids() == after
     (fusion,) = domain.find("HelmRelease", expected.FUSION)
     assert fusion["metadata"]["labels"]["app.kubernetes.io/part-of"] == "object-detection-fusion"
 

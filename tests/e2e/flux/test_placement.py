@@ -37,13 +37,13 @@ def test_services_wait_follow_a_drain_and_an_override_and_run_apart(
     merge(world, requester, gpus(world, cloud=1, station00=1))
     on_station = fused("second", "vehicle01", "station00")
     wait_for(world, fused("first", "vehicle00", "cloud", delivered=True) | on_station)
-    before = world.domain.pods()
+    before = world.domain.uids()
 
     merge(world, requester, gpus(world, cloud=1, station00=3, drained="cloud"))
     wait_for(world, fused("first", "vehicle00", "station00", delivered=True) | on_station)
     stays = [name for name in before if name.startswith("of-second")]
     assert stays
-    assert {n: world.domain.pods()[n] for n in stays} == {n: before[n] for n in stays}
+    assert {n: world.domain.uids()[n] for n in stays} == {n: before[n] for n in stays}
 
     merge(world, requester, {OVERRIDE: override(["first"], "edge")})
     moved = fused("first", "vehicle00", "edge", delivered=True)

@@ -42,11 +42,11 @@ def test_four_services_on_three_nodes_serve_two_vehicles(
     at_first = domain.inventory() | {"HelmChart ros-launch-0.2.0"}  # from the next commit on
     put(world, requester, "vehicle00", "vehicle01")
     assert_exact(domain, "vehicle00", "vehicle01")
-    before = domain.pods()
+    before = domain.uids()
 
     put(world, requester, "vehicle00")
     assert_exact(domain, "vehicle00")
-    after = domain.pods()
+    after = domain.uids()
     assert after == {name: before[name] for name in after}, (
         "a pod that both demands need was restarted"
     )
@@ -116,7 +116,7 @@ def ego_data(vehicle: str) -> str:
 
 
 def put(world: World, requester: DemandClient, *vehicles: str) -> None:
-    """Demand the application for these vehicles, with its plan delivered to each."""
+    """Demand the application for these vehicles; its output `planner.plan` is delivered to each."""
     application = {
         "id": "edge/object_detection_fusion",
         "type": "object-detection-fusion",
@@ -160,7 +160,7 @@ def assert_exact(domain: Namespace, *vehicles: str) -> None:
 
 
 def lines(*vehicles: str) -> Iterator[str]:
-    """Yield a line for everything that must exist for these vehicles, and the fusion's inputs."""
+    """Yield a line for each object and each input of the fusion that these vehicles need."""
     yield from (f"ConfigMap {FUSION}-{part}" for part in ("params", "watcher"))
     services = [(FUSION, "edge"), (PLANNER, "edge")]
     clients = []

@@ -34,8 +34,8 @@ FLEETS = {
     ("mqtt-derived-vehicle00-edge-source", "vehicle00"),
     ("mqtt-derived-vehicle00-edge-target", "edge"),
 }
-SENT_TO_THE_CITY = {("mqtt-derived-vehicle00-edge-city-source", "vehicle00")}
-"""The source end of the city's connection; it runs in the vehicle's own domain, the first one."""
+TO_THE_CITY = {("mqtt-derived-vehicle00-edge-city-source", "vehicle00")}
+"""The source end of the connection to the city; it runs in the access domain of the vehicle."""
 CITYS = {
     ("od-edge-city-vehicle00", "edge"),
     ("of-edge-lights", "edge"),
@@ -81,11 +81,11 @@ def test_two_domains_share_a_machine_and_nothing_else(
     fleet, city = world.domains[NAMESPACE], world.domains[CITY]
     assert requester.put("fleet", [application("edge/fleet")]).outcome == "booked"
     wait_for({fleet: FLEETS, city: set()})
-    before = fleet.pods()
+    before = fleet.uids()
 
     assert traffic.put("lights", [application("edge/lights")]).outcome == "booked"
-    wait_for({fleet: FLEETS | SENT_TO_THE_CITY, city: CITYS})
-    assert {name: fleet.pods()[name] for name in before} == before, (
+    wait_for({fleet: FLEETS | TO_THE_CITY, city: CITYS})
+    assert {name: fleet.uids()[name] for name in before} == before, (
         "a pod of the first domain was restarted"
     )
     assert ros_domains(city) == {CITY_ROS}
@@ -94,7 +94,7 @@ def test_two_domains_share_a_machine_and_nothing_else(
     assert granted(fleet, of=city) == granted(city, of=fleet) == set()
 
     requester.release("fleet")
-    wait_for({fleet: SENT_TO_THE_CITY, city: CITYS})
+    wait_for({fleet: TO_THE_CITY, city: CITYS})
     traffic.release("lights")
     for domain in (fleet, city):
         domain.wake()
@@ -130,7 +130,7 @@ def two_domains(world: World) -> dict[str, str]:
 
 
 def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
-    """Wait until exactly these pods run in each domain; each is a pair of a name and a node."""
+    """Wait until each domain runs exactly its pods, given as pairs of a name and a node."""
 
     def same() -> bool:
         for domain in wanted:

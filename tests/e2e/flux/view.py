@@ -17,7 +17,7 @@ SOURCE = "demandops"  # the GitRepository's name
 
 
 class Domain(Namespace):
-    """The domain's namespace on one cluster; the Kustomization `name` applies the folder."""
+    """An access domain on one cluster; the Kustomization `name` applies the domain's folder."""
 
     GITOPS = "flux"
     RELEASE = "HelmRelease"

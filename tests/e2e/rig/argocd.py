@@ -30,7 +30,7 @@ WEBHOOK_SECRET = secrets.token_hex(16)
 """The secret that signs calls of Argo CD's webhook."""
 
 
-def settings() -> list[Manifest]:
+def prerequisites() -> list[Manifest]:
     """Return the manifests that Argo CD's parts need before they start, as docs/argocd.md says."""
     labels = {"app.kubernetes.io/part-of": "argocd"}
     return [
@@ -55,7 +55,7 @@ def settings() -> list[Manifest]:
 def components(
     binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
 ) -> list[Component]:
-    """Return Redis and the three parts; `own` contains further arguments by component name."""
+    """Return Redis and the components of Argo CD; `own` maps a name to additional arguments."""
     redis, repo_server, server_port, data = free_port(), free_port(), free_port(), folder / "argocd"
     data.mkdir(parents=True, exist_ok=True)
     cache = f"--redis={LOOPBACK}:{redis}"

@@ -39,13 +39,17 @@ PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
 class Rig:
     """A cluster; several can run at once, each with its own ports and folder.
 
-    `nodes` are the ids of its nodes. `gitops` is its GitOps controller; `beside`, if given, is a
-    second one. `git_of` is another rig, whose Git server this rig uses, so that two clusters read
-    one state repo.
-    `credentials` are a user and a password, which the Git server then requires. `arguments` has
-    further arguments for controllers, by the controller's name. `folder` gets data and logs. By
-    default it is a temporary folder, which the rig removes at the end unless E2E_KEEP is set; after
-    a failure the logs stay.
+    Args:
+        name: the rig's name, as in E2E_KUBECONFIG_<NAME>.
+        gitops: the GitOps controller.
+        beside: a second GitOps controller.
+        nodes: the ids of the nodes at the start.
+        git_of: another rig, whose Git server this rig uses, so that two clusters read one repo.
+        credentials: the user and the password that the Git server requires.
+        arguments: additional arguments of controllers, by the controller's name.
+        folder: the folder of data and logs. The default is a temporary folder, which the rig
+            removes at the end unless E2E_KEEP is set; after a failure, the logs stay.
+        report: a function that shows the progress.
     """
 
     kube: Kube
@@ -189,19 +193,19 @@ class Rig:
         return self._own().log(component)
 
     def url(self, component: str) -> str:
-        """Return the URL at which tests call a part."""
+        """Return the URL at which tests call a component."""
         return self._own().url(component)
 
     def kill(self, component: str) -> None:
-        """Kill a part, which simulates a crash; `start_component` starts it again."""
+        """Kill a component, as a crash would; `start_component` starts it again."""
         self._own().kill(component)
 
     def stop_component(self, component: str) -> None:
-        """Stop a part: ask it to end, and kill it if it does not."""
+        """Ask a component to end, and kill it if it does not end."""
         self._own().stop(component)
 
     def start_component(self, component: str) -> None:
-        """Start a part again, on the same ports and data, and wait until it is ready."""
+        """Start a component again, on the same ports and data, and wait until it is ready."""
         self._own().start(component)
 
     def restart(self, component: str) -> None:
@@ -209,7 +213,7 @@ class Rig:
         self.start_component(component)
 
     def pause(self, component: str) -> None:
-        """Pause a part: it accepts connections and never answers."""
+        """Pause a component: it accepts connections and never answers."""
         self._own().signal(component, signal.SIGSTOP)
 
     def resume(self, component: str) -> None:
@@ -249,7 +253,7 @@ class Rig:
         self.kube.install_crds(tools.crd_files(self._binaries))
         parts = [PARTS[controller] for controller in self._controllers]
         for part in parts:
-            self.kube.apply(*part.settings())
+            self.kube.apply(*part.prerequisites())
         clock.lap("CRDs and settings")
         running.start_together(
             [

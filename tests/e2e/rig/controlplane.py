@@ -52,7 +52,7 @@ class ControlPlane:
         return Component("etcd", tuple(argv), answers(self.etcd_port, "/readyz"))
 
     def apiserver(self) -> Component:
-        """Return the API server, which is ready after its own post-start hooks."""
+        """Return the API server; it counts as ready once its post-start hooks have run."""
         pki = self.pki
         argv = [
             str(self.binaries["kube-apiserver"]),

@@ -21,7 +21,7 @@ REMEDY = "install Flux (source-, kustomize- and helm-controller) there first"
 CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
 
 
-def settings() -> list[Manifest]:
+def prerequisites() -> list[Manifest]:
     """Return the manifests that must exist before the controllers start."""
     return [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}]
 
@@ -29,7 +29,7 @@ def settings() -> list[Manifest]:
 def components(
     binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
 ) -> list[Component]:
-    """Return the three controllers; `own` contains further arguments by controller name."""
+    """Return the three controllers; `own` maps a controller's name to additional arguments."""
     storage = folder / "artifacts"
     storage.mkdir(parents=True, exist_ok=True)
     artifacts = f"{LOOPBACK}:{free_port()}"

@@ -168,13 +168,13 @@ class _Counter:
 def _watched(
     argv: list[str],
     workspace: Workspace,
-    line: Callable[[str], bool] = lambda line: False,
+    is_progress: Callable[[str], bool] = lambda line: False,
     tick: Callable[[], None] = lambda: None,
 ) -> str:
     """Run a command and return its standard output.
 
-    The function `line` gets each line of the command's standard error, and returns whether the line
-    reports only progress. The function `tick` is called while no line comes.
+    The function `is_progress` is called with each line of the command's standard error, and says
+    whether the line reports only progress. The function `tick` is called while no line comes.
     """
     folder = workspace.module
     process = subprocess.Popen(
@@ -199,7 +199,7 @@ def _watched(
     for thread in threads:
         thread.start()
     try:
-        shown = _follow(errors, line, tick)
+        shown = _follow(errors, is_progress, tick)
         code = process.wait()
     except BaseException:
         with contextlib.suppress(ProcessLookupError):
@@ -224,11 +224,12 @@ def _pump(stream: IO[str], lines: queue.Queue[str | None]) -> None:
 
 
 def _follow(
-    lines: queue.Queue[str | None], line: Callable[[str], bool], tick: Callable[[], None]
+    lines: queue.Queue[str | None], is_progress: Callable[[str], bool], tick: Callable[[], None]
 ) -> deque[str]:
-    """Pass each line to `line` until None comes; return the last lines that do not report progress.
+    """Read lines until None comes; return the last lines that do not report progress.
 
-    `tick` is called after each second without a line, because Go prints nothing while it links.
+    `is_progress` is called with each line. `tick` is called after each second without a line,
+    because Go prints nothing while it links.
     """
     shown: deque[str] = deque(maxlen=_SHOWN_LINES)
     while True:
@@ -239,7 +240,7 @@ def _follow(
             continue
         if text is None:
             return shown
-        if not line(text):
+        if not is_progress(text):
             shown.append(text)
 
 

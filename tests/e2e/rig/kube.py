@@ -141,7 +141,7 @@ class Kube:
     def rules(self, account: str, namespace: str, home: str = "") -> list[Manifest]:
         """Return the rules that say which resources of a namespace a service account may use.
 
-        The account itself is in the namespace `home`, by default in `namespace`.
+        `home` is the namespace of the account; the default is `namespace`.
         """
         who = f"system:serviceaccount:{home or namespace}:{account}"
         api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)

@@ -120,7 +120,7 @@ class Processes:
         os.killpg(process.pid, number)
 
     def stop_all(self) -> None:
-        """Stop everything, last started first; a second interrupt kills the others at once."""
+        """Stop all components, the newest first; an interrupt meanwhile kills all that are left."""
         try:
             for batch in reversed(self._batches):
                 self._stop_batch(batch)

@@ -1,7 +1,7 @@
 """An existing cluster for the tests, if the environment names one.
 
 With E2E_KUBECONFIG and E2E_GIT_URL the tests use an existing cluster (kind, k3d) with Flux and
-kwok, and start nothing. E2E_KUBECONFIG_<NAME> is the kubeconfig for only the rig of that name.
+kwok, and start nothing. For the rig <NAME>, E2E_KUBECONFIG_<NAME> replaces E2E_KUBECONFIG.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Build the rig's programs from pinned Go modules, once, into a cache outside the checkout.
 
-The other modules of the rig take the paths that `ensure` returns. A wrapper module under
-`tests/e2e/tools/` pins each program; the wrapper's `go.sum` covers all dependencies. The name of a
-cache entry is a digest of everything that decides the program's bytes. An entry appears by one
-rename, so each existing entry is complete.
+The other modules of the rig take the paths that `ensure` returns. Each program is pinned by a Go
+module of its own under `tests/e2e/tools/`, whose `go.sum` covers all dependencies.
+
+The name of a cache entry is a digest of everything that decides the program's bytes. A finished
+entry is renamed into the cache, so each existing entry is complete.
 
 `python -m tests.e2e.rig.tools` builds all programs and prints how long each took. With `--for flux`
 it builds the programs of a rig with Flux.

@@ -11,12 +11,12 @@ PROGRAMS = {
     ("object_fusion", "fusion_function_launch.py"): "fusion",
     ("mqtt_client", "standalone.launch.ros2.xml"): "mqtt_client",
 }
-"""The stand-in for each launch file of the reference's images."""
+"""For each launch file of the reference's images, the module that stands in for it."""
 OURS = ("demandops_ros", "parameter_sync.launch.xml")
 
 
 def main(launch: str, package: str, file: str, *arguments: str) -> None:
-    """Run the program that a launch file starts, or the program's stand-in."""
+    """Run the program of our own launch file, or the stand-in for one of the reference."""
     assert launch == "launch", launch
     given = dict(argument.split(":=", 1) for argument in arguments)
     if (package, file) == OURS:

@@ -38,12 +38,12 @@ class MqttClient(Node):
         self._broker.on_message = self._take
         self._broker.connect(self._value("broker.host", ""), self._value("broker.port", 1883))
         self._broker.loop_start()
-        self._look = self.create_timer(_LOOK_S, self._find_types)
+        self._look = self.create_timer(_LOOK_S, self._subscribe_known)
 
     def _value(self, name: str, default: Any) -> Any:
         return self.get_parameter_or(name, rclpy.Parameter(name, value=default)).value
 
-    def _find_types(self) -> None:
+    def _subscribe_known(self) -> None:
         """Subscribe to the topics whose types have appeared in the ROS graph."""
         known = dict(self.get_topic_names_and_types())
         for topic in sorted(self._unknown & known.keys()):

@@ -120,15 +120,15 @@ class Pod:
         for container in self._spec.get("initContainers", ()):
             self._run(container, [sys.executable, *container["command"][1:]])
 
-    def path(self, container: dict[str, Any], text: str) -> str:
-        """Return ``text`` with the container's mount paths replaced by this pod's folders."""
+    def _on_host(self, container: dict[str, Any], text: str) -> str:
+        """Return ``text`` with the container's mount paths replaced by its volumes' folders."""
         for mount in container["volumeMounts"]:
             text = text.replace(f"{mount['mountPath']}", str(self.folder / mount["name"]))
         return text
 
     def _run(self, container: dict[str, Any], command: list[str]) -> str:
         done = subprocess.run(
-            [self.path(container, part) for part in command],
+            [self._on_host(container, part) for part in command],
             capture_output=True,
             text=True,
             timeout=60,
@@ -149,7 +149,7 @@ class Pod:
         read = json.loads(self._run(container, [sys.executable, script, "--ros-args", *ros_args]))
         assert read["node"] == self.deployment["metadata"]["name"].replace("-", "_")
         found: dict[str, Any] = read["parameters"]
-        found["broker.tls.ca_certificate"] = self.path(
+        found["broker.tls.ca_certificate"] = self._on_host(
             container, found["broker.tls.ca_certificate"]
         )
         return found
@@ -188,7 +188,7 @@ class Client:
         self.arrived.append((message.topic, message.payload, message.qos, message.retain))
 
     def publish(self, ros_topic: str, payload: bytes) -> None:
-        """Publish a message of a ROS topic to the broker as the parameters require."""
+        """Publish to the broker what the client would publish for a message of a ROS topic."""
         prefix = f"bridge.ros2mqtt.{ros_topic}"
         sent = self._client.publish(
             self.parameters[f"{prefix}.mqtt_topic"],

@@ -13,7 +13,7 @@ from tests.kit.repo import Person
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """In every test, Petra is the author of the commits that git makes for a person."""
+    """Make Petra the author of what a test commits with git."""
 
 
 @pytest.fixture

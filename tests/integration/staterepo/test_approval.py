@@ -215,10 +215,10 @@ def test_decisions_made_while_no_generator_runs_take_effect_at_the_next_start(
 
 
 @pytest.mark.parametrize("how", ["generator-runs", "merged-while-away", "rebased-while-away"])
-def test_two_proposals_from_one_tip_come_to_what_two_demands_come_to(
+def test_two_proposals_from_one_tip_give_what_two_demands_give(
     bare: Path, petra: Person, how: str
 ) -> None:
-    """Both proposals change the same fusion, so after the merge of one the other conflicts."""
+    """Both proposals change the same fusion. Once one proposal is merged, the other conflicts."""
     one, two = goal(0, vehicle=0), goal(5, vehicle=1)
     with rig.running(bare) as generator:
         first, second = Proposed(generator, one, "op-1"), Proposed(generator, two, "op-2")

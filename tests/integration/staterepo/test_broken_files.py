@@ -74,7 +74,7 @@ def test_a_broken_file_of_a_folder_holds_back_none_of_the_others(
 ) -> None:
     """Two pull requests each add a vehicle in a file of its own.
 
-    The first file is broken at first; later it repeats the id of the second vehicle.
+    The first file is broken, then valid with the second vehicle's id, then right.
     """
 
     def joining(id: str, **more: str) -> str:
@@ -117,8 +117,10 @@ def test_what_came_with_a_broken_file_waits_with_it(bare: Path, person: Person) 
     rig.assert_sound(bare)
 
 
-def test_of_a_file_that_breaks_later_the_version_before_stays(bare: Path, person: Person) -> None:
-    """The version that stays was merged while another file was broken."""
+def test_the_last_valid_version_of_a_broken_file_stays_in_effect(
+    bare: Path, person: Person
+) -> None:
+    """The last valid version was merged while another file was broken."""
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
         person.change({"overrides/broken.yaml": BROKEN})
@@ -266,7 +268,7 @@ FOREIGN = [
     '100644 "inventory/\\377/\\377.yaml"',
     "100644 policy/" + "deep/" * 3000 + "evil.yaml",
 ]
-"""Modes and paths of tree entries, in the form of ``git fast-import``."""
+"""Entries that a state repo should not have: mode and path, as ``git fast-import`` reads them."""
 
 
 def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_called(

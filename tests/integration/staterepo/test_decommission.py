@@ -23,7 +23,7 @@ def of(generator: Generator, subject: str) -> list[str]:
 def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     url: str, bare: Path, tmp_path: Path, demandops: Run
 ) -> None:
-    """A generator runs meanwhile, and fetches the commits of the command and of the person."""
+    """A running generator fetches the commit of `decommission` and the person's deletion."""
     person = Person(bare, tmp_path / "person")
     with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))

@@ -105,9 +105,10 @@ CHANGES = {
     "moved-node": ("http", _move_node, lambda text: "garage" in text),
     "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
 }
-"""By the name of a change: kind of address, function that makes the change, check of the result.
+"""Maps the name of a change to a kind of address, a function and a check.
 
-Each change is tested with one kind of address, because the result does not depend on the address.
+The function makes the change, and the check looks at the result. Each change is tested with one
+kind of address, because the result does not depend on the address.
 """
 
 
@@ -381,7 +382,7 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server, ba
 def test_all_that_waits_while_the_remote_is_away_survives_a_kill(
     url: str, bare: Path, drivers: rig.Drivers
 ) -> None:
-    """The demands are more than one push takes, and all of them are in the journal."""
+    """There are too many demands for one push; all are in the journal."""
     many = 250
     rig.restart(url)  # creates the clone
     with rig.away(bare):

@@ -211,10 +211,10 @@ def test_a_release_in_the_same_batch_as_its_join_stays_when_both_are_replayed(
     assert rig.claims(bare, "user1") == []
 
 
-def test_a_join_that_changed_nothing_before_its_release_is_not_booked_by_a_replay(
+def test_a_join_without_effect_is_not_booked_by_a_replay_after_its_release(
     drivers: Drivers, url: str, bare: Path
 ) -> None:
-    """The repeated join has no commit, but a later commit shows that it was handled."""
+    """The second of two equal joins has no commit; the release's commit shows it was handled."""
     opening = demand("join-1", goal(1))
     lanes = [[demand("join-1-again", goal(1))], [demand("leave-1", leave(1))]]
     drivers.start(url, lanes, opening=opening, die_at="published:2").listen()
@@ -245,7 +245,10 @@ def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
 def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
     bare: Path, data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, node: str
 ) -> None:
-    """The repeated join changed nothing or was refused; after the release it could be booked."""
+    """``again`` changes nothing (``edge``) or is refused (``cloud``).
+
+    If ``again`` were decided once more after the release, it would be booked.
+    """
     synced, again = {}, goal(1)
     again["apps"][0]["header"]["node_id"] = node
 

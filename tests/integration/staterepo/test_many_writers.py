@@ -24,8 +24,8 @@ pytestmark = pytest.mark.synced
 GENERATORS = 4
 DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "16"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
-LANES = 4
-"""The number of requesters at each generator; each waits for an answer before it sends again."""
+REQUESTERS = 4
+"""How many requesters each generator has; a requester sends again only after an answer."""
 CUTS = 0.01
 """The probability that an HTTP request is cut before the server handles it.
 
@@ -35,16 +35,16 @@ PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
 
 def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
-    """Return one generator's demands: a list for each of its :data:`LANES` requesters.
+    """Return one generator's demands: a list for each of its :data:`REQUESTERS` requesters.
 
     Of every three joins, one is followed by a leave.
     """
-    lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(LANES)]
+    lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(REQUESTERS)]
     left = DEMANDS // GENERATORS
     turn = 0
     while left > 0:
         number = GENERATORS * turn + who
-        lane = lanes[turn % LANES]
+        lane = lanes[turn % REQUESTERS]
         lane.append((f"join-{number}", rig.goal(number)))
         left -= 1
         if turn % 3 == 2 and left > 0:

@@ -55,10 +55,10 @@ def _break_claim(bare: Path) -> Callable[[Person], str]:
 EITHER = pytest.mark.parametrize(
     ("address", "running"), [("file-url", True), ("embedded", False)], indirect=["address"]
 )
-"""In one case, the generator runs during the change and uses a remote.
+"""While a person changes the repo, the generator runs and uses a remote, or is stopped.
 
-In the other case, the generator is stopped during the change and uses the repo in place. The other
-two combinations are left out, because the two conditions do not affect each other.
+The stopped generator uses the repo in place. Two combinations are enough, because ``address``
+and ``running`` do not affect each other.
 """
 
 
@@ -94,10 +94,10 @@ def _kinds(bare: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("deletes", [True, False], ids=["claims", "inventory"])
-def test_what_people_undo_of_another_generators_work_is_undone_in_its_files(
+def test_a_generator_renders_again_after_a_person_undid_another_generators_work(
     address: str, bare: Path, person: Person, tmp_path: Path, deletes: bool
 ) -> None:
-    """The first generator sees no difference between its last commit and the person's result."""
+    """The claims or brokers are as at the first generator's last commit; rendered files are not."""
     with rig.running(address) as first, rig.running(address, data=tmp_path / "other") as second:
         rig.book(first, goal(3))
         rig.book(second, goal(3))
@@ -340,7 +340,7 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
 def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """According to the clone, neither demand needs a push. But the remote has a newer commit."""
+    """By the clone, ``again`` changes nothing and ``late`` is refused; the remote is newer."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)

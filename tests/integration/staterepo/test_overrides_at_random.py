@@ -33,7 +33,7 @@ def override(select: dict[str, object], **effects: object) -> Write:
     return write
 
 
-def soon(chance: random.Random) -> str:
+def around_now(chance: random.Random) -> str:
     """Return a random time between one second ago and two seconds ahead."""
     moment = datetime.now(timezone.utc) + timedelta(seconds=chance.uniform(-1, 2))
     return moment.isoformat()
@@ -43,11 +43,13 @@ POOL: dict[str, Write] = {
     "frozen": override({"services": ["object-fusion"]}, hold=True, priority=5),
     "frozen-links": override({"connections": ["vehicle0[01]/*", "vehicle02/*"]}, hold=True),
     "lasting": override({"applications": ["edge/*"], "requesters": ["user1", "user5"]}, keep=True),
-    "lasting-links": override({"connections": ["*"]}, keep=True, expires=soon),
+    "lasting-links": override({"connections": ["*"]}, keep=True, expires=around_now),
     "closed": override({"requesters": ["user2"]}, deny=True),
-    "off": override({"services": ["object-detection"]}, deny=True, expires=soon),
+    "off": override({"services": ["object-detection"]}, deny=True, expires=around_now),
     "many": override({"requesters": ["user4", "user5"]}, replicas=3, priority=3),
-    "patched": override({"nodes": ["edge"]}, values={"tolerations": []}, priority=4, expires=soon),
+    "patched": override(
+        {"nodes": ["edge"]}, values={"tolerations": []}, priority=4, expires=around_now
+    ),
     "moved": override(
         {"applications": ["edge/fusion-2"]}, node="cloud", priority=lambda c: c.choice([2, 7])
     ),

@@ -130,12 +130,12 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
     rig.assert_sound(bare)
 
 
-def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_its_commits(
+def test_a_rejected_push_is_told_to_its_batch_and_a_refusal_to_the_refused_demand(
     url: str, bare: Path
 ) -> None:
-    """``moved`` contradicts another demand of its batch, but the batch is never published.
+    """``moved`` contradicts a demand of its batch, but no demand of the batch is published.
 
-    So the contradiction must not be the reason why ``moved`` fails.
+    So ``moved`` must fail because of the push, and not because of the contradiction.
     """
     gate = Gate()
     hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
@@ -158,7 +158,7 @@ def test_a_declined_push_is_told_to_its_batch_but_not_to_those_refused_before_it
     rig.assert_sound(bare)
 
 
-def test_a_remote_that_cannot_take_the_push_is_told_or_warned_of(
+def test_the_requester_or_the_log_is_told_that_the_remote_cannot_take_a_push(
     url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The remote itself, not a hook, refuses the push, as it may do when its disk is full."""

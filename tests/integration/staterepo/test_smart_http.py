@@ -16,7 +16,7 @@ from tests.kit.git_over_http import Server, serving
 from tests.kit.rig import Gate, goal, leave
 
 
-def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
+def test_a_demand_counts_once_when_the_answer_to_its_push_is_lost(
     http: str, server: Server, bare: Path
 ) -> None:
     with rig.running(http) as generator:
@@ -30,10 +30,10 @@ def test_an_answer_lost_after_the_push_was_taken_counts_the_demand_once(
     rig.assert_sound(bare)
 
 
-def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
+def test_demands_count_once_when_the_server_goes_away_before_it_answers_the_push(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """The generator cannot ask whether the server took the push; meanwhile other demands come."""
+    """Other demands come while the generator cannot ask whether the server took the push."""
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
         rig.book(generator, goal(0))
@@ -57,13 +57,12 @@ def test_an_answer_lost_by_a_server_that_then_goes_away_counts_the_demands_once(
     rig.assert_sound(bare)
 
 
-def test_a_repeated_join_before_a_release_is_not_booked_when_the_answer_is_lost(
+def test_a_repeated_join_is_not_booked_when_the_answer_to_the_later_release_is_lost(
     http: str, server: Server, bare: Path, clock: Clock
 ) -> None:
-    """The server takes the push of a release that follows a repeated join.
+    """The repeated join changes nothing. The server takes the release, but its answer is lost.
 
-    The repeated join changes nothing, so it has no commit. If the generator decided both
-    demands again on top of the release, it would book the join.
+    If the generator decided both demands again on top of the release, it would book the join.
     """
     gate = Gate()
     with rig.running(http, runtime=clock) as generator:
@@ -90,8 +89,8 @@ def _cut(server: Server) -> None:
     server.faults.cut_answers, server.faults.away_after_cut = 1, True
 
 
-def test_a_server_that_takes_no_push_for_a_while_is_waited_for(bare: Path) -> None:
-    """The words `403`, `denied` and `rejected` in the address must not count as a refusal."""
+def test_a_push_is_repeated_until_the_server_takes_it(bare: Path) -> None:
+    """`403`, `denied` and `rejected` in the server's address make no error a refusal."""
     prefix = "/403/denied-and-rejected"
     with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
         server.faults.no_pushes, server.faults.status = 3, 503

@@ -1,4 +1,4 @@
-"""What the generator promises a caller that submits demands, whatever the caller does."""
+"""The generator's promises to a caller of `submit` hold whatever the caller does."""
 
 from __future__ import annotations
 

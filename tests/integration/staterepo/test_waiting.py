@@ -94,7 +94,7 @@ def test_demands_wait_and_are_booked_in_turn_by_any_generator(
     rig.assert_sound(bare)
 
 
-def test_a_lost_answer_of_a_demand_that_waits_on_is_told_again(
+def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(
     bare: Path, person: Person, tmp_path: Path
 ) -> None:
     """The repeated demand gets no commit of its own; the next commit records that it waits."""

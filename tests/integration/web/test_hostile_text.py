@@ -1,4 +1,7 @@
-"""Text from outside adds no HTML and no command to the page, and hides no characters there."""
+"""Text from outside adds no HTML and no command to the page.
+
+The page shows invisible characters of the text as escapes.
+"""
 
 from __future__ import annotations
 

@@ -105,10 +105,10 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
     page.close()
 
 
-def test_views_of_earlier_moments_keep_no_other_waiting(
+def test_requests_for_earlier_commits_keep_no_other_request_waiting(
     served: WebServer, follower: Follower
 ) -> None:
-    """60 requests for earlier commits wait for the loading lock; the server has fewer threads."""
+    """60 requests for earlier commits wait for the loading lock. The server has fewer threads."""
     with ExitStack() as stack:
         stack.enter_context(follower._loading)
         for _ in range(60):

@@ -46,4 +46,4 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 
 @pytest.fixture(autouse=True)
 def _isolated(git_environment: None) -> None:
-    """In every test, Petra is the author of the commits that git makes."""
+    """Make Petra the author of what a test commits with git."""
