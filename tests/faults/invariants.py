@@ -47,8 +47,8 @@ def after_restart(
 ) -> Iterator[str]:
     """Book another demand in a fresh process, and yield each problem of the state repo.
 
-    Do nothing if an earlier call has found the same state of the disk sound, and no child of the
-    faulty process lingers that may still change the disk.
+    Do nothing if an earlier call found the same state of the disk sound, and the process with the
+    fault has left no child that still runs.
 
     Args:
         rig: the state repo.

@@ -5,13 +5,13 @@ files that a step writes, as real files that a reviewer and `kubectl` can read. 
 the file ``DELETED`` lists the paths that the step deletes. The first step, ``0-start``, is what
 `init` renders. The files in a case's ``state-repo/`` replace or extend the skeleton's files.
 
-What a folder has:
+The folder of a step has these files:
 
 - the start of ``experiment``: all files.
-- the start of another case: what differs from the start of ``experiment``.
-- a later step: what differs from the step before.
+- the start of another case: the files that differ from the start of ``experiment``.
+- a later step: the files that differ from the step before.
 - a later step of a case in ``FOLLOWING``, which plays the requests of ``experiment``: the changes
-  of this step that differ from those of the same step of ``experiment``.
+  that differ from the changes of the same step of ``experiment``.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class Sent:
     accepted: bool | None = None
     feedback: list[str] = field(default_factory=list)
     stages: dict[str, float] = field(default_factory=dict)
-    """When each stage was reported; ``pushed`` by the feedback or, at the latest, by the result."""
+    """When each stage was reported; the result reports ``pushed`` if no feedback did."""
     status: str = ""
     message: str = ""
     cancel: bool | None = None
