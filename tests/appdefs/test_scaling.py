@@ -291,11 +291,11 @@ class TestAutoscaler:
 
 
 @pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
-def test_an_override_that_doubles_what_is_published_is_told(divides: str, told: bool) -> None:
-    """The override makes a second replica of both services, driver and recorder.
+def test_a_warning_says_what_an_override_publishes_twice(divides: str, told: bool) -> None:
+    """The override runs two replicas of the driver and of the recorder.
 
-    That doubles what the driver publishes, unless its replicas divide the work. The recorder
-    publishes nothing, so no warning names it.
+    The second replica doubles what the driver publishes, unless the replicas divide the work. The
+    recorder publishes nothing, so no warning names it.
     """
     driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
     doubled = override({"services": ["*"]}, replicas=2)

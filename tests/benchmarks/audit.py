@@ -49,7 +49,7 @@ def lay_down(folder: Path, releases: int, commits: int) -> Path:
 
 
 def timed(what: str, call: Callable[[], object]) -> None:
-    """Call a function; print the question, the seconds that the call took, and its result."""
+    """Print ``what``, how many seconds ``call`` takes, and what ``call`` returns."""
     start = time.perf_counter()
     found = call()
     print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")

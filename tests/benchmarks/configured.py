@@ -87,7 +87,7 @@ domains:
 
 
 def configure(files: dict[str, str]) -> None:
-    """Configure every kind of decision in the files of a configuration."""
+    """Change a configuration's ``files`` so that they configure every kind of decision."""
     appdef = yaml.safe_load(files[APPDEF])
     appdef["versions"] = "separate"
     for service, scaling in (
@@ -138,13 +138,16 @@ def _when_idle() -> float:
 
 
 def reference(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a join and a shutdown of the reference's action; both name the node in any case."""
+    """Return a join and a shutdown for the reference's action, which always name the node."""
     join = fleet.goal(fleet.edge_id(edge), fleet.spare_id(edge))
     return [join, join | {"shutdown": True}]
 
 
 def demand(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a put and a release in our own format; if ``placed``, the put names no node."""
+    """Return a put and a release for the action ``Demand``.
+
+    If ``placed``, the put leaves the choice of the node to the generator.
+    """
     who, node = fleet.spare_id(edge), fleet.edge_id(edge)
     made = goals.put(f"of-{who}", who, topic=(f"/{who}/ego", who), node="" if placed else node)
     made["applications"][0]["connect"] = "mqtt"
@@ -164,7 +167,8 @@ GOALS: dict[str, Callable[..., list[dict[str, Any]]]] = {"reference": reference,
 def measure(folder: Path, releases: int, rounds: int) -> list[dict[str, Any]]:
     """Return a row for each kind of demand.
 
-    A row has the median times of a join in both repos, and the ratio of the second to the first.
+    A row has the median time of a join with nothing configured, the median time with everything
+    configured, and the ratio of the latter to the former.
     """
     plain = fleet.lay_down(folder / "plain.git", releases)
     full = fleet.lay_down(folder / "configured.git", releases, configure=configure)

@@ -32,7 +32,7 @@ ONE_TOPIC = {
 
 
 def rules() -> list[dict[str, Any]]:
-    """Return rules for 100 intersections in a square of 10 km, for pairs, and for a count."""
+    """Return 100 ``near`` rules, a ``together`` rule and a ``count`` rule."""
     areas = [
         rule(
             f"near-{number}",

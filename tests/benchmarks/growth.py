@@ -1,4 +1,4 @@
-"""Measure how the cost of a demand grows with the vehicles of its application and with its topics.
+"""Measure the cost of a demand, by the vehicles of its application and by the topics it lists.
 
 A vehicle joins and leaves an application that 10 to 1,000 other vehicles hold. A goal lists 10,
 1,000 or 8,000 topics. The benchmark measures wall-clock time and CPU time from ``submit`` to the
@@ -43,9 +43,9 @@ def _costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
 def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Row]:
     """Return a row for each size: what the join and the leave of one more vehicle cost.
 
-    A size is a number of vehicles or a number of topics. ``sizes`` maps each size to the number of
-    vehicles that hold the application. ``ego`` takes a size and a goal's number, and
-    returns the goal's ego topics.
+    A size is the number of vehicles that hold the application, or the number of topics that a goal
+    lists. ``sizes`` maps each size to the number of vehicles. ``ego`` takes a size and a goal's
+    number, and returns the goal's ego topics.
     """
     generators: dict[int, Generator] = {}
     rows: dict[int, Row] = {}
@@ -74,12 +74,12 @@ def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Ro
 
 
 def vehicles_rows(folder: Path, vehicles: Sequence[int]) -> list[Row]:
-    """Return a row for each number of vehicles on an application: what one more vehicle costs."""
+    """Return the cost of one more vehicle for each number of vehicles that share an application."""
     return _rows(folder, {size: size for size in vehicles}, ROUNDS, lambda size, number: [])
 
 
 def topics_rows(folder: Path, topics: Sequence[int]) -> list[Row]:
-    """Return a row for each number of topics in a goal: what the goal and its shutdown cost."""
+    """Return the cost of a goal and of its shutdown, for each number of topics in the goal."""
 
     def ego(size: int, number: int) -> list[str]:
         return [f"/t{number}/n{index}" for index in range(size)]

@@ -47,7 +47,10 @@ Row = dict[str, float]
 
 
 def _on_server(url: str) -> tuple[float, int]:
-    """Return the seconds in which the server serves a view again, and the view's size in bytes."""
+    """Return how many seconds the server takes for a view, and the view's size in bytes.
+
+    The server has already served the view once.
+    """
     for _ in range(2):
         start = time.perf_counter()
         with urllib.request.urlopen(url) as answer:  # noqa: S310 - the page on this machine

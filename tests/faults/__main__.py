@@ -30,7 +30,7 @@ from demandops.cli import main as command_line
 from tests.faults import disk, injection, power_loss
 from tests.faults.injection import Result
 from tests.faults.invariants import DEMAND
-from tests.faults.progress import Progress, Tried
+from tests.faults.progress import Passed, Progress
 from tests.faults.rig import Rig
 
 WORKERS = (os.cpu_count() or 1) + 1
@@ -61,25 +61,25 @@ def main() -> int:
         "--resume", action="store_true", help="go on with a run that was interrupted"
     )
     chosen = parser.parse_args()
-    tried = Tried(TRIED, resume=chosen.resume)
+    passed = Passed(TRIED, resume=chosen.resume)
     fast = MEMORY if MEMORY.is_dir() else None
     with tempfile.TemporaryDirectory(prefix="demandops-faults-", dir=fast) as folder:
         _prepare(Path(folder))
         tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
-        left = [each for each in tasks if str(each) not in tried.sound]
+        left = [each for each in tasks if str(each) not in passed.sound]
         known = f", of which {len(tasks) - len(left)} were tried before" if chosen.resume else ""
         print(f"{len(tasks)} tasks{known}", flush=True)
-        results = [one for each in tasks for one in tried.sound.get(str(each), [])]
+        results = [one for each in tasks for one in passed.sound.get(str(each), [])]
         progress = Progress(len(left))
         start = (Path(folder), not chosen.long)
         with get_context("fork").Pool(WORKERS, _start, start) as pool:
             for task, found in pool.imap_unordered(_run, left):
                 results += found
                 _tell_problems(found)
-                tried.add(task, found)
+                passed.add(task, found)
                 progress.add(found)
     _report(results, progress.seconds)
-    tried.finish()
+    passed.finish()
     return int(any(result.problems for result in results))
 
 

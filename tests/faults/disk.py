@@ -50,7 +50,7 @@ def full(rig: Rig, folder: Path, blocks: int) -> Result:
 
 @contextmanager
 def _small_disk(folder: Path) -> Iterator[None]:
-    """Put a folder on a small file system of its own for the length of a block."""
+    """Put a folder on a small file system of its own until the ``with`` block ends."""
     aside = folder.rename(folder.with_name("aside"))
     folder.mkdir()
     options = f"size={_SIZE},mode=0700"

@@ -1,4 +1,4 @@
-"""Errors and kills at the system calls of one demand; strace finds the calls and injects both."""
+"""Inject errors and kills, by strace, at the system calls that booking a demand makes."""
 
 from __future__ import annotations
 
@@ -45,24 +45,27 @@ _NEED_ROOM = {
 _INTERRUPTIBLE = {"flock", "fsync", "open", "openat", "pread64", "pwrite64", "read", "write"}
 KILL = "SIGKILL"
 _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
-"""The faults of the short form, without (false) and with (true) a remote."""
+"""The faults that a short run injects; the key says whether the state repo is remote."""
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often to count again and to repeat a fault that missed its call, because counts vary."""
-_TRIES_ON_JOURNAL = 40
-"""How often to repeat a fault that missed a call on the journal, in the two threads in turn.
+"""How often to repeat a fault that missed its call, because the number of a call varies.
 
-Either thread may journal a demand. For these faults, strace counts only calls on the journal
-(:func:`_counted`).
+Before each repetition, the calls are counted again.
+"""
+_TRIES_ON_JOURNAL = 40
+"""How often to repeat a fault that missed its call on the journal.
+
+Either of the two threads in ``_OTHER_THREAD`` may journal a demand, so the repetitions alternate
+between the two. For such a fault, strace counts only calls on the journal (:func:`_counted`).
 """
 _OTHER_THREAD = {
     "demandops-journal": "demandops-writer",
     "demandops-writer": "demandops-journal",
 }
 _KNOWN: dict[Path, list[Site]] = {}
-"""The calls that a demand makes in this process, by the rig's folder."""
-_OF_SERVER = (
+"""The system calls that booking :data:`DEMAND` makes in a rig; the key is the rig's folder."""
+_WITHOUT_REASON = (
     "failed to update ref",
     "unpack",
     "Killed",
@@ -72,20 +75,22 @@ _OF_SERVER = (
     "the server cannot read the branch",
     "check the path in the address",
 )
-"""Messages of a git process, here or at the server, that do not give the reason of its failure.
+"""Words of messages that do not say why a process of git failed, be it here or at the server.
 
-A server that cannot read its references offers none, so the remote "has no branch", or it offers a
-branch whose id has only zeros. A server that cannot read its folder says that the folder is no
-repository.
+If a server cannot read its references, it may offer no reference, so the generator says that the
+repo "has no branch". Or the server offers a branch whose id has only zeros. If a server cannot read
+its folder, it says that the folder is no repository.
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """Messages about files that libgit2 could not read; they give no reason."""
 
 
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""A call at the server whose error Git takes for the end of a list, so Git may lose an object.
+"""A system call of the server. If it fails, Git takes the error for the end of a list.
 
-The generator cannot see this loss. docs/reliability.md describes it under "Known and open".
+So Git may lose an object.
+
+The generator cannot see the loss. docs/reliability.md describes it under "Known and open".
 """
 
 
@@ -93,8 +98,9 @@ The generator cannot see this loss. docs/reliability.md describes it under "Know
 class Site:
     """The n-th call of a kind in a thread or process, and the class of file that it touches.
 
-    ``role`` is the thread or the program. If a process of git makes the call, ``which`` is its
-    number among the processes of the same git command, counted from 1. For a thread it is 0.
+    ``role`` is the name of the thread, or the git command of the process, such as ``git push``. For
+    a thread, ``which`` is 0. For a process, ``which`` is its number, from 1, among the processes of
+    the same git command.
     """
 
     role: str
@@ -104,11 +110,11 @@ class Site:
     creates: bool = False
     which: int = 0
     place: int = 0
-    """How many calls of the same class (:attr:`of_class`) came before this one."""
+    """How many calls of the same class (:attr:`call_class`) came before this one."""
 
     @property
-    def of_class(self) -> tuple[str, str, str, bool]:
-        """The class of a call: role, kind, class of file, and whether the call creates the file."""
+    def call_class(self) -> tuple[str, str, str, bool]:
+        """What calls of one class share: role, kind, class of file, and whether they create it."""
         return self.role, self.kind, self.file, self.creates
 
     @property
@@ -124,7 +130,7 @@ class Site:
     def faults(self) -> list[str]:
         """Return the faults that can be injected at this call.
 
-        A kill comes before the call, so it shows the state after the previous call.
+        A kill ends the process before the call, so the disk is as the previous call left it.
         """
         errors = ["EIO"]
         if self.kind in _BY_NAME:
@@ -162,7 +168,7 @@ class Result:
 
 
 def sites(rig: Rig) -> list[Site]:
-    """Return the calls of one demand.
+    """Return the system calls that booking :data:`DEMAND` makes.
 
     The demand is booked twice: strace traces the threads in one run, and git's processes in the
     other.
@@ -177,22 +183,26 @@ def sites(rig: Rig) -> list[Site]:
     made += _git_sites(rig, rig.must(rig.book(DEMAND, Strace(options, GIT), PLENTY_S)))
     found, counts = [], Counter[object]()
     for site in made:
-        found.append(replace(site, place=counts[site.of_class]))
-        counts[site.of_class] += 1
+        found.append(replace(site, place=counts[site.call_class]))
+        counts[site.call_class] += 1
     _KNOWN[rig.folder] = found
     return found
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return the call of a site, with the number that :func:`sites` found for it in this rig.
+    """Return a call with the number that :func:`sites` found for the call in this rig.
 
-    Numbers differ between processes, because a process may read more or fewer files. If the site's
-    thread did not make the call this time, return the call of another thread on the same class of
-    file.
+    The number of a call differs between processes, because a process may read more or fewer files.
+    If the site's thread did not make the call, return a call of the same kind that another thread
+    made on the same class of file.
     """
     known = _KNOWN[rig.folder]
-    same = [each for each in known if (each.of_class, each.place) == (site.of_class, site.place)]
-    threads = [each for each in known if each.is_threads and each.of_class[1:] == site.of_class[1:]]
+    same = [
+        each for each in known if (each.call_class, each.place) == (site.call_class, site.place)
+    ]
+    threads = [
+        each for each in known if each.is_threads and each.call_class[1:] == site.call_class[1:]
+    ]
     return next(iter(same or (threads if site.is_threads else [])), site)
 
 
@@ -232,17 +242,16 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    With ``short``, return only some of these faults:
+    With ``short``, choose some calls, and some faults for each:
 
-    - Only the last call of each class gets faults. Without a remote, the first call of each class
-      of syncs gets faults as well.
-    - A call that only reads gets only EIO. With a remote, it gets no fault.
-    - Any other call gets only those of its faults that ``_SHORT`` lists.
+    - The last call of each class. Without a remote, also the first call of a class of syncs.
+    - For a call that only reads: EIO. With a remote, no fault.
+    - For a call that changes or syncs a file: those of its faults that ``_SHORT`` lists.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
         if site.kind not in CANNOT_FAIL:
-            classes.setdefault(site.of_class, []).append(site)
+            classes.setdefault(site.call_class, []).append(site)
     made = []
     for group in classes.values():
         chosen = group
@@ -283,20 +292,21 @@ def run(rig: Rig, job: Job) -> Result:
 
 
 def _counted_anew(rig: Rig, wanted: Site, here: Site, *, only_here: bool) -> Site:
-    """Return a call with its number in a new process that meets no fault.
+    """Run a new process without a fault; return a call with the number that it has there.
 
     If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If
-    that thread or process does not make the call this time, trace all of them.
+    the thread or process does not make the call this time, trace all threads and processes.
     """
     if only_here:
         before = sum(
-            (each.of_class, each.which) == (here.of_class, here.which) and each.place < here.place
+            (each.call_class, each.which) == (here.call_class, here.which)
+            and each.place < here.place
             for each in _KNOWN[rig.folder]
         )
         rig.restore()
         ran = rig.must(rig.book(DEMAND, Strace(_traces(here), _at(here)), PLENTY_S))
         made = [_site(call, rig, which) for which, call in _calls_at(rig, here, ran)]
-        same = [each for each in made if each.of_class == here.of_class]
+        same = [each for each in made if each.call_class == here.call_class]
         if len(same) > before:
             return replace(same[before], which=here.which, place=here.place)
     sites(rig)
@@ -335,7 +345,7 @@ def _run(rig: Rig, job: Job, site: Site) -> Result:
         return Result(part, where, job.fault, (_MISSED,))
     told = [os.strerror(getattr(errno, job.fault, 0)), "no room", *_HIDDEN]
     if not site.is_threads:
-        told += _OF_SERVER
+        told += _WITHOUT_REASON
     # a failed sync of a clone does no harm, because the remote keeps what was pushed
     own = site.is_threads and (not job.remote or "outbox" in site.file)
     unsound = own and site.kind in SYNCS and job.fault == "EIO" and "stop" not in site.role

@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.faults.rig import Ran, Rig, demands, includes
+from tests.faults.rig import Ran, Rig, commits_by_demand, includes
 
 DEMAND, NEXT = 1, 2
 _DONE, _REFUSED, _UNSOUND, _INTERRUPTED = 0, 1, 3, 130
@@ -47,14 +47,14 @@ def after_restart(
 ) -> Iterator[str]:
     """Book another demand in a fresh process, and yield each problem of the state repo.
 
-    A state of the disk that was sound before is not tried again, unless a process that lingers may
-    still change the disk.
+    Do nothing if an earlier call found the same state of the disk sound, and the process with the
+    fault has left no child that still runs.
 
     Args:
         rig: the state repo.
         ran: the process with the injected fault.
-        journaled: whether the journal has the demand, so that it must be booked.
-        clones: whether `git fsck` must find no fault in the clones, too.
+        journaled: whether the journal has the demand, so a missing demand is a problem.
+        clones: whether `git fsck` also checks the clones.
     """
     state = None
     if not ran.lingers:
@@ -73,7 +73,7 @@ def _after_restart(rig: Rig, ran: Ran, *, journaled: bool, clones: bool) -> Iter
         told = f"{found.hangs} {_last_line(found)}"
         yield f"the next start fails: exit code {found.code} {told}"
         return
-    booked = demands(rig)
+    booked = commits_by_demand(rig)
     times = len(booked.get(DEMAND, []))
     if times > 1:
         yield f"booked {times} times"

@@ -25,14 +25,14 @@ _GONE = -2
 
 @dataclass(frozen=True)
 class _Name:
-    """A change of a name in a folder: the name gets a file or a folder, or is removed."""
+    """A change of one entry of a folder: ``path`` gets a file or a folder, or is removed."""
 
     path: str
     node: int
 
     @property
     def scope(self) -> str | int:
-        """The folder, which must be synced to make the change safe."""
+        """The folder whose sync makes the change safe."""
         return self.path.rpartition("/")[0]
 
 
@@ -46,13 +46,17 @@ class _Data:
 
     @property
     def scope(self) -> str | int:
-        """The file, which must be synced to make the change safe."""
+        """The file whose sync makes the change safe."""
         return self.node
 
 
 @dataclass
 class _Change:
-    """A change by one call or by successive writes; ``safe`` and ``lost`` index its ``parts``."""
+    """A change by one call or by successive writes.
+
+    ``safe`` has the indices of the ``parts`` that survive a loss of power. ``lost`` has the indices
+    of the ``parts`` whose sync failed.
+    """
 
     name: str
     parts: list[_Name | _Data]
@@ -180,7 +184,10 @@ class Disk:
             yield f"without {change.name}", [change]
 
     def write(self, missing: Iterable[_Change]) -> None:
-        """Write the folder as it is on the disk without the unsafe parts of ``missing``."""
+        """Write the folder as it is after a loss of power that removes ``missing``.
+
+        The safe parts of ``missing`` stay.
+        """
         left_out = {id(change) for change in missing}
         names = dict(self._first_names)
         data = {node: bytearray(text) for node, text in self._first_data.items()}
@@ -246,8 +253,8 @@ def _lose(
 def failed_sync(rig: Rig, number: int) -> Result:
     """Fail a sync of the branch or pack, start again, then lose power; nothing may be missing.
 
-    A power loss removes the data whose sync failed, although the next start could still read that
-    data. So the next start must write the data again.
+    After a failed sync, the next start can still read the data, but a power loss would remove it.
+    So the next start must write the data again.
     """
     rig.restore()
     disk = Disk(rig.folder)

@@ -18,12 +18,12 @@ from tests.faults.injection import Result
 _TELL_EVERY_S = 30.0
 
 
-class Tried:
-    """The tasks that broke no promise in an interrupted run; a file has a line for each of them.
+class Passed:
+    """A file of the tasks that broke no promise, from which a later run can resume.
 
-    ``sound`` has the results of these tasks, by the task's text. The first line of the file has a
-    digest of the program that was tried. If the program has changed since, the file's tasks do not
-    count.
+    The first line of the file is a digest of the program. Each further line is a task with its
+    results. ``sound`` maps each task of the file to its results. Without ``resume``, or if the
+    digest is not that of the current program, the file begins anew.
     """
 
     def __init__(self, file: Path, *, resume: bool) -> None:

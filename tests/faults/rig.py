@@ -34,24 +34,24 @@ from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""The shortest time, in seconds, after which a process that books a demand gets SIGTERM.
+"""How many seconds a process that books a demand has, at least, until it gets SIGTERM.
 
-A demand takes half a second, but it may have to wait for its disk.
+The process needs half a second, but it may have to wait for its disk. :meth:`Rig.is_slower` raises
+the limit on a busy machine.
 """
 PATIENCE = 20
-"""On a busy machine, the time limit is this many times the time that the first demand took."""
+"""The limit on a busy machine, as a multiple of the time that a demand without a fault took."""
 PLENTY_S = 300.0
-"""The time limit, in seconds, for commands that meet no fault; a busy machine once took over 60."""
+"""How many seconds a command without a fault has; on a busy machine, one needed more than 60."""
 END_S = 8.0
 """How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
 _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
-"""The clock of the first process; each further process has a clock that is a minute later.
+"""The time at which the clock of a rig's first process stands still.
 
-The clock of a process stands still.
-
-So a demand has the same commits each time. Its calls keep their numbers, and a state of the disk
-that was met before is recognized (:meth:`Rig.fingerprint`).
+The clock of each further process stands still a minute later. So each run of a demand makes the
+same commits. Its system calls keep their numbers, except for small differences, and a rig
+recognizes a state of the disk that it has met before (:meth:`Rig.fingerprint`).
 """
 _END_WITH_PARENT, _ADOPT_ORPHANS = 1, 36  # PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER
 _CHANCE = re.compile(
@@ -61,7 +61,7 @@ _CHANCE = re.compile(
 """The parts of a file's name that a program chooses at random; nothing depends on them."""
 
 GIT = "git"
-"""The value of ``Strace.at`` with which strace traces each process of git by itself."""
+"""The value of ``Strace.at`` for all processes of git; each process gets a strace of its own."""
 
 _GIT = """#!/bin/sh
 # Runs one of git's programs, under strace if it is the process that is asked for.
@@ -87,10 +87,10 @@ exec "$FAULTS_EXEC/$program" "$@"
 
 @dataclass(frozen=True)
 class Strace:
-    """The options of strace, and what it traces: a thread from its start, or processes of git.
+    """The options of strace, and what strace traces.
 
-    ``at`` is a thread's name, or :data:`GIT` for all processes of git, or one process by its
-    command and number, such as ``git push 1``.
+    ``at`` is the name of a thread, :data:`GIT` for all processes of git, or the command and the
+    number of one process of git, such as ``git push 1``.
     """
 
     options: Sequence[str]
@@ -106,8 +106,9 @@ class Strace:
 class GitTrace:
     """The calls of one process of git.
 
-    ``which`` numbers the processes of one ``command``, such as ``git push``. ``folder`` is the
-    working directory of the process, and ``text`` is the output of strace.
+    ``which`` is the number of the process, from 1, among those of its ``command``, such as
+    ``git push``. ``folder`` is the working directory of the process, and ``text`` is the output of
+    strace.
     """
 
     command: str
@@ -191,7 +192,7 @@ class Rig:
             lock.unlink()
 
     def must(self, ran: Ran) -> Ran:
-        """Return what a process did; fail unless it succeeded."""
+        """Return ``ran``; fail unless its exit code is 0."""
         assert ran.code == 0, f"{ran.code}: {ran.out}{ran.err}"
         return ran
 
@@ -270,7 +271,7 @@ class Rig:
             os.close(told)
             os.close(go)
             os.environ.update(environment)
-            _repeat(now)
+            _make_repeatable(now)
             _become(command, paths["out"], paths["err"], tell, waits)
         os.close(tell)
         os.close(waits)
@@ -288,7 +289,7 @@ class Rig:
     ) -> Ran:
         """Wait for the end of a process; return what it did.
 
-        When the thread that ``strace`` names starts, attach strace to it.
+        If ``strace`` names a thread, trace the thread from its start.
         """
         roles: dict[int, str] = {}
         alone = 0  # the only traced thread, if any; strace then writes no thread numbers
@@ -372,8 +373,8 @@ def _attach(strace: Strace, thread: int, out: Path) -> subprocess.Popen[str]:
     return tracer
 
 
-def _repeat(now: datetime) -> None:
-    """Give this forked process a clock that stands still, and ids that follow from its time."""
+def _make_repeatable(now: datetime) -> None:
+    """Stop the clock of this forked process at ``now``, and derive its fresh ids from ``now``."""
     numbers = count(1)
 
     def fresh_id(_: Runtime) -> str:
@@ -421,8 +422,8 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
         os._exit(code)
 
 
-def demands(rig: Rig) -> dict[int, list[str]]:
-    """Return the commits of each booked demand, by the demand's number."""
+def commits_by_demand(rig: Rig) -> dict[int, list[str]]:
+    """Map the number of each booked demand to its commits; more than one commit is a fault."""
     found: dict[int, list[str]] = {}
     for commit in commits(rig.state):
         name = commit.one("Request-Id")

@@ -8,7 +8,7 @@ import pytest
 
 from tests.faults import progress
 from tests.faults.injection import Result
-from tests.faults.progress import Tried
+from tests.faults.progress import Passed
 
 SOUND = Result("remote", ("git push", "openat", "state.git/HEAD"), "EIO", ())
 BROKEN = Result(
@@ -17,8 +17,8 @@ BROKEN = Result(
 
 
 def interrupted(file: Path) -> None:
-    """Try two tasks, of which one breaks a promise; do not reach the end."""
-    run = Tried(file, resume=False)
+    """Add two tasks, of which one breaks a promise, and do not finish the run."""
+    run = Passed(file, resume=False)
     run.add("one", [SOUND, SOUND])
     run.add("two", [SOUND, BROKEN])
 
@@ -26,7 +26,7 @@ def interrupted(file: Path) -> None:
 def test_a_run_goes_on_with_what_was_not_tried_or_not_sound(tmp_path: Path) -> None:
     file = tmp_path / "build" / "tried.jsonl"
     interrupted(file)
-    assert Tried(file, resume=True).sound == {"one": [SOUND, SOUND]}
+    assert Passed(file, resume=True).sound == {"one": [SOUND, SOUND]}
 
 
 def test_a_line_that_the_interruption_cut_off_is_tried_again(tmp_path: Path) -> None:
@@ -34,17 +34,17 @@ def test_a_line_that_the_interruption_cut_off_is_tried_again(tmp_path: Path) -> 
     interrupted(file)
     whole = file.read_text()
     file.write_text(whole + '["three", [{"pa')
-    resumed = Tried(file, resume=True)
+    resumed = Passed(file, resume=True)
     resumed.add("four", [SOUND])
     assert list(resumed.sound) == ["one"]
-    assert list(Tried(file, resume=True).sound) == ["one", "four"]
+    assert list(Passed(file, resume=True).sound) == ["one", "four"]
 
 
 def test_a_run_begins_anew_unless_it_is_told_to_go_on(tmp_path: Path) -> None:
     file = tmp_path / "tried.jsonl"
     interrupted(file)
-    assert Tried(file, resume=False).sound == {}
-    assert Tried(file, resume=True).sound == {}
+    assert Passed(file, resume=False).sound == {}
+    assert Passed(file, resume=True).sound == {}
 
 
 def test_nothing_is_taken_over_from_another_program(
@@ -53,12 +53,12 @@ def test_nothing_is_taken_over_from_another_program(
     file = tmp_path / "tried.jsonl"
     interrupted(file)
     monkeypatch.setattr(progress, "_program", lambda: "another")
-    assert Tried(file, resume=True).sound == {}
+    assert Passed(file, resume=True).sound == {}
     assert "the program has changed" in capsys.readouterr().out
 
 
 def test_a_run_that_reached_its_end_leaves_nothing(tmp_path: Path) -> None:
     file = tmp_path / "tried.jsonl"
     interrupted(file)
-    Tried(file, resume=True).finish()
+    Passed(file, resume=True).finish()
     assert not file.exists()

@@ -33,7 +33,7 @@ _RANDOM = (
 
 @dataclass(frozen=True)
 class Call:
-    """One system call; ``n`` is its number among the calls of its name in its thread or process."""
+    """A system call; it is the ``n``-th call of its ``kind`` in a thread or process."""
 
     process: int
     role: str

@@ -152,7 +152,10 @@ class Run:
             some()
 
     def findings(self, exitcode: int | None) -> list[str]:
-        """Return the names of all findings, given the exit code of the process that has ended."""
+        """Return the names of all findings.
+
+        If the process of the target ended with an ``exitcode`` other than 0, that is a finding too.
+        """
         found = sorted(path.name for path in self.folder.iterdir() if path.suffix == ".input")
         return found if exitcode == 0 else [*found, f"the process ended with {exitcode}; see out"]
 

@@ -32,7 +32,7 @@ class Clock(Runtime):
         return high if self._start else super().uniform(low, high)
 
     def condition(self) -> threading.Condition:
-        """Return a condition variable whose waits end early, so that users notice a moved clock."""
+        """Return a condition variable that often wakes waiting threads to look at the clock."""
         return _Impatient()
 
     @property

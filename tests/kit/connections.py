@@ -54,10 +54,11 @@ def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any
 
 
 def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ``Demand`` document for a demand in short form, which lists only connections.
+    """Return the ``Demand`` document for a demand in short form.
 
-    A connection in short form has ``topics`` as the ledger writes them, and its ``type`` by name.
-    It may list ``requesters``. The whole demand gets the requesters of the first connection.
+    A demand in short form lists only connections. Such a connection has ``topics`` as the ledger
+    writes them, and its ``type`` by name. It may list ``requesters``. The whole demand gets the
+    requesters of the first connection.
     """
     connections = []
     for item in demand["connections"]:

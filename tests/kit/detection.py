@@ -59,7 +59,7 @@ class Run:
         return [*events]
 
     def told(self, now: float, *observations: Observation) -> list[tuple[Any, ...]]:
-        """Advance the engine; return each event as (rule, entities, start or stop, time)."""
+        """Advance the engine; return the told events as (rule, entities, start or stop, time)."""
         return [
             (event.rule, " ".join(event.subjects), "start" if event.starts else "stop", event.at)
             for event in self.step(now, *observations)

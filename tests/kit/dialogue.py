@@ -50,20 +50,20 @@ class Dialogue:
     def end(self) -> int:
         """Read until the command ends; return its exit code.
 
-        If the command prints nothing for some seconds, type the last text again, as people do:
-        Python can miss the signal of a Ctrl-C that arrives just before Python begins to read. If
-        the command has printed something since the text was typed, do not type the text again,
-        because a second Ctrl-C would kill the command while it ends.
+        If the command prints nothing for some seconds, repeat the last text that was typed, such as
+        Ctrl-C: Python can miss a Ctrl-C just before it begins to read. Do not repeat the text if
+        the command has printed something since, because a second Ctrl-C would kill a command that
+        is ending.
         """
         end = time.monotonic() + PATIENCE_S
-        while self._read(_SILENCE_S) or self._runs_silently():
+        while self._read(_SILENCE_S) or self._runs_on():
             assert time.monotonic() < end, f"the command has not ended:\n{self.text}"
         _, status = os.waitpid(self._pid, 0)
         self._pid = 0
         return os.waitstatus_to_exitcode(status)
 
-    def _runs_silently(self) -> bool:
-        """Return whether the command still runs; if it ignores the last text, type that again."""
+    def _runs_on(self) -> bool:
+        """Return whether the command still runs; repeat the last text if it is ignored."""
         if select.select([self._master], [], [], 0)[0]:
             return self._read(0)
         if not self.text[self._typed_at :].strip("^C\r\n"):

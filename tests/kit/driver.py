@@ -1,10 +1,14 @@
 """A program that runs generators, which tests kill; a run prints its events as lines of JSON.
 
 The program imports the modules once and forks for every run. It reads each run from standard input,
-as one line of JSON. A run has lanes of demands. Each lane is a client that waits for an answer
-before it sends its next demand. If a run has an opening demand, the lanes start while the worker is
-busy with it, so that their first demands become one batch. ``die_at`` (``<point>`` or
-``<point>:<n>``) ends the process with SIGKILL when it reaches the point for the n-th time.
+as one line of JSON with these fields, among others:
+
+- ``lanes``: clients, each a list of demands. A client waits for an answer before it sends its next
+  demand.
+- ``opening``: a demand, or nothing. The lanes start while the worker is busy with this demand, so
+  that the first demands of the lanes become one batch.
+- ``die_at``: ``<point>`` or ``<point>:<n>``. The process gets SIGKILL when it reaches the point for
+  the first or the n-th time.
 """
 
 from __future__ import annotations
@@ -83,7 +87,10 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""For each point: whether to kill after (true) or before (false) a call, and which functions."""
+"""For each point: the functions at whose calls to kill the process, and when to kill it.
+
+The process is killed after the call (true) or before the call (false).
+"""
 
 
 def arm(where: str, address: str) -> None:

@@ -21,7 +21,7 @@ class Faults:
 
     away: bool = False
     """Whether the server answers every request with 503."""
-    no_pushes: int = 0
+    pushes_to_refuse: int = 0
     """How many of the next pushes the server refuses with ``status``."""
     status: int = 503
     cut_answers: int = 0
@@ -29,9 +29,12 @@ class Faults:
     away_after_cut: bool = False
     """Whether a push without an answer also sets ``away``."""
     hang: threading.Event | None = None
-    """If this is not None, the server waits for the event before it handles a request."""
+    """An event for which the server waits before it handles a request; None to wait for nothing."""
     cuts: Callable[[], bool] = lambda: False
-    """Called before a request is carried out and before it is answered; true cuts the connection.
+    """Returns whether to cut the connection.
+
+    The server calls it twice for each request: before it carries out the request, and before it
+    sends the answer.
     """
 
 
@@ -44,7 +47,7 @@ class Server:
     taken: int = 0
     """How many pushes the server carried out, with or without an answer."""
     refused: int = 0
-    """How many requests a fault made the server answer with an error."""
+    """How many requests the server answered with an error because of a fault."""
     cut: int = 0
     """How many connections ``Faults.cuts`` has cut."""
 
@@ -81,9 +84,9 @@ class _Handler(githttp.Handler):
         push = self.command == "POST" and path.endswith("/git-receive-pack")
         about_to = path.endswith("/info/refs") and query == "service=git-receive-pack"
         with _LOCK:
-            no_push = bool((push or about_to) and faults.no_pushes and not faults.away)
+            no_push = bool((push or about_to) and faults.pushes_to_refuse and not faults.away)
             refuse = 503 if faults.away else faults.status if no_push else 0
-            faults.no_pushes -= no_push
+            faults.pushes_to_refuse -= no_push
             server.refused += bool(refuse)
         if refuse:
             self.send_error(refuse)

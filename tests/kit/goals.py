@@ -51,7 +51,7 @@ def application(
 
 
 def input_topic(topic: Topic) -> dict[str, str]:
-    """Return a topic as an application of the reference's action lists it."""
+    """Return a topic as an application in a ``DeploymentRequest`` goal lists it."""
     return {"topic_name": topic[0], "source_node_id": topic[1]}
 
 
@@ -103,9 +103,9 @@ def numbered(
 ) -> Goal:
     """Return demand ``number``.
 
-    Its requester ``user<number>`` requests no other demand. ``station00`` is a requester of every
-    demand, but ``alone`` leaves it out. Some other numbers give the same application, and some the
-    same connection.
+    Its requesters are ``user<number>``, who has no other demand, and ``station00``. If ``alone``,
+    ``station00`` is left out. Every fifth number gives the same application. Without ``vehicle``,
+    every fourth number gives the same connection.
     """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
     who = [f"user{number}", *([] if alone else ["station00"])]

@@ -5,10 +5,13 @@ files that a step writes, as real files that a reviewer and `kubectl` can read. 
 the file ``DELETED`` lists the paths that the step deletes. The first step, ``0-start``, is what
 `init` renders. The files in a case's ``state-repo/`` replace or extend the skeleton's files.
 
-The case ``experiment`` stores its whole start. Every other case stores how its start differs from
-the start of ``experiment``. A later step stores how it differs from the step before. A case in
-``FOLLOWING`` plays the requests of ``experiment``. Each later step of such a case stores only how
-the step's changes differ from the changes of the same step of ``experiment``.
+The folder of a step has these files:
+
+- the start of ``experiment``: all files.
+- the start of another case: the files that differ from the start of ``experiment``.
+- a later step: the files that differ from the step before.
+- a later step of a case in ``FOLLOWING``, which plays the requests of ``experiment``: the changes
+  that differ from the changes of the same step of ``experiment``.
 """
 
 from __future__ import annotations

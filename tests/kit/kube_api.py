@@ -85,7 +85,7 @@ class KubeApi:
         status = {"lastAppliedRevision": revision, "conditions": [ready]}
         self.put("kustomizations", namespace, domain, status)
 
-    def service(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
+    def helm_release(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
         """Report a Helm release as failed with ``fault``, or as ready if ``fault`` is empty."""
         ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
         ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"

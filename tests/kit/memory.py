@@ -43,7 +43,7 @@ class MemoryRepo:
         state: State | None = None,
         now: datetime = NOW,
     ) -> None:
-        """Start from the skeleton's files with the ``changed`` ones, or from a state."""
+        """Start from the skeleton's files, replaced or extended by ``changed``, or from a state."""
         self.now = now
         if state is not None:
             self.state, self._initial = state, rendered_files(state)
@@ -175,7 +175,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
     return ledger
 
 
-def is_booked(path: str) -> bool:
+def is_of_ledger(path: str) -> bool:
     """Return whether a file contains a claim, shutdowns, kept replicas or a waiting demand."""
     roots = (
         recent_shutdowns.SHUTDOWNS_ROOT,
@@ -187,7 +187,7 @@ def is_booked(path: str) -> bool:
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
     """Return the ledger in ``files``; files that do not belong to a ledger are ignored."""
-    booked = {path: text for path, text in files.items() if is_booked(path)}
+    booked = {path: text for path, text in files.items() if is_of_ledger(path)}
     claims = [path for path in booked if claim_file.kind_of(path)]
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
     return replace(

@@ -47,13 +47,12 @@ class Mutation(NamedTuple):
 
     def is_at(self, field: str) -> bool:
         """Return whether a fault names the mistake's place, or a place inside or around it."""
-        return any(_is_around(field, path(place)) for place in (self.place, self.new_place))
+        return any(_overlaps(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the keys on the path to the mistake, and all texts in the replaced value.
+        """Return the keys on the path to the mistake, and all texts in the former value.
 
-        If another field refers to what the mistake broke, the fault in that field quotes one of
-        these texts.
+        A fault in a field that refers to the former value quotes one of these names.
         """
         names = {str(part) for part in self.place}
         values = [self.value]
@@ -71,21 +70,21 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
     """Yield a mutation for each mistake at each place of a document.
 
     ``limits`` are tried in place of whole numbers. To save time, a place gets only one value of a
-    wrong type, and a text only one control character. Successive places get different ones. With
-    ``DEMANDOPS_EXAMPLES`` above 1, each place gets all of them.
+    wrong type, and a text gets only one control character; the next place gets the next type and
+    the next control character. With ``DEMANDOPS_EXAMPLES`` above 1, each place gets all of them.
     """
     for turn, place in enumerate(places(document)):
         value = _at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
         if not isinstance(value, str):
             wrong["text"] = "x"
-        wrong = _one(wrong, turn)
+        wrong = _in_turn(wrong, turn)
         if isinstance(value, bool):
             wrong["the opposite"] = not value
         elif isinstance(value, int):
             wrong |= {f"{limit}": limit for limit in limits}
         elif isinstance(value, str):
-            wrong |= _one({"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}, turn)
+            wrong |= _in_turn({"reversed text": f"{value}\u202eb", "a bell": f"{value}\ab"}, turn)
         for kind, new in (wrong | _OF_TYPE[type(value)]).items():
             if new != value or type(new) is not type(value):
                 yield Mutation(place, kind, _replaced(document, place, new), value, place)
@@ -108,8 +107,8 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
                 yield Mutation(place, "the program's own name", changed, value, now)
 
 
-def _one(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
-    """Return the one mistake for this ``turn``, or all if ``DEMANDOPS_EXAMPLES`` is above 1."""
+def _in_turn(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
+    """Return one mistake, chosen by ``turn``; all mistakes if ``DEMANDOPS_EXAMPLES`` is above 1."""
     kinds = [*mistakes] if TIMES > 1 else [[*mistakes][turn % len(mistakes)]]
     return {kind: mistakes[kind] for kind in kinds}
 
@@ -147,8 +146,8 @@ def path(place: Place) -> str:
     return text.removeprefix(".")
 
 
-def _is_around(field: str, place: str) -> bool:
-    """Return whether a fault's field is the place, or lies inside or around the place."""
+def _overlaps(field: str, place: str) -> bool:
+    """Return whether ``field`` is ``place``, is inside it, or contains it."""
     short, long = sorted((field, place), key=len)
     return (long.startswith(short) and (long[len(short) :] or ".")[0] in ".[") or not short
 
@@ -158,10 +157,10 @@ def problem(
 ) -> str:
     """Return what is wrong with the faults found in a mutation, or an empty string.
 
-    A fault must be at the mutation's place if the schema forbids the mutated document, or if a text
-    outside the ``free`` fields got a control character. A fault at another place must concern a
-    reference, so it must quote a name from the mutation's place. A fault at the mutation's place
-    must not contain words of Python.
+    - If the schema forbids the mutated document, a fault must be at the mutation's place.
+    - If a text outside the ``free`` fields got a control character, a fault must be there too.
+    - A fault at the mutation's place must not contain words of Python.
+    - A fault at another place must quote one of the mutation's :meth:`~Mutation.names`.
     """
     place = path(mutation.place)
     here = [found for found in faults if found.file == file and mutation.is_at(found.field)]

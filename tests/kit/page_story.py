@@ -104,7 +104,7 @@ class Story:
         for release, target in self.follower.at(commit).commit_state.targets:
             if target.is_service:
                 fault = FAULT if release.name == FAILING and not mended else ""
-                self.api.service(NAMESPACE, release.name, fault, since)
+                self.api.helm_release(NAMESPACE, release.name, fault, since)
             else:
                 self.api.deployment(NAMESPACE, release.name)
 

@@ -1,4 +1,4 @@
-"""Random requests with leases, and the ledger's claims in the form of the model of leases."""
+"""Random requests with leases, and the ledger's claims as the model of leases writes them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim, demand_id
 
-from tests.model.leases import Goal, Subject, by_message
+from tests.model.leases import Goal, Subject, name_by_message
 
 DEMANDS = ("d0", "d1", "D1", "d/2")
 PEOPLE = ("vehicle00", "vehicle01", "station00")
@@ -28,7 +28,7 @@ class Maker:
     def any(self) -> Goal:
         kind = self._random.randrange(20)
         if self._puts and kind < 9:
-            return self._of_known(kind)
+            return self._again(kind)
         if kind < 14:
             self._puts.append(self.put())
             return self._puts[-1]
@@ -38,8 +38,8 @@ class Maker:
             return self._random.choice(self._shutdowns[-2:])
         return self._message(shutdown=kind > 17)
 
-    def _of_known(self, kind: int) -> Goal:
-        """Return a renewal of a recent put, or the same put again, perhaps with another lease."""
+    def _again(self, kind: int) -> Goal:
+        """Return a recent put, the put with another lease, or a renewal of the put's demand."""
         known = self._random.choice(self._puts[-2:])
         if kind < 3:
             return {key: known[key] for key in ("kind", "demand", "requesters")} | {
@@ -110,7 +110,7 @@ Name = tuple[str, Subject]
 
 
 MESSAGES = {
-    demand_id(request, who): by_message(request, who)
+    demand_id(request, who): name_by_message(request, who)
     for request in ("m0", "m1")
     for count in (1, 2, 3)
     for who in combinations(PEOPLE, count)

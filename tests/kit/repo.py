@@ -78,7 +78,7 @@ def write_tree(
 ) -> pygit2.Oid:
     """Write a copy of the tree ``base`` in which ``files`` are changed; return the new tree's id.
 
-    The copy is written with the program's own code.
+    The generator's code writes the copy.
     """
     objects = NewObjects(repo)
     tree = trees.write(objects, base, files)
@@ -367,8 +367,8 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
 FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
 """The bundle of a state repo from the first version: render version 1, ``demandops.ledger/v1``.
 
-The repo has three joins of the experiment (tag ``three-joins``), two overrides (one of them
-has ended), a join by another request, a demand with a lease, and a shutdown.
+The repo has the experiment's first three joins (tag ``three-joins``), two overrides (one of them
+has ended), a fourth join, a demand with a lease, and a shutdown.
 """
 
 

@@ -100,7 +100,7 @@ class Served:
         """Wait until the log contains ``text``; fail with :meth:`last_words` if it is late.
 
         The time in which the process waits for a processor does not count. On a busy machine, a
-        start that needs two seconds once waited for half a minute.
+        start of two seconds once waited half a minute for a processor.
         """
         began = time.monotonic()
         while True:
@@ -204,7 +204,7 @@ class Sent:
     accepted: bool | None = None
     feedback: list[str] = field(default_factory=list)
     stages: dict[str, float] = field(default_factory=dict)
-    """When each stage was reported; the result sets ``pushed`` if no feedback did."""
+    """When each stage was reported; the result reports ``pushed`` if no feedback did."""
     status: str = ""
     message: str = ""
     cancel: bool | None = None

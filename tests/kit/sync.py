@@ -1,7 +1,7 @@
 """Forced writes to disk are off in tests, except in tests that are marked ``synced``.
 
-Without forced writes, a killed process loses no data; only a power cut does. The program has no
-switch for forced writes, so the tests replace the functions that it calls.
+A forced write is an fsync. Without fsync, a power cut can lose data, but a killed process loses
+none. The program has no switch for fsync, so the tests replace the functions that it calls.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ _CALLS: Mapping[str, object] = {name: getattr(os, name) for name in ("fsync", "f
 
 
 def force(on: bool) -> None:
-    """Switch this process's forced writes on or off."""
+    """Switch fsync in this process on or off."""
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, int(on))
     for name, call in _CALLS.items():
         setattr(os, name, call if on else lambda file: None)
 
 
 def force_in(repo: Path, on: bool) -> None:
-    """Switch git's forced writes in a repository on or off."""
+    """Switch git's fsync in a repository on or off."""
     pygit2.Repository(str(repo)).config["core.fsync"] = "committed" if on else "none"

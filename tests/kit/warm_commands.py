@@ -96,10 +96,10 @@ def _import_all() -> None:
 
 
 def _watch(wanted: dict[str, Any]) -> int:
-    """Fork for a command.
+    """Fork a child for a command.
 
-    In the command's process, return 0. In the parent, write the command's process id and exit code
-    into the command's pipe, and return the process id.
+    The child returns 0 at once. The parent waits until the child has ended, writes the child's
+    process id and exit code into the pipe that ``wanted`` names, and returns the process id.
     """
     with Path(wanted["pipe"]).open("w", buffering=1) as pipe:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)

@@ -16,9 +16,9 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Item = dict[str, Any]
 Demand = tuple[str, tuple[str, ...]]
-"""The request id and the sorted, distinct requesters of a join.
+"""A demand: the request id and the sorted, distinct requesters of its joins.
 
-The claims on one subject differ in these.
+Each claim on a subject has a demand of its own.
 """
 
 Subject = tuple[str, str]
@@ -94,13 +94,13 @@ class Books:
         self.now = 0
         self._shutdowns: dict[Any, int] = {}
 
-    def take(self, goal: Goal, after: int = 1) -> Result:
+    def take(self, goal: Goal, pause: int = 1) -> Result:
         """Book or release a request as a whole, or refuse it as a whole.
 
-        The request comes ``after`` seconds after the previous one. ``after`` is at least 1, so that
-        claims differ in age, because a shutdown takes from the oldest claim first.
+        ``pause`` is the number of seconds since the previous request. It is at least 1, so all
+        claims differ in age: a shutdown takes from the oldest claim first.
         """
-        self.now += after
+        self.now += pause
         problem = next(self._inadmissible(goal), None)
         if problem:
             return Result("refused", problem)
@@ -175,11 +175,10 @@ class Books:
             yield "no broker"
 
     def _broker(self, item: Item) -> str:
-        """Return the broker of an item, or an empty text if the item names none.
+        """Return the node of an item's broker, or an empty text if the item names no broker.
 
-        A broker is named by its node. If the inventory has only one broker, the item gets that
-        one. Otherwise the item gets the first broker that is found on the named node, on the
-        target or on the source.
+        If the inventory has only one broker, return its node. If it has several, return the first
+        node with a broker among these: the named node, the target, the source.
         """
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
@@ -219,10 +218,10 @@ class Books:
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
         """Take the holds that a shutdown lists.
 
-        Which claim gives up a hold follows from ``found``, the claims before the shutdown, so a
-        hold that is listed twice is taken once. The design leaves one case open: a shutdown with
-        several requesters and no topics. Here each requester gives up one claim, and these claims
-        may differ.
+        ``found`` has the claims before the shutdown. The claim that gives up a hold is chosen among
+        these, so a hold that is listed twice is taken once. The design leaves one case open: a
+        shutdown with several requesters and no topics. In this model, each requester then gives up
+        its holds on one claim, which may be another claim for each requester.
         """
         # a shutdown repeats another one if it lists the same, in any order and any number of times
         said = frozenset(_said(item) for item in _items(goal))
@@ -346,7 +345,7 @@ def _subject(item: Item) -> Subject:
 def _fixed(item: Item) -> dict[str, Any]:
     """Return the fields that all claims on a subject share: the node or the ends, and the type.
 
-    If a shutdown does not name a node, the field of the node is an empty text.
+    A field that a shutdown leaves out is an empty text.
     """
     if "header" in item:
         return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}

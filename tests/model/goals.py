@@ -262,10 +262,7 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Change the requesters of the items.
-
-        Keep only the first one, take others instead, or add others.
-        """
+        """Change the requesters of a goal: keep only the first one, replace all, or add some."""
         people = self._people()
         for kind in ("apps", "connections"):
             named = [one for item in made[kind] for one in requesters(item)]

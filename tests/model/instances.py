@@ -26,7 +26,7 @@ MAY = {
     "vehicle01": frozenset({HALL, FURTHER}),
     "traffic": frozenset({FURTHER}),
 }
-"""The names under which each requester may demand the node, one for each access domain."""
+"""For each requester, the names under which it may demand the node ``hall``."""
 MOST = 3
 KEPT_FOR = timedelta(seconds=120)
 
@@ -38,8 +38,9 @@ Instance = tuple[str, str]
 class Instances(Places):
     """Extends the model of places by separate instances and by kept replicas.
 
-    ``testing`` is the version of the channel ``testing``. ``kept`` has an entry for each instance
-    that keeps more replicas than it needs: until when it keeps each number of replicas.
+    ``testing`` is the version of the channel ``testing``. ``kept`` has the instances that keep more
+    replicas than they need. For example, ``kept[one] == {3: t}`` if ``one`` keeps its third replica
+    until ``t``.
     """
 
     testing: str = NEXT
@@ -50,7 +51,7 @@ class Instances(Places):
 
         ``received`` is the time at which the generator received the goal.
         """
-        before = self.running()
+        before = self.demanded()
         app: dict[str, Any] = next(iter(goal.get("applications", [])), {})
         if app.get("type") == TALLY:
             chosen = self._chosen(app, goal["requesters"])
@@ -62,7 +63,7 @@ class Instances(Places):
         return outcome
 
     def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any] | None:
-        """Return ``app`` with the id, node and version of its claim; None if it is refused."""
+        """Return ``app`` with the id, node and version for its claim; None to refuse the demand."""
         asked = app["version"]
         version = self.testing if asked == "testing" else asked or DEFAULT
         asked = asked and version  # a claim records the version, not the channel
@@ -73,7 +74,7 @@ class Instances(Places):
             return None
         node = HALL if app["node"] == FIRST else app["node"]
         if app["node"] == HALL:
-            booked = {on for other, on in self.running() if other == id}
+            booked = {on for other, on in self.demanded() if other == id}
             allowed = {one for one in (HALL, FURTHER) if all(one in MAY[name] for name in who)}
             if len(choice := booked or allowed) != 1:
                 return None
@@ -82,8 +83,8 @@ class Instances(Places):
             return None
         return app | {"id": id, "node": node, "version": asked}
 
-    def running(self) -> dict[Instance, frozenset[Any]]:
-        """Return the topics of each instance that is demanded."""
+    def demanded(self) -> dict[Instance, frozenset[Any]]:
+        """Return each demanded instance and its topics."""
         found: dict[Instance, frozenset[Any]] = {}
         for subjects in self.held.values():
             for (_, id), held in subjects.items():
@@ -97,7 +98,7 @@ class Instances(Places):
 
         ``before`` has the topics of each instance before the goal.
         """
-        after = self.running()
+        after = self.demanded()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
             kept = self.kept.pop(one, {}) | dict.fromkeys(range(least + 1, had + 1), now + KEPT_FOR)
@@ -105,11 +106,11 @@ class Instances(Places):
                 self.kept[one] = kept
 
     def come_down(self, one: Instance, record: Mapping[int, datetime], now: datetime) -> None:
-        """Check and adopt the record of replicas that an instance keeps.
+        """Replace the replicas that an instance keeps by those of the program's ``record``.
 
-        The record may lack replicas whose time is over at ``now``.
+        First check that ``record`` lacks only replicas whose time is over at ``now``.
         """
-        least = needed(self.running().get(one, ()))
+        least = needed(self.demanded().get(one, ()))
         kept, told = _ends(self.kept.get(one, {}), least), _ends(record, least)
         for number in kept.keys() - told.keys():
             assert kept[number] <= now, f"{one} came down from {number} before {kept[number]}"
@@ -119,7 +120,7 @@ class Instances(Places):
             self.kept[one] = told
 
     def replicas(self, one: Instance) -> int:
-        return max(needed(self.running()[one]), *self.kept.get(one, ()), 0)
+        return max(needed(self.demanded()[one]), *self.kept.get(one, ()), 0)
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:

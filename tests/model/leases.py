@@ -17,14 +17,13 @@ Subject = tuple[str, str]
 """A subject: its kind (``applications`` or ``connections``) and its id."""
 
 BY_MESSAGE = "by message: "
-"""The start of the names of demands that come from goals of the reference."""
-
+"""The prefix of the name of a demand that comes from a ``DeploymentRequest`` goal."""
 
 REPEATS_WITHIN_S = 15 * 60
 
 
-def by_message(request: str, who: Iterable[str]) -> str:
-    """Return the name of the demand that a goal of the reference becomes."""
+def name_by_message(request: str, who: Iterable[str]) -> str:
+    """Return the name of the demand that comes from a ``DeploymentRequest`` goal."""
     return f"{BY_MESSAGE}{request} {sorted(who)}"
 
 
@@ -33,8 +32,8 @@ class Held:
     """The hold of a demand on a subject, and its lease.
 
     ``seconds`` is the lease, and ``promised`` is the last renewal plus the lease; both are None for
-    a demand without an end. A demand that comes from a goal of the reference also has ``holders``
-    (who holds each topic), ``request`` (the id of the goal) and ``booked`` (the time).
+    a demand without an end. A demand that comes from a ``DeploymentRequest`` goal also has
+    ``holders`` (who holds each topic), ``request`` (the id of the goal) and ``booked`` (the time).
     """
 
     what: dict[str, Any]
@@ -53,7 +52,7 @@ class Held:
         return mine == (other.what, other.requesters, other.seconds, other.holders)
 
     def holds(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return the requesters that hold each topic of a connection, below the key ``holds``.
+        """Return ``{"holds": …}``, which maps each topic of a connection to its requesters.
 
         All requesters hold a topic unless ``holders`` names some of them. For an application, the
         result is empty.
@@ -66,8 +65,8 @@ class Held:
 class Promises:
     """The model: the hold of each demand on each subject, with its lease.
 
-    ``slack`` is how many seconds after ``promised`` a release may come. ``default`` is the lease of
-    a demand that names none.
+    ``slack`` is how many seconds after the end of its lease a demand may be released. ``default``
+    is the lease of a demand that names none.
     """
 
     slack: int
@@ -143,7 +142,7 @@ class Promises:
                 return True
         return False
 
-    # goals of the reference: each has one connection; the goal's id and requesters name the demand
+    # DeploymentRequest goals: each has one connection; its id and requesters name the demand
 
     def _message(self, goal: Goal, now: int) -> Outcome:
         item = goal["connections"][0]
@@ -155,7 +154,7 @@ class Promises:
         ends = {"source": item["source_node_id"], "target": item["target_node_id"]}
         if self._contradicts("", subject, {**ends, "topics": routes}):
             return "refused"
-        demand = by_message(goal["id"], who)
+        demand = name_by_message(goal["id"], who)
         was = self.held.get(demand, {}).get(subject, Held(ends | {"topics": {}}, frozenset()))
         holders = {one: was.holders.get(one, frozenset()) | who for one in routes}
         held = Held(
@@ -177,7 +176,7 @@ class Promises:
         this = (request, who, subject, topics)
         if this in self.shutdowns and abs(now - self.shutdowns[this]) <= REPEATS_WITHIN_S:
             return "unchanged"
-        own = by_message(request, who)
+        own = name_by_message(request, who)
         around = [
             (name != own, held[subject].request != request, held[subject].booked, name)
             for name, held in self.held.items()

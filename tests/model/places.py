@@ -1,9 +1,9 @@
 """A model of demands without a node, of full and drained nodes, and of waiting.
 
 It is written from what docs/placement.md promises, and imports nothing of the program. In this
-model, each such demand has one application of its own, and each of the ``nodes`` has room for one
-application. The generator may choose any free node: ``told`` has its choice, and the model checks
-that the node is free.
+model, a demand without a node has one application, which no other demand has, and each of the
+``nodes`` has room for one application. The generator may choose any free node: ``chosen`` has the
+nodes that it has chosen, and the model checks that they are free.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tests.model import leases
 from tests.model.leases import Goal, Promises, Subject
 
 Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "waits"]
-"""``waiting``: the demand waits from now on; ``waits``: it already waits in the same way."""
+"""``waiting``: the demand begins to wait or waits with a change; ``waits``: nothing changes."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,8 @@ class Places(Promises):
     nodes: frozenset[str] = frozenset()
     drained: frozenset[str] = frozenset()
     waiting: dict[str, Waiting] = field(default_factory=dict)
-    told: Mapping[Subject, str] = field(default_factory=dict)
+    chosen: Mapping[Subject, str] = field(default_factory=dict)
+    """The node that the generator has chosen for each application; empty while it is not known."""
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:  # type: ignore[override]
         """Apply a goal as a whole or refuse it as a whole; return the outcome.
@@ -59,7 +60,7 @@ class Places(Promises):
                 return "unchanged"
             del self.waiting[demand]
             return "released"
-        if not is_placed(goal) or not who:
+        if not lacks_node(goal) or not who:
             return super().take(goal, now)
         standing = self.held.get(demand)
         if standing is not None:
@@ -68,8 +69,8 @@ class Places(Promises):
             return "refused"
         if self.free():
             first = min(self.waiting, key=self._turn, default=demand)
-            # with a real placement (`told`), no other demand may wait in front of this one
-            assert first == demand or not self.told, f"{first} waits, but {demand} gets room"
+            # if the generator has chosen a node, no other demand may wait in front of this one
+            assert first == demand or not self.chosen, f"{first} waits, but {demand} gets room"
             return self._place(demand, goal, now)
         if self.nodes <= self.drained:
             return "refused"
@@ -90,16 +91,16 @@ class Places(Promises):
         if node in self.drained:
             if not self.free():
                 return "refused"
-            node = self._told(subject)
+            node = self._chosen_node(subject)
         return super().take(_at(goal, node), now)  # type: ignore[return-value]
 
     def _place(self, demand: str, goal: Goal, now: int) -> Outcome:
         self.waiting.pop(demand, None)
-        subject = ("applications", goal["applications"][0]["id"])
-        return super().take(_at(goal, self._told(subject)), now)  # type: ignore[return-value]
+        node = self._chosen_node(("applications", goal["applications"][0]["id"]))
+        return super().take(_at(goal, node), now)  # type: ignore[return-value]
 
-    def _told(self, subject: Subject) -> str:
-        node = self.told.get(subject) or min(self.free())
+    def _chosen_node(self, subject: Subject) -> str:
+        node = self.chosen.get(subject) or min(self.free())
         assert node in self.free(), f"{subject} is placed on {node}, but {self.free()} are free"
         return node
 
@@ -124,10 +125,11 @@ class Places(Promises):
         assert self._place(demand, self.waiting[demand].goal, now) == "booked"
 
     def moved(self, demand: str, subject: Subject) -> None:
-        """Move an application from a drained node to the node in ``told``."""
+        """Move an application from a drained node to the node that the generator has chosen."""
         held = self.held[demand][subject]
         assert held.what["node"] in self.drained, f"{subject} moved off a node that is not drained"
-        self.held[demand][subject] = replace(held, what=held.what | {"node": self._told(subject)})
+        node = self._chosen_node(subject)
+        self.held[demand][subject] = replace(held, what=held.what | {"node": node})
 
     def drain(self, node: str, drained: bool) -> None:
         self.drained = self.drained | {node} if drained else self.drained - {node}
@@ -137,8 +139,8 @@ class Places(Promises):
         return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
 
 
-def is_placed(goal: Goal) -> bool:
-    """Return whether a goal leaves the node of its application to the generator."""
+def lacks_node(goal: Goal) -> bool:
+    """Return whether the generator must choose the node of a goal's application."""
     apps: list[dict[str, Any]] = goal.get("applications", [])
     return any("place" in app for app in apps)
 

@@ -21,11 +21,11 @@ STEPS = (
     ("7-vehicle02-leaves", "S 3", "", "3"),
     ("8-vehicle03-leaves", "", "", ""),
 )
-"""A row for each of the experiment's files, with the requesters after it.
+"""One row for each step of the experiment.
 
-The second column has the requesters of the services that the station's data feeds. The third has
-those of the services that vehicle 0's data feeds. The last has the other vehicles that have a
-connection.
+The first column names the step's file. The second has the requesters of the services that read the
+station's data, and the third the requesters of the services that read vehicle 0's data. The last
+has the further vehicles that have a connection.
 """
 
 

@@ -115,7 +115,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def calls(script: ModuleType) -> list[str]:
-    """Return the stages for which the script has called CMake since the last call of `calls`."""
+    """Return the stages of CMake that the script has run, and clear the log of these stages."""
     log: Path = script.PREFIX / "calls"
     lines = log.read_text().split() if log.exists() else []
     log.unlink(missing_ok=True)

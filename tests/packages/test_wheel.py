@@ -60,7 +60,7 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
 
 
 def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
-    """The test only looks up what `ros2 run` and `ros2 launch` need, because PyPI lacks both."""
+    """PyPI has neither `ros2 run` nor `ros2 launch`, so the test only looks up what they need."""
     packages = pytest.importorskip("ament_index_python.packages")
     # without --ignore-installed pip would remove the package under test from its environment
     options = ["-q", "--no-deps", "--no-index", "--ignore-installed", "--prefix", str(tmp_path)]

@@ -43,7 +43,7 @@ SERIOUS = ("serious", "critical")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_view_can_be_read_by_anybody(visit: Visits, scheme: str) -> None:
+def test_every_view_is_accessible(visit: Visits, scheme: str) -> None:
     """axe-core finds nothing serious in any view; the fixture `visit` checks the console too."""
     BUILD.mkdir(parents=True, exist_ok=True)
     seen = visit(color_scheme=scheme)

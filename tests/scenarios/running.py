@@ -33,7 +33,7 @@ from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
 from tests.kit.config import skeleton
 from tests.kit.memory import NOW as START
-from tests.kit.memory import MemoryRepo, is_booked, ledger_in
+from tests.kit.memory import MemoryRepo, is_of_ledger, ledger_in
 
 HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
@@ -42,7 +42,7 @@ _APPDEFS = HERE.parent / "appdefs"
 # # ---- the form of a scenario ----
 
 
-class Told(FrozenModel):
+class ExpectedFault(FrozenModel):
     """An expected fault: its code, file and field, and words that its message contains."""
 
     code: str = "invalid"
@@ -78,7 +78,7 @@ class Step(FrozenModel):
     send: dict[str, Any] | None = None
     gives: Literal["booked", "released", "unchanged", "waiting"] | None = None
     waiting: list[str] | None = None
-    refused: list[Told] | None = None
+    refused: list[ExpectedFault] | None = None
     warns: list[str] | None = None
     expires: list[str] | None = None
     runs: dict[str, list[str]] | None = None
@@ -115,7 +115,7 @@ class Scenario(FrozenModel):
     must: str = Field(min_length=1)
     appdefs: list[Literal["recorder", "monitor"]] = Field(default_factory=list)
     config: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    invalid: list[Told] | None = None
+    invalid: list[ExpectedFault] | None = None
     steps: list[Step] = Field(default_factory=list)
 
     @model_validator(mode="after")
@@ -188,7 +188,7 @@ class World(MemoryRepo):
         self.state = replace(self.state, ledger=moved.ledger)
         empty = replace(state, ledger=Ledger())
         self._initial = {**skeleton(), **config, **rendered_files(empty)}
-        ledger = {p: text for p, text in self.files.items() if is_booked(p)}
+        ledger = {p: text for p, text in self.files.items() if is_of_ledger(p)}
         moved_files = changed_claim_files(before, moved.ledger, moved.keys)
         for path, text in moved_files.items():
             ledger.pop(path) if text is None else ledger.update({path: text})
@@ -211,11 +211,11 @@ class World(MemoryRepo):
             throttle=lambda request, config: self._throttle.faults(request, config, operation, now),
         )
 
-    def look(self) -> list[str]:
+    def do_what_is_due(self) -> list[str]:
         """Release the demands whose leases have ended; return their ids in order.
 
-        Like the generator, this then removes replicas whose time to be kept is over, moves placed
-        applications away from drained nodes, and tries to book the waiting demands.
+        Then do what the generator also does by itself: remove replicas that it need not keep any
+        longer, move placed applications away from drained nodes, and try to book waiting demands.
         """
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
@@ -243,7 +243,7 @@ class World(MemoryRepo):
         return [one.demand for one in in_turn(self.state.ledger.waiting)]
 
     def runs(self) -> dict[str, list[str]]:
-        """Return requesters by service; a key is like `driver for vehicle00 /points on edge`."""
+        """Map each service, such as `driver for vehicle00 /points on edge`, to its requesters."""
         return {
             f"{entry['service']} for {_purpose(entry)} on {entry['node']}": entry["requesters"]
             for entry in self.books()["services"].values()
@@ -301,7 +301,8 @@ def _take(step: Step, world: World, place: str) -> None:
         world.clock.set_by(sign * seconds_of(step.clock.removeprefix("-")))
     if step.restart:
         world.restart()
-    assert world.look() == (step.expires or []), f"{place}: other demands expire than expected"
+    ended = world.do_what_is_due()
+    assert ended == (step.expires or []), f"{place}: other demands expire than expected"
     if step.send is not None:
         taken = world.take(step.send)
         for problem in _sent(step, taken):
@@ -355,12 +356,12 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
             yield f"warns of {taken.warnings}"
 
 
-def same_faults(wanted: Iterable[Told], found: Iterable[Fault]) -> bool:
+def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool:
     """Return whether the faults found are exactly the expected ones."""
     wanted, found = list(wanted), list(found)
     return len(wanted) == len(found) and all(
-        any(told.fits(fault) for fault in found) for told in wanted
-    ) and all(any(told.fits(fault) for told in wanted) for fault in found)  # fmt: skip
+        any(one.fits(fault) for fault in found) for one in wanted
+    ) and all(any(one.fits(fault) for one in wanted) for fault in found)  # fmt: skip
 
 
 def _of_connections(world: World, what: str) -> dict[str, list[str]]:

@@ -140,7 +140,7 @@ class Oracle:
         self.counts["commits"] += 1
         claims = claims_of(self.claims(str(commit.id)).values())
         records = _kept_replicas(commit)
-        self.books.told = {
+        self.books.chosen = {
             subject: what["node"] for (_, subject), (what, _) in claims.items() if "node" in what
         }
         if str(commit.id) in self.edits:
@@ -151,7 +151,7 @@ class Oracle:
             asked = self.asked.get(operation)
             if asked is None:
                 assert by is not None
-                before = self.books.running()
+                before = self.books.demanded()
                 self._own_work(claims, *by)
                 self.books.keep(before, self._time_of_own_work(commit, records))
                 continue
@@ -166,7 +166,7 @@ class Oracle:
         told, waiting = self.books.waiting_files(), self._waiting_on(commit)
         assert waiting == told, f"{waiting} wait, but expected {told}"
         self._compare_instances(commit, records)
-        self.books.told = {}
+        self.books.chosen = {}
         self._claims, self._records = claims, records
         self._models.append(pickle.dumps(self.books))
 
@@ -179,7 +179,7 @@ class Oracle:
         for one in self.books.kept.keys() | records.keys():
             self.books.come_down(one, records.get(one, {}), now)
         if entry.by_generator:
-            running = self.books.running()
+            running = self.books.demanded()
             expected = sorted(
                 (
                     "city" if one[1] == FURTHER else "perception",

@@ -86,7 +86,7 @@ NOT_SHOWN = {
     "serve": "prints nothing but its log",
     "web": "prints an address",
 }
-"""The commands whose output has no file in `expected`, with the reason; each has a help text."""
+"""The commands whose output has no file in `expected`, each with the reason."""
 
 _HEX = re.compile(
     r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<=after commit )[0-9a-f]{12}"

@@ -30,7 +30,10 @@ SCHEMA = yaml.safe_load((Path(__file__).parents[2] / "docs" / "json.schema.yaml"
 
 @pytest.fixture(scope="module")
 def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPatch]:
-    """Make the fleet once for all tests; return the patch that sets its clock and environment."""
+    """Make the fleet once for all tests.
+
+    Return the patch that sets the clock and the environment for the commands.
+    """
     with pytest.MonkeyPatch.context() as made:
         folder = tmp_path_factory.mktemp("fleet")
         made.setenv("DEMANDOPS_DATA_HOME", str(folder / "home"))
@@ -40,7 +43,7 @@ def patch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPat
 
 @pytest.fixture(autouse=True)
 def _home(data_home: Path, patch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let each test use the journals of the fleet instead of journals of its own."""
+    """Give each test the data folder of the fleet, which has the fleet's journals."""
     with pytest.MonkeyPatch.context() as made:
         made.setenv("DEMANDOPS_DATA_HOME", str(Path.cwd() / "home"))
         yield
@@ -63,8 +66,8 @@ def test_no_name_is_cut(demandops: Run, command: str, patch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("command", CHANGING[:-1])
-def test_no_name_is_cut_where_something_changes(command: str, patch: pytest.MonkeyPatch) -> None:
-    """No word is cut: each word also occurs in the output at 1000 columns.
+def test_no_word_of_a_changing_command_is_cut(command: str, patch: pytest.MonkeyPatch) -> None:
+    """Each word of the output at 80 columns is also in the output at 1000 columns.
 
     The test leaves out ``watch``, which cuts its output to the height of the terminal.
     """

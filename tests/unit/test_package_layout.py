@@ -29,8 +29,7 @@ SAME_NAME = {
 """The module names that may occur more than once, with the reason."""
 
 COMMANDS = PACKAGES[0] / "cli"
-"""The folder of the commands. Its modules have the commands' names, which may occur elsewhere too.
-"""
+"""The folder of the commands; its modules may have the names of modules in other folders."""
 
 
 def dotted(path: Path) -> str:

@@ -62,7 +62,7 @@ def test_an_empty_table_says_so() -> None:
 @given(st.lists(st.tuples(WORDS, WORDS, st.lists(WORDS)), max_size=4), st.integers(1, 90))
 @examples(80)
 def test_no_word_is_ever_cut(rows: list[tuple[str, str, list[str]]], width: int) -> None:
-    """The first column is always shown. Other columns are left out if they do not fit."""
+    """The first column is always shown whole. Another column is left out if it does not fit."""
     columns = (Column("Name", wraps=True), Column("State", 1, wraps=True), Column("Since", 2))
     table = Table(columns, rows)
     shown = table.lines(width)

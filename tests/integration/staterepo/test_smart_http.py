@@ -93,7 +93,7 @@ def test_a_push_is_repeated_until_the_server_takes_it(bare: Path) -> None:
     """`403`, `denied` and `rejected` in the server's address make no error a refusal."""
     prefix = "/403/denied-and-rejected"
     with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
-        server.faults.no_pushes, server.faults.status = 3, 503
+        server.faults.pushes_to_refuse, server.faults.status = 3, 503
         assert rig.receipt(one.submit(goal(1))).outcome == "booked"
         assert server.refused == 3
     rig.assert_sound(bare)
@@ -103,10 +103,10 @@ def test_a_server_that_forbids_the_push_is_told_and_not_asked_for_ever(
     http: str, server: Server, bare: Path
 ) -> None:
     with rig.running(http) as generator:
-        server.faults.no_pushes, server.faults.status = 1000, 403
+        server.faults.pushes_to_refuse, server.faults.status = 1000, 403
         with pytest.raises(StateRepoError, match="rejects the push"):
             rig.receipt(generator.submit(goal(1)))
-        server.faults.no_pushes = 0
+        server.faults.pushes_to_refuse = 0
         assert rig.book(generator, goal(2))[0].outcome == "booked"
     assert rig.books(bare) == rig.books_after([goal(2)])
 

@@ -62,8 +62,8 @@ def application(
 
 
 def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return the ``operationState`` of a sync whose source is ``of``, by default ``FOLDER``."""
-    result = {"revision": revision, "source": more.pop("of", FOLDER)}
+    """Return the ``operationState`` of a sync from ``source``, by default from ``FOLDER``."""
+    result = {"revision": revision, "source": more.pop("source", FOLDER)}
     result["resources"] = more.pop("resources", [])
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
     return {
@@ -140,7 +140,8 @@ BAD = condition("Progressing", "False", "timed out")
          "has not been compared with its current spec yet", False),
         (application(NEW, sync="OutOfSync", at="b"), None, "reconciled", "is being synced", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "waiting for "
-                     "healthy state", of=NEW)), None, "reconciled", "waiting for healthy", False),
+                     "healthy state", source=NEW)), None, "reconciled", "waiting for healthy",
+         False),
         (application(NEW, sync="Synced", at="b", health="Progressing"), None, "reconciled",
          "its health is Progressing", False),
         (application(NEW, sync="Synced", at="b", health="Degraded"), None, "reconciled",
@@ -159,12 +160,12 @@ BAD = condition("Progressing", "False", "timed out")
         (application(NEW, sync="Unknown", conditions=(condition("ComparisonError", "", "no chart"),)
                      ), None, "reconciled", "ComparisonError: no chart", True),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
-                     of=NEW)), None, "reconciled", "denied", True),
+                     source=NEW)), None, "reconciled", "denied", True),
         # a failure of the previous spec counts only while Argo CD still retries that spec
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Failed", "b", "denied",
-                     of=OLD)), None, "reconciled", "denied", False),
+                     source=OLD)), None, "reconciled", "denied", False),
         (application(NEW, sync="OutOfSync", at="b", operation=synced("Running", "b", "denied",
-                     of=OLD, finishedAt=AT)), None, "reconciled",
+                     source=OLD, finishedAt=AT)), None, "reconciled",
          "its previous spec is still being retried: denied", True),
     ],
 )  # fmt: skip
@@ -277,7 +278,7 @@ def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cl
     assert ARGOCD.last_transition(CLIENT, objects) == ""
 
 
-def test_of_argo_cd_s_own_namespace_one_object_is_asked_for() -> None:
+def test_only_one_object_of_argo_cds_namespace_is_read() -> None:
     """The generator may lack the right to read other objects in Argo CD's namespace."""
     assert ARGOCD.objects_to_watch(PLACE)[0] == ObjectSelector(
         "Application", "argocd", "demandops-perception"

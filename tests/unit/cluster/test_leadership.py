@@ -36,9 +36,9 @@ The Lease ends after 15 s, and the standbys poll it every 2 s.
 class Server:
     """A stand-in for an API server with one Lease.
 
-    ``trouble`` decides whether a call fails before or after its effect, or not at all (empty).
-    ``takes`` decides how many seconds a call takes. After each call, ``ages`` gets the age of the
-    Lease, once for each process that leads at that time.
+    ``trouble`` returns ``before`` or ``after`` if the next call fails before or after its effect,
+    or an empty text if it does not fail. ``takes`` returns how many seconds the next call takes.
+    After each call, the age of the Lease is appended to ``ages``, once for each process that leads.
     """
 
     turns: Turns

@@ -27,7 +27,10 @@ HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 def trigger(
     case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
 ) -> None:
-    """Wake the cluster of a golden case once; ``changed`` lists the paths that have changed."""
+    """Run the trigger once for the configuration of a golden case.
+
+    ``changed`` lists the paths that have changed, as after a push.
+    """
     state, _ = start(case)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)

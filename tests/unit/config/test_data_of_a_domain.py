@@ -34,8 +34,8 @@ CONNECTION = {
 def domains(fleet: str = "", city: str = "") -> dict[str, str]:
     """Return a policy with the access domains `fleet` and `city`.
 
-    ``fleet`` and ``city`` are further fields of these domains. By default, these fields are rules
-    that permit everything.
+    Each argument has further YAML fields of the domain of that name, by default a rule that permits
+    everything.
     """
     return {
         DOMAINS: f"""

@@ -104,7 +104,7 @@ class RelayType(ConnectionType):
 
 @dataclass(frozen=True, slots=True)
 class Relay(Client):
-    """The relay of a node. ``fetch`` maps each topic that it fetches to the name at the target."""
+    """The relay of a node; ``fetch`` maps each topic at its source to its name at the node."""
 
     fetch: dict[str, str]
 

@@ -257,8 +257,8 @@ class TestWhatPeopleDidInGit:
 
     NODES: ClassVar[dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
 
-    def after(self, kind: str, route: Route, **nodes: Any) -> list[str]:
-        """Render a claim with this route between these nodes, and return the faults."""
+    def faults_of(self, kind: str, route: Route, **nodes: Any) -> list[str]:
+        """Render an edited claim with this route between these nodes; return the faults."""
         world = World(state(**self.NODES))
         world.send(demand(kind))
         (claim,) = world.state.ledger.connection_claims("c")
@@ -269,13 +269,13 @@ class TestWhatPeopleDidInGit:
         return [str(found) for found in refused.value.faults]
 
     def test_an_option_that_the_type_cannot_honour(self) -> None:
-        assert self.after("zenoh", Route("/a", "/a", qos=1)) == [
+        assert self.faults_of("zenoh", Route("/a", "/a", qos=1)) == [
             "connections: 'c': qos of '/a' is not supported by ZENOH; leave it out, or use "
             "type MQTT"
         ]
 
     def test_another_name(self) -> None:
-        (found,) = self.after("ros", Route("/a", "/b"))
+        (found,) = self.faults_of("ros", Route("/a", "/b"))
         assert found.startswith("connections: 'c': '/a' cannot become '/b'")
 
     @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ class TestWhatPeopleDidInGit:
     def test_what_the_inventory_lost(
         self, kind: str, node: str, left: dict[str, Any], expected: str
     ) -> None:
-        assert self.after(kind, Route("/a", "/a"), **{node: left})[0].startswith(expected)
+        assert self.faults_of(kind, Route("/a", "/a"), **{node: left})[0].startswith(expected)
 
     def test_an_image_that_the_registry_lost(self) -> None:
         world = World(state(**self.NODES))

@@ -23,7 +23,7 @@ ELSEWHERE = {
     "applications[1].place": "applications[1].node",  # then both are missing
     "applications[1].parameters_json.": "applications[1].parameters.",
 }
-"""Maps some fields to another field, at which a mistake in the first field may be reported."""
+"""Maps a field to a second field, at which a mistake in the first field may be reported."""
 
 
 @pytest.mark.parametrize(

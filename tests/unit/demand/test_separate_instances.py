@@ -36,8 +36,11 @@ def empty() -> MemoryRepo:
     return MemoryRepo(SEPARATE)
 
 
-def own(version: str) -> str:
-    """Return the version of the separate instance for a demanded version; empty for the default."""
+def separate_version(version: str) -> str:
+    """Return the version of the separate instance that serves a demand for ``version``.
+
+    The result is empty if the application's default version serves the demand.
+    """
     version = CHANNELS.get(version, version or DEFAULT)
     return "" if version == DEFAULT else version
 
@@ -65,7 +68,7 @@ def test_each_version_has_its_services_topics_and_end(random: Random) -> None:
         wanted = Counter[tuple[str, str]]()
         for made in held.values():
             (app,) = made["applications"]
-            version = own(app.get("version", ""))
+            version = separate_version(app.get("version", ""))
             wanted[app["id"] + (f"@{version}" if version else ""), version or DEFAULT] += 1
         assert {(id, one.version.name) for one in planned(repo) for id in one.applications} == {
             *wanted
@@ -107,8 +110,8 @@ def test_the_receipt_says_so_and_a_put_moves_it() -> None:
     assert {id for one in planned(repo) for id in one.applications} == {"edge/a"}
 
 
-def test_a_channel_that_leaves_the_default_version_changes_nothing_that_runs() -> None:
-    """One demand names the channel, another names no version; both share one application."""
+def test_a_channel_moved_off_the_default_version_changes_nothing_that_runs() -> None:
+    """Two demands share an application: one names the channel, the other names no version."""
     repo = MemoryRepo(SEPARATE)
     repo.send(put("a"))
     repo.send(put("b", "stable"))
@@ -192,7 +195,10 @@ def test_what_several_definitions_share_runs_once_so_another_version_of_it_is_re
 
 
 def shared(policy: str) -> dict[str, str]:
-    """Return a configuration; version 1.0.1 pins another recorder image, 1.1.0 a driver image."""
+    """Return a configuration with three versions of the recorder and one shared driver.
+
+    Version 1.0.1 pins an image of the recorder, and version 1.1.0 an image of the driver.
+    """
     appdef = yaml.safe_load(ADDITIONS["appdefs/recorder/appdef.yaml"])
     versions = {
         "1.0.0": {},

@@ -207,7 +207,7 @@ def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
 
 
 class Walk:
-    """Random joins and leaves; checks compare the running versions with the rule."""
+    """Random demands and releases, with checks of the versions that run."""
 
     def __init__(self, random: Random, policy: str) -> None:
         self.random = random
@@ -233,7 +233,7 @@ class Walk:
             else:
                 self.asked[demand] = wanted
 
-    def assert_as_the_rule_says(self) -> None:
+    def assert_newest_versions_run(self) -> None:
         """Check that each service runs the newest version of the applications that use it.
 
         The version of an application is the newest one that is demanded for it.
@@ -264,7 +264,7 @@ def test_what_runs_follows_from_the_claims_whatever_their_order(
     walk = Walk(random, policy)
     for _ in range(12):
         walk.step()
-        walk.assert_as_the_rule_says()
+        walk.assert_newest_versions_run()
     walk.assert_rendered_from_the_claims()
 
 

@@ -75,7 +75,7 @@ class Model:
                     self.events.append((now, *key, True))
 
     def levels(self) -> Iterator[tuple[Any, bool, bool]]:
-        """Yield (key, starts, stops) for each possible event; the entities' positions decide."""
+        """Yield (key, starts, stops): whether the positions fit an event's start, and its stop."""
         inside = 0
         for (source, entity), (x, y) in self.at.items():
             away = hypot(x, y)

@@ -76,8 +76,8 @@ def test_a_schedule_follows_the_clock_of_its_zone_and_may_end_on_the_next_day() 
     assert run.told(on(30, 23)) == []
 
 
-def test_changes_that_a_long_silence_brings_are_told_in_their_order() -> None:
-    """All the changes are in one step, as in a replay of a bag with a gap."""
+def test_after_a_gap_one_step_tells_each_change_at_its_own_time() -> None:
+    """A bag that is replayed may have such a gap."""
     sources = {**SOURCES, "slow": {"topic": "/slow/{entity}", "type": POSE, "timeout": "10m"}}
     rules = (
         rule("hour", schedule={"start": "00:01", "stop": "00:02"}),

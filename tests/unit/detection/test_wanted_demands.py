@@ -1,4 +1,4 @@
-"""The detector sends an event's goals one at a time; it repeats a failed goal if still wanted."""
+"""The detector sends one goal of an event at a time, and a failed goal again while it is wanted."""
 
 from __future__ import annotations
 
@@ -134,7 +134,10 @@ def test_a_demand_booked_before_the_start_is_renewed_at_once_and_not_put_again()
 
 
 def test_an_event_waits_until_another_one_has_ended_the_demand_with_the_same_id() -> None:
-    """If a rule is renamed, the release for its old name must not end the new demand."""
+    """A renamed rule may demand under the same id as before.
+
+    Then the release of the demand of the old name must not end the demand of the new name.
+    """
     sent = Sent()
     sent.want(PUT)
     assert sent.done(0) == "start"

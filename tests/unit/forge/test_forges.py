@@ -1,4 +1,4 @@
-"""Each call of the forges' adapters has the recorded method, path, headers and body."""
+"""The requests of the forge adapters match recordings: method, path, headers and body."""
 
 from __future__ import annotations
 

@@ -79,8 +79,8 @@ values = st.recursive(
 )
 
 
-def by_place(found: list[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return topics in the form of a claim: sorted, and each topic of a source only once."""
+def as_in_a_claim(found: list[InputTopic]) -> tuple[InputTopic, ...]:
+    """Return topics sorted, and only one of those with the same name and source."""
     return tuple(sorted({(item.topic, item.source): item for item in found}.values()))
 
 
@@ -92,7 +92,7 @@ def applications(draw: st.DrawFn) -> Application:
         node=draw(ids),
         inputs=MappingProxyType(
             {
-                role: by_place(draw(inputs))
+                role: as_in_a_claim(draw(inputs))
                 for role in ("ego_data", "point_cloud", "radar")
                 if draw(st.booleans())
             }
@@ -185,8 +185,8 @@ def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
     assert everything(ledger) == everything(Ledger())
 
 
-def written(claim: Claim, *changes: tuple[str, str]) -> Claim:
-    """Return the claim that is read from a claim's file after a person replaced texts in it."""
+def edited(claim: Claim, *changes: tuple[str, str]) -> Claim:
+    """Write a claim's file, replace texts in it as a person may, and return the claim it has."""
     text = claim_file.text_of(claim)
     for old, new in changes:
         assert old in text
@@ -201,8 +201,8 @@ def test_the_first_schema_has_no_action_and_the_demand_id_tells_it(
     connection = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
     claim = Claim(connection, demand, "r", ("c",), datetime(2026, 1, 31, tzinfo=timezone.utc))
 
-    assert written(claim) == claim
-    assert written(claim, ("ledger/v2", "ledger/v1")) == replace(claim, joined=joined)
+    assert edited(claim) == claim
+    assert edited(claim, ("ledger/v2", "ledger/v1")) == replace(claim, joined=joined)
 
 
 @pytest.mark.parametrize(
@@ -221,14 +221,14 @@ def test_a_time_that_cannot_be_reckoned_with_is_refused(
     booked, until = claim_file.format_timestamp(at), claim_file.format_timestamp(at.replace(day=30))
     claim = Claim(held, "d", "r", ("c",), at, Lease(1, LONGEST_S, at.replace(day=30)))
     with pytest.raises(InvalidInput) as error:
-        written(claim, (booked if field == "booked" else until, value))
+        edited(claim, (booked if field == "booked" else until, value))
     assert error.value.faults[0].message == f"'{value}' {problem}"
 
 
 def test_a_claim_of_any_year_survives_its_file() -> None:
     held = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"),))
     claim = Claim(held, "d", "r", ("c",), datetime(7, 1, 31, tzinfo=timezone.utc))
-    assert written(claim) == claim
+    assert edited(claim) == claim
 
 
 def test_a_topic_names_requesters_of_the_claim_only() -> None:
@@ -243,7 +243,7 @@ def test_a_topic_names_requesters_of_the_claim_only() -> None:
         claim = Claim(held, "d", "r", ("c", "e"), datetime(2026, 1, 31, tzinfo=timezone.utc))
         claim = claim.with_holders(held, {first: ("e",), second: ("c", "e")})
         with pytest.raises(InvalidInput) as error:
-            written(claim, ("    - e\n", "    - e\n    - x\n"))
+            edited(claim, ("    - e\n", "    - e\n    - x\n"))
         (found,) = error.value.faults
         assert found.field == place
         assert found.message == (

@@ -51,7 +51,7 @@ def assert_released(world: running.World, promises: Promises, now: int) -> None:
     Check that every claim that must end is released, and only claims that may end.
     """
     before = set(claims_of(world.state.ledger))
-    demands = world.look()
+    demands = world.do_what_is_due()
     assert len(demands) == len(set(demands))
     released = before - set(claims_of(world.state.ledger))
     assert promises.must_go(now) <= released <= promises.may_go(now)

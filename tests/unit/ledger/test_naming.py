@@ -58,7 +58,7 @@ subjects: st.SearchStrategy[Subject] = st.one_of(
 
 
 def rivals(subject: Subject, name: str) -> Iterator[Subject]:
-    """Yield other subjects that a simpler naming might also call ``name``."""
+    """Yield other subjects that would also get ``name`` if names were made in a simpler way."""
     prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
     yield ("of", rest)
     yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")

@@ -30,7 +30,7 @@ def join(*clouds: Topic, who: str = "vehicle01", id: str = APP, shutdown: bool =
 
 
 def published(repo: MemoryRepo) -> dict[str, str]:
-    """Return the topic of the object list of each detection, by the topic of its point cloud."""
+    """Map each detection's input topic (a point cloud) to its output topic (an object list)."""
     values = [release["spec"]["values"] for release in repo.objects("HelmRelease").values()]
     detections = [one["detection"] for one in values if "detection" in one]
     return {one["pointCloudTopic"]: one["objectListTopic"] for one in detections}

@@ -36,8 +36,8 @@ def key_of(subject: tuple[str, str], demand: Demand) -> Key:
     return subject, demand_id(*demand)
 
 
-def key_in(key: ClaimKey) -> Key:
-    """Return the key of a claim of the program, in the form of `key_of`."""
+def key_from(key: ClaimKey) -> Key:
+    """Convert the program's key of a claim."""
     return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
 
 
@@ -72,7 +72,7 @@ class Walk:
 
     def _holds(self) -> dict[Key, dict[tuple[str, ...], set[str]]]:
         return {
-            key_in(claim.key): {key: set(claim.holders(key)) for key in claim.held.topic_keys()}
+            key_from(claim.key): {key: set(claim.holders(key)) for key in claim.held.topic_keys()}
             for claim in self._repo.state.ledger
         }
 
@@ -86,7 +86,7 @@ class Walk:
 
 def assert_changes(taken: Decision, expected: Result) -> None:
     """Check that exactly the touched claims are written, and that each missing hold is named."""
-    changed = {key_in(change.key) for change in taken.changes.claims}
+    changed = {key_from(change.key) for change in taken.changes.claims}
     assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
     assert {path for path in taken.files if claim_file.kind_of(path)} == paths

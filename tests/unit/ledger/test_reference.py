@@ -60,10 +60,10 @@ def counted(ledger: Ledger) -> Books:
 
 
 def running(repo: MemoryRepo) -> Books:
-    """Return the topics of each service and connection, by the name of the reference's resource.
+    """Return the topics of each service and connection.
 
-    The reference has one detection for all clouds of a source, so the topics of these clouds are
-    listed together.
+    The keys are the names of the reference's resources. The reference has one detection for all
+    point clouds of a source, so the topics of a source's detections are listed together.
     """
     runs, books = defaultdict[str, set[str]](set), repo.bookkeeping()
     for service in books["services"].values():
@@ -81,26 +81,26 @@ def running(repo: MemoryRepo) -> Books:
 class Recorded:
     """One of the two tables of the recorded run: ``books`` (who requests what) or ``runs``.
 
-    ``there`` is the table of the reference after a step. ``here`` is the table that DemandOps must
-    have after the same step. The record of a step lists only what changes: entries of ``there``,
-    and entries of ``here`` that differ from ``there``.
+    ``theirs`` is the table of the reference after a step, and ``ours`` is the table that DemandOps
+    must have after the step. The record of a step lists only changes: to the entries of ``theirs``,
+    and to the list of entries in which ``ours`` differs from ``theirs``.
     """
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self.there: Books = {}
+        self.theirs: Books = {}
         self._differs: dict[str, Any] = {}
 
     def follow(self, step: dict[str, Any]) -> None:
-        self.there = present(self.there | step.get(self._name, {}))
+        self.theirs = present(self.theirs | step.get(self._name, {}))
         differs = self._differs | step.get(f"{self._name}_here", {})
         self._differs = {name: what for name, what in differs.items() if what != "same"}
         for name, what in self._differs.items():
-            assert what != self.there.get(name), f"{name} does not differ here"
+            assert what != self.theirs.get(name), f"{name} does not differ here"
 
     @property
-    def here(self) -> Books:
-        return present(self.there | self._differs)
+    def ours(self) -> Books:
+        return present(self.theirs | self._differs)
 
 
 def present(books: dict[str, Any]) -> Books:
@@ -120,10 +120,10 @@ def test_a_recorded_run_of_the_reference_is_what_the_model_says_and_what_comes_o
         reasons = operators.take(wanted)
         repo.take(wanted, NOW + timedelta(minutes=2 * number))
 
-        assert operators.books() == books.there, number
+        assert operators.books() == books.theirs, number
         assert reasons <= {step.get("class"), "never-ran"}, number
-        assert counted(repo.state.ledger) == books.here, number
-        assert running(repo) == runs.here, number
+        assert counted(repo.state.ledger) == books.ours, number
+        assert running(repo) == runs.ours, number
 
 
 def test_the_recorded_run_shows_every_difference_that_the_page_explains() -> None:
@@ -156,7 +156,10 @@ def made(random: Random) -> Goal:
 
 
 def counts_twice(ledger: Ledger, request: DemandRequest) -> bool:
-    """Return whether a join demands a topic that its own claim already has."""
+    """Return whether the operators count a join twice.
+
+    They do if the demand of the join already has a claim with one of the join's topics.
+    """
     for one in request.demanded if isinstance(request, Join) else ():
         own = ledger.get(ClaimKey(one.held.subject, demand_id(request.id, one.requesters)))
         if own and {*own.held.topic_keys()} & {*one.held.topic_keys()}:

@@ -1,4 +1,4 @@
-"""``messages.txt`` has all messages and fields, so each change of one shows in the file's diff."""
+"""``messages.txt`` has the messages and fields, so its diff shows each change of them."""
 
 from tests.unit.messages.text import FILE, text
 

@@ -1,4 +1,4 @@
-"""One text: the messages for the mistakes in the tests' tables, and every field's JSON schema."""
+"""The text of ``messages.txt``: messages for the tests' example mistakes, and all JSON schemas."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def after(*goals: dict[str, Any]) -> Reference:
 
 
 def read(reference: Reference, *wanted: str) -> ReferenceFiles:
-    """Read the reference's files whose names contain one of these words."""
+    """Read the reference's files whose names contain one of the ``wanted`` texts."""
     texts = {
         name: text for name, text in reference.texts().items() if any(w in name for w in wanted)
     }
@@ -122,16 +122,13 @@ def _goals(chance: Random) -> list[dict[str, Any]]:
     return goals
 
 
-def test_the_versioning_of_a_fusion_is_enough() -> None:
+def test_the_versioning_of_a_fusion_shows_its_holders() -> None:
     joins, _ = imported_goals.remaining_joins(read(experiment(6), "object_fusion_versioning"))
     assert who(joins[FUSION]) == [("vehicle03", "station00"), ("vehicle02", "station00")]
 
 
-def test_the_versioning_of_a_connection_is_not() -> None:
-    """A connection's versioning file alone does not show who holds the connection.
-
-    The first request in the file lists all later requesters too.
-    """
+def test_the_versioning_of_a_connection_does_not_show_its_holders() -> None:
+    """The first request in the versioning file lists all later requesters too."""
     files = read(experiment(3), "mqtt_versioning")
     first, *_ = files.versions[CONNECTION].values()
     assert first.requester == ["vehicle00", "station00", "vehicle01", "station00"]

@@ -180,7 +180,7 @@ def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
     ]
 
 
-def test_a_demand_that_an_override_breaks_is_told_which() -> None:
+def test_a_refusal_names_the_override_that_breaks_the_demand() -> None:
     """A patch may fit the demand that `check` invents, but not a real demand."""
     fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
     books = MemoryRepo(files(tested=fields))

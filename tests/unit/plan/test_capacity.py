@@ -1,4 +1,4 @@
-"""The usage of a node is counted from changes alone, and never exceeds the node's capacity."""
+"""Each change updates a node's usage without a recount; the usage never exceeds the capacity."""
 
 from __future__ import annotations
 

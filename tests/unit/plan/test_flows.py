@@ -36,10 +36,13 @@ CLUSTER_NODE = "cloud"
 class Origin(NamedTuple):
     """What a service can read: the topics of an input role, or the output of a service.
 
-    ``kind`` says how the topics are made. ``source``: at their sources. ``topic``: at the node of
-    an application, one for each input topic. ``once``: a single topic for an application, a node or
-    a cluster. ``roots`` are the roles from which the topics are made; ``roots`` is empty if
-    ``kind`` is ``once``.
+    The ``kind`` of the topics is one of these:
+
+    - ``source``: topics at their sources.
+    - ``topic``: topics at the node of an application, one for each input topic.
+    - ``once``: a single topic for an application, a node or a cluster.
+
+    ``roots`` are the input roles from which the topics are made. They are empty for ``once``.
     """
 
     name: str
@@ -55,8 +58,8 @@ class Graphs:
     ) -> None:
         """Make the definitions.
 
-        Some services that run once for an application also get the fields in ``place``. If ``each``
-        is set, some services that run once for each topic get these fields too.
+        ``place`` has fields that services with the scope ``application`` may get. If ``each`` is
+        set, services with the scope ``topic`` may get these fields too.
         """
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
@@ -128,8 +131,11 @@ class Graphs:
         name = origin.name.partition(".")[0]
         return next(iter(self.services[type][name]["roots"])) if "." in origin.name else origin.name
 
-    def _each(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
-        """Return a random origin that a service with the scope ``topic`` can read first."""
+    def _first(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
+        """Return a random origin for the first input of a service with the scope ``topic``.
+
+        Such a service has one instance for each topic of its first input.
+        """
 
         def is_for_each(one: Origin) -> bool:
             service = self.services[type].get(one.name.partition(".")[0])
@@ -149,7 +155,7 @@ class Graphs:
             self._add(type, name, "application", False, read)
         else:
             at_source = self.random.random() < 0.5
-            each = self._each(origins, type, at_source)
+            each = self._first(origins, type, at_source)
             more = self._readable(origins, "topic", at_source, self._root(type, each))
             read = [each, *self._chosen(more)]
             service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
@@ -166,7 +172,7 @@ class Graphs:
         definition |= {"nodes": {"c-its": CLUSTER_NODE}} if scope == "cluster" else {}
         definition |= copy.deepcopy(self._place) if scope == "application" else {}
         definition |= {"placement": "source" if at_source else "application"}
-        first = self._each(self._common, TYPES[0], at_source or scope == "cluster")
+        first = self._first(self._common, TYPES[0], at_source or scope == "cluster")
         count = self.random.randint(0, 1)
         made = []
         for type in TYPES:
@@ -221,7 +227,7 @@ class Demands:
         return app | {"deliver": self._deliveries(self.types[id])}
 
     def _deliveries(self, type: str) -> list[dict[str, Any]]:
-        """Return no delivery, or one whose output no other node makes under the same name."""
+        """Return at most one delivery, of an output that only one node makes under its name."""
         services = self.graphs.services[type].items()
         names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
         chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
@@ -233,7 +239,7 @@ def instances(
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the services that must run for an application of a demand.
 
-    ``moved`` maps each service that does not run on the application's node to its node.
+    ``moved`` maps a service to the node on which it runs, if that is not the application's node.
     """
     for name, service in graphs.services[app["type"]].items():
         own = moved.get(name, app["node"])

@@ -169,8 +169,11 @@ class Extreme(Random):
 
 
 @pytest.mark.parametrize(("seed", "length"), [(62, 3), (87, 4)])
-def test_a_drain_brings_no_topic_to_a_node_from_two(seed: int, length: int) -> None:
-    """With these seeds, services at several sources have outputs with the same name."""
+def test_a_drain_brings_no_topic_to_a_node_from_two_nodes(seed: int, length: int) -> None:
+    """Each seed gives services at several sources whose outputs have the same name.
+
+    A drain must not bring a topic of that name from two sources to one node.
+    """
     test_services_that_are_placed_fit_stay_and_leave_drained_nodes.hypothesis.inner_test(  # type: ignore[attr-defined]
         Extreme(seed), length
     )

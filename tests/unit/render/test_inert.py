@@ -102,7 +102,7 @@ def quoted(text: str) -> str:
 def inventory(lines: Iterable[str]) -> MemoryRepo:
     """Return a state repo with one more vehicle for each item of ``lines``.
 
-    An item has the fields of the vehicle besides type and cluster.
+    An item is the vehicle's YAML without the fields ``type`` and ``cluster``.
     """
     entries = "".join(f"  - type: vehicle\n    cluster: c-its\n{line}" for line in lines)
     return MemoryRepo({NODES: skeleton()[NODES] + entries})
@@ -139,12 +139,12 @@ def test_ids_are_read_back_as_they_were() -> None:
 ANY_TEXT = [
     text for text in (*TRAPS, *UNSEEN) if not control_character(re.sub(r"[\n\t]", " ", text))
 ]
-"""The texts that the configuration accepts. tests/unit/config tests that it refuses the others."""
+"""Texts that the configuration accepts. It refuses the rest of ``TRAPS`` and ``UNSEEN``."""
 LABELS = ["yes", "y", "1e3", "0x1F", "010", "1_000", "2026-01-31", "null", "true", "12", "1.5"]
 
 
 def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
-    """A toleration may have any text. The values of a selector must be text for every parser."""
+    """A toleration may have any text; a selector may even have a text like ``yes`` or ``010``."""
     tolerations = [{"key": text, "value": text} for text in ANY_TEXT]
     selector = {label: label for label in LABELS} | {"a": ""}
     texts = ", ".join(f"{{key: {quoted(text)}, value: {quoted(text)}}}" for text in ANY_TEXT)

@@ -103,7 +103,7 @@ def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> N
 
 
 def test_a_chart_in_a_new_folder_changes_nothing_that_someone_applied() -> None:
-    """Flux must be able to read the chart although nobody applies the bootstrap file again."""
+    """The bootstrap file stays as it is, because nobody applies it again for a new chart."""
     folder = "appdefs/new/charts/new"
     charts = skeleton()["registry/charts.yaml"]
     added = {

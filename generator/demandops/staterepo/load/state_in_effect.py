@@ -102,8 +102,9 @@ def start_at(
 ) -> Snapshot:
     """Return the state in effect at the generator's newest commit at or before ``commit``.
 
-    If there is no such commit, or its state is not valid, return the state of the newest commit up
-    to there whose files are all valid; if there is none, of the newest valid one after it.
+    The generator recorded that state. If there is no such record, or it is wrong, return the state
+    of a commit whose files are all valid: the newest one that the generator followed, or else the
+    newest one.
 
     Raises InvalidInput or StateRepoError if no commit is valid.
     """
