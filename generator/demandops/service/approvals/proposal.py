@@ -89,8 +89,9 @@ class Proposal:
     ) -> Verdict:
         """Return the verdict on the proposal's demands.
 
-        A demand is booked if a commit of main names its operation id in a trailer. A squash merge
-        may lose this trailer, so a demand is also booked if it would change no file of main.
+        A demand counts as booked if a commit of main names its operation id in a trailer. A squash
+        merge may lose this trailer, so a demand that would change no file of main also counts as
+        booked.
 
         Args:
             state: the state of main.
@@ -133,7 +134,7 @@ class Proposal:
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
     def wait_for(self, left: Decided) -> None:
-        """Remove all demands except those in ``left``, which still need approval."""
+        """Keep only the demands in ``left``, which still need approval."""
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
@@ -144,7 +145,10 @@ class Proposal:
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request releases all of ``pending``, and shares a requester with them."""
+    """Return whether a request releases all demands in ``pending``.
+
+    Only a request with a requester of one of these demands can release them.
+    """
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
@@ -190,7 +194,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a goal, as plain data, is a shutdown or a release."""
+    """Return whether a goal, as plain data, is a shutdown or the release of a demand."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 
@@ -225,8 +229,8 @@ def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     """
     fence = _fence(message, 3)
     return (
-        f"{_required_by(reasons)} Merging carries the demand out; closing this pull request or "
-        f"deleting the branch turns it down.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
+        f"{_required_by(reasons)} Merging approves the demand; closing this pull request or "
+        f"deleting the branch rejects the demand.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
     )
 
 
@@ -235,8 +239,8 @@ def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) ->
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = _fence(why, 1)
     description = (
-        f"{_required_by(reasons)} {fence} {why} {fence} Merging carries the demand out; deleting "
-        "the branch turns it down."
+        f"{_required_by(reasons)} {fence} {why} {fence} Merging approves the demand; deleting the "
+        "branch rejects the demand."
     )
     return [
         "merge_request.create",
