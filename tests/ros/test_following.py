@@ -77,7 +77,7 @@ def test_diagnostics_report_invalid_configuration_and_an_unreachable_remote(
     client.wait(lambda: heard.is_at(STATE, DiagnosticStatus.OK))
     assert served.stop() == 0
     log = served.log.read_text()
-    assert log.count("trying again until it is back") == 1
+    assert log.count("trying again until the state repo is back") == 1
     assert log.count("is back after") == 1
 
 

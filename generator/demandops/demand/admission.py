@@ -1,4 +1,4 @@
-"""Admission: the check that what a request demands can run with the configuration.
+"""Admission checks whether what is demanded can run with the configuration.
 
 The check reads appdefs, inventory, brokers and access domains, but not the ledger.
 """
@@ -233,7 +233,8 @@ def _unknown_application(name: str, config: Config) -> Fault:
         known = f"; known: {', '.join(types)}" if types else none
     else:
         none = (
-            "; appdefs/ on main has none: add one (demandops new application), commit and push it"
+            "; appdefs/ on main has no application definition: add one (demandops new "
+            "application), commit and push it"
         )
         known = suggestion(name, config.appdefs) or none
     shown = name.removeprefix("#") if name.startswith("#") else quoted(name)

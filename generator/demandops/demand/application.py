@@ -17,7 +17,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 class InputTopic(NamedTuple):
     """An input topic of an application, and the node that publishes it.
 
-    ``further`` is true if another topic was the node's usual topic when this topic was booked
+    ``further`` is true if this topic was not the node's usual topic when it was booked
     (:mod:`demandops.plan.output_topics`).
     """
 
@@ -43,9 +43,10 @@ class InputTopic(NamedTuple):
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
     def distinguishing_text(self, further: bool, version: str) -> str:
-        """Return the text that distinguishes topic names that are made from the same source.
+        """Return the text that makes topic names differ although their source is the same.
 
-        The text contains the topic if ``further`` is set, and the version if it is not empty.
+        The text contains the topic if ``further`` is set, and ``version`` unless ``version`` is
+        empty.
         """
         if not further:
             return version
@@ -147,7 +148,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The nodes that an override's selector may match."""
+        """The application's node. An override's selector may match it."""
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
@@ -167,13 +168,12 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further inputs of a role whose text in topic names is ``part``.
+        """Return those further inputs of a role that topic names show as ``part``.
 
-        For a separate instance, usual inputs of the role with this text are returned too. The texts
-        of all inputs are computed only once, because the plan of each service for a further topic
-        needs them.
+        For a separate instance, also return those usual inputs of the role that topic names show as
+        ``part``.
         """
-        if not self._further:
+        if not self._further:  # computed only once, because the plans of many services need it
             for known, topic in self.all_inputs():
                 if topic.further or self.separate:
                     called = topic.part_in(self.own_version)
@@ -199,7 +199,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def chosen_nodes(self) -> set[str]:
-        """The application's node, and the nodes of the services that have a node of their own."""
+        """The nodes that the demand or the generator chose for the application and its services."""
         return {self.node, *self.services.values()}
 
     def has_same_definition_and_nodes(self, other: Application) -> bool:

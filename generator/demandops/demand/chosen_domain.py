@@ -3,10 +3,9 @@
 In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
 it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
 
-A demand may name the node without a domain for an application, for a service of an application, or
-for an end of a connection. The domain is then the one in which the subject is booked already. If
-the subject is not booked yet, the domain is the only one in which the rules let the requesters use
-the node.
+A demand may name a node without a domain: as the node of an application or of a service, or as an
+end of a connection. If the application or connection is booked already, its domain stays. If it is
+not booked yet, the domain is the only one in which the rules let the requesters use the node.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def with_chosen_domains(
     faults: list[Fault] = []
     demanded = []
     for one in request.demanded:
-        held = _with_first_names(one.held, config)
+        held = _with_short_names(one.held, config)
         known = booked(held.subject)
         ends = dict(_chosen(one, known, config, request.adds_claims, faults))
         demanded.append(replace(one, held=_with_ends(held, ends)))
@@ -57,29 +56,29 @@ def _with_ends(held: Held, ends: Mapping[str, str]) -> Held:
     return replace(held, source=source, target=target)
 
 
-def _with_first_names(held: Held, config: Config) -> Held:
-    """Return ``held`` with the name ``<node>`` in place of each ``<node>@<first domain>``."""
+def _with_short_names(held: Held, config: Config) -> Held:
+    """Return ``held`` with each name ``<node>@<first domain>`` shortened to ``<node>``."""
 
-    def first(name: str) -> str:
+    def short(name: str) -> str:
         node, _, domain = name.rpartition("@")
         own = config.domain_of.get(node)
         return node if own and name not in config.nodes and own.name == domain else name
 
     if isinstance(held, Connection):
-        source, target, broker = map(first, (held.source, held.target, held.broker))
+        source, target, broker = map(short, (held.source, held.target, held.broker))
         return replace(held, source=source, target=target, broker=broker)
     inputs = {
-        role: tuple(one._replace(source=first(one.source)) for one in topics)
+        role: tuple(one._replace(source=short(one.source)) for one in topics)
         for role, topics in held.inputs.items()
     }
-    deliver = tuple(one._replace(node=first(one.node)) for one in held.deliver)
-    services = MappingProxyType({name: first(node) for name, node in held.services.items()})
-    held = replace(held, node=first(held.node), services=services, deliver=deliver)
+    deliver = tuple(one._replace(node=short(one.node)) for one in held.deliver)
+    services = MappingProxyType({name: short(node) for name, node in held.services.items()})
+    held = replace(held, node=short(held.node), services=services, deliver=deliver)
     return held.with_inputs(inputs)
 
 
 def _named(held: Held) -> Iterator[tuple[str, str]]:
-    """Yield (field, node) for each node whose access domain can be chosen."""
+    """Yield (field, node) for both ends of a connection, or for an application and its services."""
     if isinstance(held, Connection):
         yield from (("source", held.source), ("target", held.target))
     else:

@@ -148,7 +148,9 @@ class DemandGoal(FrozenModel):
 
 
 _DEEPEST = 50
-"""How many levels a parameter's value may have; a claim's file, which has the value, may have 100.
+"""How many levels a parameter's value may have.
+
+The value is a part of a claim's file, and the whole file may have 100 levels.
 """
 _LONGEST_KEY = 128
 """How many characters a key in a parameter's value may have.
@@ -200,10 +202,10 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
 
 
 def _field(item: str, path: str) -> str:
-    """Return the goal's path to a field of an application or connection; faults name this path.
+    """Return the path in the goal for a field of an item; faults name this path.
 
-    ``item`` is the path of the application or connection in the goal, and ``path`` is the field's
-    path in the item. The requesters are a field of the goal itself.
+    For example, the field ``appdef`` of the item ``applications[0]`` has the path
+    ``applications[0].type``. The requesters are a field of the goal itself.
     """
     if path.startswith("requesters"):
         return path
@@ -227,9 +229,9 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return the requirement in ``place``, or ``None`` if ``place`` is empty.
+    """Return the requirement that the field ``place`` states, or ``None`` if the field is empty.
 
-    A fault for each invalid text in ``place`` is added to ``faults``.
+    Add a fault for each invalid text in the field to ``faults``.
     """
     if place == GoalPlace():
         return None

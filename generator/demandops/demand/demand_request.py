@@ -19,8 +19,8 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""A function that takes the path of a field in an application or connection, and returns its path
-in the goal, which faults name. A path in an application is ``inputs.ego_data[2].source``.
+"""Takes the path of a field in an application or connection (``inputs.ego_data[2].source``), and
+returns the path of the field in the goal, for faults.
 """
 
 
@@ -58,7 +58,8 @@ class DemandRequest:
 
     ``demand`` is the demand's id. The reference's requests have no demand id; for each subject of
     such a request, :func:`demandops.demand.claim.demand_id` makes an id. ``own_requesters`` are the
-    requesters of the request itself: a release, for example, lists no item, but has requesters.
+    requesters of the request as a whole. For example, a request to release a demand lists no
+    applications and no connections, but has requesters.
     """
 
     id: str
@@ -142,11 +143,11 @@ class Expire(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Decommission(DemandRequest):
-    """An operator's request to remove a node or a requester, named by ``id``, for good.
+    """An operator's request to remove the node or the requester ``id`` for good.
 
     ``kinds`` are ``node``, ``requester`` or both. ``nodes`` lists the names that the node has in
-    its access domains. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. Only
-    the journal contains the request as plain data; actions and demand files cannot contain it.
+    its access domains. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. The
+    journal stores the request; no action and no demand file can express it.
     """
 
     kinds: frozenset[str] = frozenset()
@@ -158,7 +159,7 @@ class Decommission(DemandRequest):
 
     @staticmethod
     def is_goal(data: object) -> bool:
-        """Return whether plain data is a request to decommission."""
+        """Return whether plain data is the goal of a request to decommission."""
         return isinstance(data, dict) and data.get("kind") == "Decommission"
 
     def goal(self) -> dict[str, Any]:

@@ -90,8 +90,8 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
     """Return the path in the goal for a field of an application; faults name this path.
 
-    ``item`` is the application's path in the goal (``apps[0]``), and ``path`` is the field's path
-    in :class:`Application`. ``lists`` maps roles to the goal's lists of topics.
+    For example, the field ``node`` of the item ``apps[0]`` has the path ``apps[0].header.node_id``.
+    ``lists`` maps roles to the goal's lists of topics.
     """
     name, _, rest = path.partition(".")
     if name in ("id", "node"):
@@ -111,9 +111,8 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
 def _connection_field(item: str, path: str) -> str:
     """Return the path in the goal for a field of a connection; faults name this path.
 
-    ``item`` is the connection's path in the goal (``connections[0]``), and ``path`` is the field's
-    path in :class:`Connection`. The goal has two lists of topics: the names at the source, and the
-    names at the target.
+    For example, the field ``topics[2].target`` of the item ``connections[0]`` has the path
+    ``connections[0].target_topics[2]``.
     """
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"

@@ -16,7 +16,7 @@ from demandops.config.base_model import faults_of, field_path
 from demandops.errors import Fault, fault
 
 _DEEPEST = 100
-"""The deepest nesting of a goal, the same as in YAML."""
+"""How deeply a goal may be nested: as deeply as a YAML file of the state repo."""
 
 Goal = TypeVar("Goal", bound=BaseModel)
 

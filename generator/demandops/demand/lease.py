@@ -50,10 +50,10 @@ class Lease:
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease with its start at ``now``, when a person approves the claim.
+        """Return the lease of a claim that a person approves at ``now``.
 
-        If the claim already has a lease, ``before`` is that lease. The result is then the lease
-        ``before`` after a renewal, and never ends earlier than ``before``.
+        If the claim had the lease ``before``, the approval renews ``before``. So the new lease
+        never ends earlier than ``before``.
         """
         term = Term(self.seconds, self.slack)
         return before.renewed(term, now) if before else term.lease_from(now)
@@ -83,9 +83,9 @@ class Lease:
 
 
 def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | None:
-    """Return the lease of a claim that is requested with ``term``; ``None`` without a term.
+    """Return a claim's lease after a request with ``term``; ``None`` without a term.
 
-    If the claim has the lease ``current``, the result is that lease after a renewal.
+    The result is ``current`` after a renewal, or a new lease if ``current`` is ``None``.
     """
     if term is None:
         return None

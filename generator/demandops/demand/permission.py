@@ -27,13 +27,14 @@ Access = list[tuple[str, str]]
 PEERS = "peers"
 """The field of a rule that lists the access domains to which connections may lead."""
 _NO_RULES = (Rule(name="everything"),)
-"""The rules that apply to a domain without rules: everybody may demand everything inside of it."""
+"""For a domain whose policy has no rules: everybody may demand everything inside of the domain."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
     """Yield a fault for everything that the access domains do not allow the requesters.
 
-    A release needs no permission. :mod:`demandops.demand.admission` reports nodes without a domain.
+    A request that adds no claims needs no permission. :mod:`demandops.demand.admission` reports
+    nodes without a domain.
     """
     if not request.adds_claims:
         return
@@ -86,9 +87,9 @@ def _service_nodes(app: Application, config: Config) -> Iterable[str]:
 
 
 def may_place(one: Demanded, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may have an application of this type on a node.
+    """Return whether the requesters may use a node for an application of the type ``appdef``.
 
-    With an empty ``appdef``, return whether they may have a connection to the node.
+    If ``appdef`` is empty, return whether they may use the node as an end of a connection.
     """
     domain = config.domain_of.get(node)
     access: Access = [("applications", appdef)] if appdef else []
@@ -217,7 +218,7 @@ def _reasons(claim: Claim, config: Config) -> Iterator[str]:
 
 
 def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
-    """Yield the reasons for approval, unless one rule grants the access without approval."""
+    """Yield why an access to a domain needs approval, if no rule grants it without approval."""
     rules = [
         rule
         for rule in domain.rules

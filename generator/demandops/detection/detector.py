@@ -48,14 +48,18 @@ class Detector:
         return len(self._state.seen)
 
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
-        """Continue the events whose demands were booked before the start; return what each wants.
+        """Continue the events whose demands were booked before the detector started.
 
         Args:
-            booked: each event, with a goal that can end its demand. An event ends if there is no
-                longer a rule for it.
+            booked: each event, with its demand as a goal. The goal may lack everything except the
+                demand's id and requesters.
             now: the time.
             settle_s: how many seconds the events' entities may stay unseen until they count as
                 gone. If their source's timeout is longer, the timeout counts instead.
+
+        Returns:
+            What each event wants: its demand or, if no rule is for the event any longer, the end of
+            its demand.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting

@@ -2,8 +2,10 @@
 
 This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
 outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
-nothing is sent for it. If two events want demands with the same id, the second event waits until
-the first one has ended its demand. Such events exist after a rule gets another name.
+nothing is sent for it.
+
+After a rule is renamed, an event of the old name and an event of the new name may want demands with
+the same id. The second event then waits until the first event has ended its demand.
 """
 
 from __future__ import annotations
@@ -25,10 +27,10 @@ _RENEW_AFTER = 1 / 3
 _RETRY_S = 5.0
 _OTHER_S = 0.2
 """How many seconds until the next try while another event holds a demand with the same id."""
-_NOT_SENT = frozenset({"no-server", "rejected"})
-"""The codes of goals that the node did not accept."""
+_NOT_ACCEPTED = frozenset({"no-server", "rejected"})
+"""The codes of outcomes in which no node accepted the goal."""
 _UNKNOWN = "timeout"
-"""The code of a goal whose outcome is not known."""
+"""The code if nobody knows whether the node booked the goal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,11 +102,11 @@ class _Entry:
 
 
 class WantedDemands:
-    """The demands of all events."""
+    """For each event, the demand that it wants and the demand that it holds."""
 
     def __init__(self) -> None:
         self._entries: dict[Key, _Entry] = {}
-        self._owners: dict[str, Key] = {}  # which event holds the demand with an id
+        self._owners: dict[str, Key] = {}  # which event has a demand id
         self._queue: list[tuple[float, int, Key]] = []
         self._number = 0
 
@@ -116,14 +118,14 @@ class WantedDemands:
         self._enqueue(want.key, entry)
 
     def hold(self, key: Key, goal: Goal) -> None:
-        """Record that a demand was booked before the start.
+        """Record that a demand was booked before the detector started.
 
         The caller then calls :meth:`want` for the same event. If the event still wants the demand,
         the next goal renews the demand, because nobody knows how much time its lease has left.
         """
         entry = self._entries.setdefault(key, _Entry())
         entry.held, entry.renew_at = goal, -inf
-        self._owns(key, goal)
+        self._reserve(key, goal)
         self._enqueue(key, entry)
 
     def next(self, now: float) -> Sending | None:
@@ -135,17 +137,17 @@ class WantedDemands:
             _, _, key = heappop(self._queue)
             entry = self._entries.get(key)
             if entry is not None and (found := entry.next(now)):
-                if self._owns(key, found[1]):
+                if self._reserve(key, found[1]):
                     entry.is_under_way = True
                     return Sending(key, *found)
                 entry.not_before = now + _OTHER_S
                 self._enqueue(key, entry)
         return None
 
-    def _owns(self, key: Key, goal: Goal) -> bool:
-        """Return whether an event may send a goal: only if no other event holds the goal's demand.
+    def _reserve(self, key: Key, goal: Goal) -> bool:
+        """Reserve the demand id of a goal for an event; return false if another event has the id.
 
-        An event that may send the goal holds the demand from now on.
+        A ``DeploymentRequest`` has no demand id, so nothing is reserved and the result is true.
         """
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
@@ -176,7 +178,7 @@ class WantedDemands:
         if outcome.code and not is_over:
             if outcome.code == _UNKNOWN and sending.purpose == "start":
                 entry.held, entry.is_sure = sending.goal, False
-            is_away = outcome.code in {*_NOT_SENT, _UNKNOWN}
+            is_away = outcome.code in {*_NOT_ACCEPTED, _UNKNOWN}
             entry.not_before = now + (_RETRY_S if is_away else entry.retry_s)
             is_new = outcome.message != entry.refusal
             entry.refusal = outcome.message

@@ -67,8 +67,9 @@ class Demands:
 
         Args:
             journal: the journal, with the demands that an earlier process left.
-            limit: how many demands may wait.
-            requester_limit: how many demands of one requester may wait; None is no limit.
+            limit: how many demands may be queued.
+            requester_limit: how many demands of one requester may have no answer, apart from those
+                that await approval; None is no limit.
             runtime: provides the time and the threads.
         """
         self._journal = journal
@@ -104,7 +105,7 @@ class Demands:
 
     @property
     def unpublished(self) -> int:
-        """The number of demands in the journal that do not await approval."""
+        """The number of demands still to publish: those in the journal that await no approval."""
         with self._changed:
             return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
 
@@ -115,7 +116,7 @@ class Demands:
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether the worker must end a fetch: a demand is queued, or the generator stops."""
+        """Whether a demand is queued or the generator stops, so that no wait or fetch may go on."""
         return self.has_queued or self._closed
 
     # ---- waiting for demands ----
@@ -146,10 +147,10 @@ class Demands:
             return self.has_queued or not self._closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
-        """Wait for a new demand; return all demands that arrived since the last call.
+        """Return the demands that arrived since the last call of this method or of :meth:`take`.
 
-        Demands that had arrived when :meth:`take` was called are left out. The list is empty if the
-        wait ended after ``timeout`` seconds, by a withdrawal or by :meth:`wake`.
+        If there are none, wait for one. The list is empty if the wait ended after ``timeout``
+        seconds, by a withdrawal or by :meth:`wake`.
 
         Raises:
             Unsound: if a failed write left the journal in an unknown state.

@@ -100,12 +100,18 @@ class Evaluator:
             return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of the demands in ``batch`` that were pushed before, oldest first.
+        """Return the results of demands that an earlier attempt pushed but did not answer.
 
-        The history of ``tip`` records these demands. An earlier attempt pushed them but did not
-        answer them, because the connection or the process ended after the remote accepted the push,
-        or because an fsync failed. In a repository on this disk, this method writes their commits
-        and all later ones once more, and fsyncs them.
+        The demands got no answer because the connection or the process ended after the remote
+        accepted the push, or because an fsync failed. In a repository on this disk, this method
+        writes and fsyncs the commits of the demands and all later commits once more.
+
+        Args:
+            tip: the commit whose history records pushed demands.
+            batch: demands, of which some may be pushed already.
+
+        Returns:
+            The pushed demands of ``batch``, oldest first, each with its result.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())

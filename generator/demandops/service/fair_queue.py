@@ -1,11 +1,13 @@
 """The queue of demands: requesters take turns, and related demands keep their order.
 
-For the turns, only the first requester of a demand counts. Demands that share an application, a
-connection or a demand id keep their order. Goals of the reference's action that share a requester
-also keep their order, because the second of two equal shutdowns has an effect only if a join came
-between them. If the next demand must follow another demand, the queue returns the other demand
-first. A rollback or a decommission may touch any subject, so no demand overtakes it, and it
-overtakes no demand.
+A demand counts only for its first requester. If another queued demand must stay ahead of the demand
+whose turn it is, the queue returns the other demand first.
+
+- Demands that share an application, a connection or a demand id keep their order.
+- Goals of the reference's action that share a requester keep their order. For example, of two equal
+  shutdowns, the second has an effect only if a join came between them.
+- A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
+  overtakes it.
 """
 
 from __future__ import annotations
@@ -18,7 +20,10 @@ from typing import Any
 from demandops.service.ticket import Ticket
 
 _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
-"""A goal with any of these fields lists the subjects that it touches."""
+"""Fields of a goal that lists the subjects that it touches.
+
+A goal without any of these fields may touch any subject.
+"""
 
 
 @dataclass(eq=False)
@@ -37,7 +42,7 @@ class _Queued:
 class FairQueue:
     """A queue of demands; not thread-safe.
 
-    With ``in_order`` the demands leave in the order of their arrival, without turns.
+    Requesters take turns. With ``in_order``, demands leave in the order of their arrival instead.
     """
 
     def __init__(self, *, in_order: bool = False) -> None:

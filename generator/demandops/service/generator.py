@@ -141,7 +141,7 @@ class Generator:
 
     @property
     def unpublished(self) -> int:
-        """The number of demands in the journal that do not await approval.
+        """The number of demands still to publish: those in the journal that await no approval.
 
         Any thread may read this.
         """

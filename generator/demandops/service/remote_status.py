@@ -39,7 +39,7 @@ class RemoteMonitor:
         """Record that the remote cannot be reached; warn if it was reachable before."""
         since = self.status.unreachable_since
         if since is None:
-            log.warning("%s; trying again until it is back", reason)
+            log.warning("%s; trying again until the state repo is back", reason)
             self._away_from = self._runtime.monotonic()
         else:
             log.debug("%s", reason)

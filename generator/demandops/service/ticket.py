@@ -65,27 +65,28 @@ class Receipt:
 
 @dataclass(eq=False)
 class Ticket:
-    """A demand under way; ``future`` returns its receipt or raises its error.
-
-    The future ``journaled`` returns True as soon as the journal has the demand, because from then
-    on a crash does not lose the demand. If the demand is refused and not journaled, ``journaled``
-    returns False, and ``future`` raises the reason.
-
-    ``base`` is the tip that was known when the demand arrived. ``maybe_published`` is true if the
-    remote may have accepted a push of the demand although no answer arrived. ``has_released`` is
-    true if the demand is a release and ended a demand that awaited approval. Such a release
-    succeeds even if it ends no claim.
-    """
+    """A demand under way."""
 
     operation: str
     goal: Any
     received: datetime
     listener: Listener = lambda stage, text: None
     future: Future[Receipt] = field(default_factory=Future)
+    """Returns the demand's receipt or raises its error."""
     journaled: Future[bool] = field(default_factory=Future)
+    """Returns true once the demand is in the journal, so that a crash does not lose the demand.
+
+    Returns false if the demand is refused without being journaled.
+    """
     base: str = ""
+    """The tip that was known when the demand arrived."""
     maybe_published: bool = False
+    """Whether the remote may have accepted a push of the demand although no answer arrived."""
     has_released: bool = False
+    """Whether this demand released a demand that awaited approval.
+
+    Such a release succeeds even if it ends no claim.
+    """
     state: State = "queued"
     notified: set[str] = field(default_factory=set)
     proposal: ProposalRecord | None = None

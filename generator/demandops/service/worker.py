@@ -57,7 +57,7 @@ _NAME = "writer"
 class Worker:
     """Follows the state repo and turns batches of demands into published commits.
 
-    Any thread may read ``snapshot``, the newest published state, and ``remote``. The worker calls
+    Any thread may read ``remote`` and ``snapshot`` (the newest published state). The worker calls
     the ``listeners`` with the configuration in effect whenever the published state changes.
     """
 
@@ -91,7 +91,7 @@ class Worker:
     # ---- from any thread ----
 
     def fetch_now(self) -> None:
-        """Have the worker fetch as soon as no demand waits."""
+        """Have the worker fetch as soon as no demand is queued, even if no fetch is due."""
         self._timer.request()
         self._demands.wake()
 
@@ -104,7 +104,7 @@ class Worker:
     # ---- the loop ----
 
     def run(self) -> None:
-        """Publish demands, until no further demand is accepted and no demand waits."""
+        """Publish demands, until no further demand is accepted and no demand is queued."""
         # people may have decided about proposals before the start, so answer these demands first
         if self._demands.proposed:
             self._work()
@@ -142,7 +142,7 @@ class Worker:
         """Answer a batch with an error; if the batch is empty, stop fetching for a while.
 
         Raises:
-            Unsound: if ``error`` is one; then the process must end, and the journal is kept.
+            Unsound: if ``error`` is an ``Unsound``. The process must end then; the journal is kept.
         """
         if isinstance(error, Unsound):
             self._demands.end(error)
@@ -239,7 +239,7 @@ class Worker:
         tip = self._repository.tip()
         results = self._evaluator.published_before(str(tip), batch)
         published = {ticket for ticket, _ in results}
-        certain = len(results)
+        independent = len(results)
         left = [ticket for ticket in batch if ticket not in published]
         part, left = left[: backoff.max_demands], left[backoff.max_demands :]
         self._approvals.remove_released(part, self.snapshot.state)
@@ -255,7 +255,7 @@ class Worker:
             self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluated(commits, ticket))
             if commits.is_empty:
-                certain = len(results)
+                independent = len(results)
         if not left:
             for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
                 results.append(self._evaluated(commits, ticket))
@@ -267,7 +267,7 @@ class Worker:
             self._tip_is_fresh = True
             if self._repository.refresh() != commits.start.commit:
                 return None
-        if self._publish_commits(commits, results, certain):
+        if self._publish_commits(commits, results, independent):
             batch[:] = left
             self._demands.put_back(batch)
             backoff.published()
@@ -281,7 +281,11 @@ class Worker:
         )
 
     def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
-        """Evaluate a demand and return its result; if this frees room, book waiting demands."""
+        """Evaluate a demand, and book waiting demands if the demand frees room.
+
+        Returns:
+            The demand with its result.
+        """
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         self._own_work.follow(commits, before)
@@ -290,30 +294,34 @@ class Worker:
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        Return no ticket while a demand waits, because that demand may renew a lease.
+        Return no ticket while a demand is queued, because the queued demand may renew a lease.
         """
         if self._rest or self._demands.has_queued:
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
-    def _publish_commits(self, commits: CommitBatch, results: list[Result], certain: int) -> bool:
+    def _publish_commits(
+        self, commits: CommitBatch, results: list[Result], independent: int
+    ) -> bool:
         """Publish a commit batch and answer its demands, or return false and answer none.
 
-        The result is false if another writer published first. If the remote denies the push, the
-        demands after the first ``certain`` ones get :class:`PushDenied` as their answer, unless
-        they were withdrawn.
+        The result is false if another writer published first. If the remote denies the push, each
+        demand in ``results`` gets :class:`PushDenied` as its answer, except the first
+        ``independent`` demands and withdrawn demands.
 
         Args:
             commits: the commits of the demands.
             results: the demands and their results, in the order of evaluation.
-            certain: how many demands were decided before the batch had a commit; their results
-                do not depend on the push.
+            independent: how many demands were decided before the batch had a commit, so that their
+                results do not depend on the push.
         """
         try:
             published = commits.publish()
         except PushDenied as error:
-            denied = [(t, r if isinstance(r, Withdrawn) else error) for t, r in results[certain:]]
-            results[certain:] = denied
+            results[independent:] = [
+                (ticket, result if isinstance(result, Withdrawn) else error)
+                for ticket, result in results[independent:]
+            ]
             self.remote.record_push_denied(str(error))
         else:
             if not published:
@@ -388,7 +396,8 @@ class Worker:
     def _carry_out_changes(self) -> bool:
         """Publish the effects of people's changes; return whether this published a commit.
 
-        The changes are fetched already. Fetch again only if another writer published first.
+        The caller has fetched the changes. This method fetches only after another writer published
+        first.
         """
         for _ in range(_TRIES):
             commits = self._new_commit_batch()

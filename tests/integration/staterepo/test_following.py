@@ -328,7 +328,7 @@ def test_a_remote_away_is_logged_once_and_once_when_it_is_back(
             lambda: not generator.remote_status.unreachable, "the remote is known to be back"
         )
     told = [record.getMessage() for record in caplog.records]
-    assert sum("trying again until it is back" in text for text in told) == 1
+    assert sum("trying again until the state repo is back" in text for text in told) == 1
     assert sum(" is back after " in text for text in told) == 1
 
 

@@ -72,8 +72,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(request="{distance}")),
-            "rules.yaml:21: rules[0].demand.request: '{distance}' alone becomes a number, but this "
-            "field needs text; add a word to it",
+            "rules.yaml:21: rules[0].demand.request: '{distance}' becomes a number, but this field "
+            "needs text; write a word before {distance}, such as 'near-{distance}'",
         ),
         (
             rule("a", near={"source": "cars", "polygon": [{"x": 0, "y": 0}, {"x": 1, "y": 1}]}),

@@ -102,7 +102,7 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
     for _ in range(3):
         remote.record_reached(pushed=True)
     assert [record.getMessage() for record in caplog.records] == [
-        "cannot be fetched: no route; trying again until it is back",
+        "cannot be fetched: no route; trying again until the state repo is back",
         "https://git.example/state.git is back after 90 s",
     ]
     assert not remote.status.unreachable and remote.status.last_push is not None

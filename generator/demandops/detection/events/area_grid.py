@@ -21,7 +21,11 @@ class AreaGrid(Generic[Item]):
     """Items with areas, indexed by the squares of the map that each area and its margin touch."""
 
     def __init__(self, items: Iterable[tuple[Item, Area, float]]) -> None:
-        """Index items, each with its area and the margin around it in metres."""
+        """Build the index.
+
+        Args:
+            items: each item with its area and the margin around the area in metres.
+        """
         boxes = [(item, _box(area, around)) for item, area, around in items]
         sizes = [max(box[2] - box[0], box[3] - box[1]) for _, box in boxes]
         self._size = max(_SMALLEST_CELL_M, median(sizes) if sizes else 0.0)

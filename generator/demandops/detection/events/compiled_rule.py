@@ -67,7 +67,7 @@ class HoursRule(CompiledRule):
         self.schedule = hours.schedule
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the rule's name as the only value."""
+        """Return facts with one value: the rule's name."""
         return Facts(self._named(subjects), "the hours of the schedule")
 
 
@@ -89,7 +89,7 @@ class ThresholdRule(CompiledRule):
         return is_low if self._limits.above is not None else value >= self._limits.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the number that the entity reported last."""
+        """Return facts with the latest value that the entity reported for the rule's field."""
         value = seen[self.sources[0], subjects[0]].values.get(self.field, 0.0)
         named = {**self._named(subjects), "value": value}
         return Facts(named, f"{self.field} of {subjects[0]} is {value:g}")
@@ -106,7 +106,7 @@ class AreaRule(CompiledRule):
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return an entity's position and its distance to the area, or the number of entities."""
+        """Return facts: the number of entities, or one's position and distance to the area."""
         named = self._named(subjects)
         if self.count is not None:
             return Facts({**named, "count": count}, f"{count} entities are in or near the area")
@@ -146,7 +146,7 @@ class PairRule(CompiledRule):
         return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the position of the first entity, and its distance to the second one."""
+        """Return facts with the first entity's position and its distance to the second entity."""
         one, other = (seen[who] for who in self.entities_of(subjects))
         (x, y), away = one.position or (0.0, 0.0), distance(one, other)
         text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"

@@ -14,7 +14,7 @@ Who: TypeAlias = tuple[str, str]
 """The identity of an entity: its source and its name."""
 
 Cell: TypeAlias = tuple[str, str, int, int]
-"""A square of the map, for a rule on pairs and one of its sources: rule, source, column and row."""
+"""A square of the map, for one source of a rule on pairs: (rule, source, column, row)."""
 
 _NOTHING: Mapping[Any, Any] = MappingProxyType({})
 
@@ -54,9 +54,9 @@ class Event(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """A condition that has been met since the time ``since``.
+    """The dwell time before an event (``lasts`` is false), or the event itself (``lasts`` is true).
 
-    ``lasts`` is false during the dwell time, and true after it.
+    ``since`` is the time at which the phase began.
     """
 
     since: float
@@ -65,35 +65,32 @@ class Phase(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """The engine's whole state; times are in seconds since 1970.
-
-    ``seen`` has the last observation of each entity that is not gone.
-
-    ``phases`` has the conditions that are met now, by key. ``engaged`` has, for each entity, the
-    keys of the conditions in which the entity takes part.
-
-    ``awaited`` has the entities that take part in an earlier event and have not been seen since the
-    start, each with the time at which the entity counts as gone. Before the time ``settled``, no
-    condition on a count stops.
-
-    ``counted`` has, for each entity, the rules that count it. ``counts`` has, for each rule, how
-    many entities it counts. ``cells`` has the entities by square, for rules on pairs.
-
-    Before the time ``due``, only an observation can change anything. Before the time
-    ``hours_due``, no schedule begins or ends.
-    """
+    """The engine's whole state; times are in seconds since 1970."""
 
     now: float
     due: float
+    """The time before which only an observation can change anything."""
     settled: float
+    """The time before which no condition on a count stops."""
     hours_due: float
+    """The time before which no schedule begins or ends."""
     seen: Mapping[Who, Observation] = field(default_factory=dict)
+    """The last observation of each entity that is not gone."""
     awaited: Mapping[Who, float] = field(default_factory=dict)
+    """The entities of resumed events that have not been seen since the engine started.
+
+    Each has the time at which it counts as gone.
+    """
     phases: Mapping[Key, Phase] = field(default_factory=dict)
+    """The phases that have not ended."""
     engaged: Mapping[Who, frozenset[Key]] = field(default_factory=dict)
+    """For each entity, the keys of the phases in which the entity takes part."""
     counted: Mapping[Who, frozenset[str]] = field(default_factory=dict)
+    """For each entity, the rules that count it."""
     counts: Mapping[str, int] = field(default_factory=dict)
+    """For each rule, how many entities the rule counts."""
     cells: Mapping[Cell, frozenset[str]] = field(default_factory=dict)
+    """The entities in each square, for rules on pairs."""
 
     @property
     def lasting(self) -> frozenset[Key]:

@@ -34,7 +34,7 @@ def faults_of_demand(
     Args:
         template: the template of the demand.
         field: the path of the demand in the file of rules.
-        subjects: the names that stand for an event's entities in the template.
+        subjects: the names by which the template refers to an event's entities.
         momentary: the names of values that are known only when an event starts. A ``Demand`` may
             use them, except in its id and its requesters. A ``DeploymentRequest`` may not.
     """
@@ -58,17 +58,23 @@ def faults_of_demand(
 
 
 def _number_for_text(text: str) -> str:
-    """Return a message if ``text`` is only a number's name in braces, like ``{x}``; else empty."""
+    """Return a message if ``text`` is ``{x}`` or another name that stands for a number.
+
+    Return an empty text for any other ``text``.
+    """
     if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
-        return f"{quoted(text)} alone becomes a number, but this field needs text; add a word to it"
+        return (
+            f"{quoted(text)} becomes a number, but this field needs text; write a word before "
+            f"{text}, such as 'near-{text}'"
+        )
     return ""
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
     """Yield a fault for each id that is missing, that may change, or that two entities would share.
 
-    ``needed`` has the names in braces that a ``Demand`` must have in its id, and a
-    ``DeploymentRequest`` in the requesters of each item.
+    ``needed`` are names in braces, such as ``{entity}``. They must be in the id of a ``Demand``, or
+    in the requesters of each application and connection of a ``DeploymentRequest``.
     """
     data = template.data
     if template.action == "demand":

@@ -36,7 +36,7 @@ class Goal:
 
     @property
     def action_name(self) -> str:
-        """The name of the action's type."""
+        """The action's type in ROS: ``Demand`` or ``DeploymentRequest``."""
         return "Demand" if self.action == "demand" else "DeploymentRequest"
 
     @property
@@ -46,14 +46,14 @@ class Goal:
         return {**head, **self.data}
 
     def ended(self) -> Goal:
-        """Return the goal that ends the demand of this goal."""
+        """Return the goal that ends the demand that this goal starts."""
         if self.action == "deployment_request":
             return Goal(self.action, {**self.data, "shutdown": True})
         kept = {name: self.data[name] for name in ("demand", "requesters")}
         return Goal(self.action, {**kept, "operation": "release"})
 
     def renewed(self) -> Goal:
-        """Return the goal that renews the demand of this goal."""
+        """Return the goal that renews the demand that this goal starts."""
         if self.action == "deployment_request":
             return self
         kept = {name: self.data[name] for name in ("demand", "requesters")}
@@ -113,7 +113,7 @@ class RuleDemand:
 
         Args:
             held: the demand in the bookkeeping.
-            subjects: the names that stand for entities in the template.
+            subjects: the names by which the template refers to the event's entities.
             rule: the name of the rule.
 
         Returns:

@@ -128,7 +128,7 @@ class Rule(CamelModel):
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """The names that stand for an event's entities in the template, such as ``entity``."""
+        """The names by which the template refers to an event's entities, such as ``entity``."""
         if self.together is not None:
             return ("entity", "other")
         return () if self.count or self.schedule else ("entity",)
@@ -150,7 +150,8 @@ class Rule(CamelModel):
     def is_for(self, *entities: str) -> bool:
         """Return whether the rule is for an event about these entities.
 
-        In a pair from two sources, ``entities`` limits only the entity of the first source.
+        If the rule is for pairs from two sources, the rule's patterns limit only the entity of the
+        first source.
         """
         limited = entities[:1] if self.together and self.together.other else entities
         return all(matches(entity, self.entities) for entity in limited)

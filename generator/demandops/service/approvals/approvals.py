@@ -130,12 +130,12 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """If ``by`` releases demands in ``earlier`` that need approval, withdraw these demands.
+        """Withdraw demands in ``earlier`` that need approval and that the demand ``by`` releases.
 
         Args:
             earlier: the demands of the batch that are evaluated already, with their results. For a
                 withdrawn demand, the result is replaced by :class:`Withdrawn`.
-            by: the next demand of the batch, which may be a release.
+            by: the next demand of the batch, whether it releases a demand or not.
             state: the state on which ``by`` will be evaluated.
         """
         request = _release_request(by, state) if earlier else None
@@ -432,7 +432,10 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the release that a demand requests; None if there is none that can be carried out."""
+    """Return the request of a shutdown or of the release of a demand; None for other demands.
+
+    None also stands for a demand that is withdrawn or refused.
+    """
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)

@@ -91,23 +91,23 @@ class Proposal:
     ) -> Verdict:
         """Return the verdict on the proposal's demands.
 
-        A demand is booked if a commit of main names its operation id in a trailer. A squash merge
-        may lose this trailer, so a demand is also booked if it would change no file of main. A
-        person may also have edited the branch before. So a demand is booked too if it would change
-        only claims that people have added, and no other demand of the proposal has these claims.
+        A demand counts as booked if a commit of main names its operation id in a trailer. A squash
+        merge may lose this trailer, so two more kinds of demands count as booked: a demand that
+        would change no file of main; and, if a person edited the branch before the merge, a demand
+        that would change only claims in ``added``.
 
         Args:
             state: the state of main.
             read: reads a file of main.
             on_main: the operation ids in the commits of main since ``searched_to``.
-            added: if a person has edited or deleted the branch, the claims that people have added
-                to main since ``searched_to``.
+            added: the claims that people have added to main since ``searched_to``; empty unless a
+                person has edited or deleted the branch.
             head: the newest commit of the branch; empty if the branch does not exist.
             pull_request: the pull request, if it is known.
         """
         verdict = Verdict()
         if any(ticket.goal != self.tickets[0].goal for ticket in self.tickets):
-            added = ()
+            added = ()  # a claim may come from any of these demands
         for ticket in self.tickets:
             decision: Decision | InvalidInput
             try:
@@ -143,7 +143,7 @@ class Proposal:
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
     def wait_for(self, left: Decided) -> None:
-        """Remove all demands except those in ``left``, which still need approval."""
+        """Keep only the demands in ``left``, which still need approval."""
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
@@ -160,7 +160,10 @@ def _changes_only(claims: Container[ClaimKey], decision: Decision) -> bool:
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request releases all of ``pending``, and shares a requester with them."""
+    """Return whether a request releases all demands in ``pending``.
+
+    Only a request with a requester of one of these demands can release them.
+    """
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
@@ -206,7 +209,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a goal, as plain data, is a shutdown or a release."""
+    """Return whether a goal, as plain data, is a shutdown or the release of a demand."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 
@@ -241,8 +244,8 @@ def pull_request_body(message: str, reasons: Iterable[str]) -> str:
     """
     fence = _fence(message, 3)
     return (
-        f"{_required_by(reasons)} Merging carries the demand out; closing this pull request or "
-        f"deleting the branch turns it down.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
+        f"{_required_by(reasons)} Merging approves the demand; closing this pull request or "
+        f"deleting the branch rejects the demand.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
     )
 
 
@@ -251,8 +254,8 @@ def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) ->
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     fence = _fence(why, 1)
     description = (
-        f"{_required_by(reasons)} {fence} {why} {fence} Merging carries the demand out; deleting "
-        "the branch turns it down."
+        f"{_required_by(reasons)} {fence} {why} {fence} Merging approves the demand; deleting the "
+        "branch rejects the demand."
     )
     return [
         "merge_request.create",

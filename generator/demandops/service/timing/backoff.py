@@ -11,26 +11,26 @@ from demandops.runtime import Runtime
 
 FIRST_PAUSE_S = 0.05
 LONGEST_AWAY_S = 10.0
-"""The longest delay while the remote cannot be reached."""
+"""The longest delay before the next attempt, while the remote cannot be reached."""
 LONGEST_TURN_S = 0.4
-"""The longest delay after another writer published first.
+"""The longest delay before the next attempt, after another writer published first.
 
-A writer with a longer delay would lose again to writers that wait less.
+A writer that waits longer would lose again to writers that wait less.
 """
 LIMIT_LOCAL = 20
-"""How many demands to publish together at most, in a repository on this disk."""
+"""The most demands to publish together in a repository on this disk."""
 LIMIT_REMOTE = 200
-"""How many demands to publish together at most, with one push to a remote.
+"""The most demands to publish together with one push to a remote.
 
-The limit is higher for a remote, because a push takes about 50 ms. Moving a branch of a repository
-on this disk takes less than 1 ms.
+The limit is higher than :data:`LIMIT_LOCAL`, because a push takes about 50 ms, but moving a branch
+of a repository on this disk takes less than 1 ms.
 """
 
 LONGEST_EVALUATION_S = 1.0
-"""After how many seconds of evaluation the demands evaluated so far are published.
+"""The longest time to evaluate the demands of a batch before the evaluated demands are published.
 
-The other demands of the batch go back to the queue, so that demands that arrived meanwhile take
-their turn.
+The other demands of the batch go back to the queue. In the queue, requesters take turns, so a
+demand that arrived meanwhile may come first.
 """
 
 

@@ -27,7 +27,10 @@ class Draining:
         self._logged: dict[str, frozenset[str]] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
-        """Commit the moves off each drained node; later retry the applications that stayed."""
+        """Commit the moves of placed applications away from drained nodes.
+
+        If an application cannot be moved yet, a later call tries again.
+        """
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)

@@ -28,7 +28,7 @@ log = logging.getLogger("demandops")
 _JUMP = timedelta(seconds=30)
 _SHORTEST_S = 1.0
 LONGEST_WAIT_S = 60.0
-"""The longest time between two checks of the leases. It is short, as the clock may be set."""
+"""The longest time between two checks of the leases; short, because a person may set the clock."""
 _RETRY = timedelta(seconds=LONGEST_WAIT_S)
 """The pause after a failed try to end a lease or an override, or to scale down."""
 
@@ -47,9 +47,10 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        A demand whose ticket was answered is left out until that ticket is a minute old. The
-        tickets are correct only at the time of the call, because later a requester may have renewed
-        a lease, or a person may have set the clock.
+        If the last ticket of a demand was answered and the demand still has an ended lease, the
+        demand gets no new ticket until the last ticket is a minute old. The tickets are correct
+        only at the time of the call: later, a requester may renew a lease, or a person may set the
+        clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)

@@ -28,7 +28,10 @@ class OwnWork:
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand freed room; ``before`` is the state before it."""
+        """Book waiting demands if the last demand freed room.
+
+        ``before`` is the state before the last demand.
+        """
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:

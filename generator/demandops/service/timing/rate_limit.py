@@ -28,7 +28,7 @@ class RateLimit:
     ) -> Iterator[Fault]:
         """Count a demand, and yield a fault for each quota that a requester exceeds with it.
 
-        Releases are not limited.
+        Requests that add no claims are not limited.
         """
         if not request.adds_claims:
             return

@@ -15,23 +15,23 @@ class Rest:
         self._next, self._until = FIRST_S, runtime.monotonic()
 
     def __bool__(self) -> bool:
-        """Return whether to rest now."""
+        """Return whether the pause goes on."""
         return self._runtime.monotonic() < self._until
 
     @property
     def follows_success(self) -> bool:
-        """Whether the next rest is the first one since a success or since the start."""
+        """Whether the next pause is the first one since a success or since the start."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
-        """Return the seconds until the end of the rest."""
+        """Return the seconds until the end of the pause."""
         return self._until - self._runtime.monotonic()
 
     def begin(self) -> None:
-        """Begin a rest now."""
+        """Begin a pause now."""
         self._until = self._runtime.monotonic() + self._next
         self._next = min(2 * self._next, LONGEST_S)
 
     def succeeded(self) -> None:
-        """Make the next rest short again."""
+        """Make the next pause short again."""
         self._next = FIRST_S

@@ -45,7 +45,10 @@ class WaitingTurns:
         self._tried = commits.head.state
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand freed room; ``before`` is the state before it."""
+        """Book waiting demands if the last demand freed room.
+
+        ``before`` is the state before the last demand.
+        """
         if commits.frees:
             commits.frees = False
             self.book_due(commits)
