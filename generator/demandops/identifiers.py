@@ -95,7 +95,7 @@ _ANY = "letters, digits"
 PATTERN_WORDS = {
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": f"{_LOWER} and '-' between them, such as c-its",
     r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, for example road-station",
-    r"^[a-z][a-z0-9]{0,9}$": "up to ten small letters and digits, with a letter first, for example od",
+    r"^[a-z][a-z0-9]{0,9}$": "up to ten small letters and digits, a letter first, for example od",
     r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, for example sensor_msgs",
     r"^[a-z][A-Za-z0-9_]*$": f"{_ANY} and '_', with a small letter first, for example memoryGiB",
     r"^[a-z0-9./-]+$": f"{_LOWER}, '.', '/' and '-', such as cpu or nvidia.com/gpu",

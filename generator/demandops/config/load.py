@@ -290,7 +290,7 @@ def _in_further_domains(
             elif domain is first or id in nodes:
                 message = f"'{node.id}' is already in '{further.name}'; remove this entry"
                 if domain is not first and id not in hosts:
-                    message = f"a node of the inventory has the id '{id}'; give it another id"
+                    message = f"a node of the inventory has the id '{id}'; rename that node"
                 reader.add_fault(file, f"{where}.name", message)
             elif domain is not None:
                 number = _in_ros_domain(node, domain).ros.domain_id

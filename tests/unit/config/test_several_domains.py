@@ -208,3 +208,15 @@ def test_a_domain_that_does_not_fit_is_a_fault(
     with pytest.raises(InvalidInput) as raised:
         MemoryRepo(files(further, *domains))
     assert fault in str(raised.value)
+
+
+def test_no_node_has_the_id_that_another_node_gets_in_a_further_domain() -> None:
+    taken = {"id": "edge@city", "type": "edge", "cluster": "c-its", "selector": {"host": "other"}}
+    given = files([{"name": "city"}])
+    nodes = yaml.safe_load(given["inventory/nodes.yaml"])
+    nodes["nodes"].append(taken)
+    with pytest.raises(InvalidInput) as raised:
+        MemoryRepo(given | {"inventory/nodes.yaml": yaml.safe_dump(nodes)})
+    assert (
+        "accessDomains[0].name: a node of the inventory has the id 'edge@city'; rename that node"
+    ) in str(raised.value)
