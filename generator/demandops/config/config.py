@@ -98,7 +98,7 @@ class Config:
     files: Mapping[str, str]
     """The text of each file below ``appdefs/``, such as a template or a chart, by path."""
     hosts: Mapping[str, str] = field(default_factory=dict)
-    """For each name of a node in a further access domain (``edge@city``), its id (``edge``)."""
+    """For each node in a further access domain (``edge@city``), the inventory's id (``edge``)."""
     overrides: Mapping[str, Override] = field(default_factory=dict)
     """Every override; :class:`demandops.ledger.world.World` knows which of them have ended."""
     clients: ClientsFile = DEFAULT_SETTINGS

@@ -33,9 +33,10 @@ class Service(Deployed):
     root: str | None = None
     """The role for each of whose topics a service with ``each`` runs once."""
     roots: tuple[str, ...] = ()
-    """The roles whose topics an instance reads from its only source, directly or through services.
+    """The roles whose topics an instance reads from its only source.
 
-    Empty if an instance may have several sources.
+    The instance reads them directly or through other services. The roles are empty if an instance
+    may have several sources.
     """
     nodes: dict[str, str] = Field(default_factory=dict)
     """For a service that runs once for each cluster: the service's node in each cluster."""

@@ -60,8 +60,8 @@ class Scaling(CamelModel):
 
     ``divides_work`` says that no two replicas publish the same data.
 
-    Additional replicas start without delay. They stop ``down_after`` later than the last demand
-    that needed them (:mod:`demandops.ledger.kept_replicas`).
+    Additional replicas start without delay. Additional replicas stop ``down_after`` after the last
+    demand that needed them has ended (:mod:`demandops.ledger.kept_replicas`).
     """
 
     min: Count = 1

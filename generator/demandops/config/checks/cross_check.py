@@ -211,7 +211,7 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 def _check_uses(config: Config, reader: ConfigReader) -> None:
     """Check the nodes of shared services, and the input that a shared service names in ``each``.
 
-    That input must have one origin in all appdefs that use the service.
+    The input must have the same origin in all appdefs that use the service.
     """
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():

@@ -102,7 +102,7 @@ def _selects_services(selector: Selector) -> bool:
 def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
     """Yield the fields that can separate two selectors.
 
-    If two selectors do not overlap in one of these fields, no release matches both.
+    If both selectors have one of these fields and do not overlap in it, no release matches both.
     """
     yield from ("services", "nodes")
     if not any(_shared(one, other, services) for services in config.services.values()):
