@@ -1,4 +1,4 @@
-"""The rules for ids, topic names and message types, and words for the patterns of other fields."""
+"""Rules for ids, topic names and message types, and how messages explain a field's pattern."""
 
 from __future__ import annotations
 
@@ -94,13 +94,13 @@ _ANY = "letters, digits"
 
 PATTERN_WORDS = {
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": f"{_LOWER} and '-' between them, such as c-its",
-    r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, such as road-station",
-    r"^[a-z][a-z0-9]{0,9}$": "up to ten small letters and digits, with a letter first, such as od",
-    r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, such as sensor_msgs",
-    r"^[a-z][A-Za-z0-9_]*$": f"{_ANY} and '_', with a small letter first, such as memoryGiB",
+    r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, for example road-station",
+    r"^[a-z][a-z0-9]{0,9}$": "up to ten small letters and digits, a letter first, for example od",
+    r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, for example sensor_msgs",
+    r"^[a-z][A-Za-z0-9_]*$": f"{_ANY} and '_', with a small letter first, for example memoryGiB",
     r"^[a-z0-9./-]+$": f"{_LOWER}, '.', '/' and '-', such as cpu or nvidia.com/gpu",
     r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
-    r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, such as ROS_DOMAIN_ID",
+    r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, for example ROS_DOMAIN_ID",
     r"^[A-Za-z0-9_.-]+$": f"{_ANY}, '_', '.' and '-', such as start.launch.py",
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$": f"{_ANY}, '_', '.' and '-', such as ca.crt",
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
@@ -112,7 +112,7 @@ PATTERN_WORDS = {
     r"^values/[A-Za-z0-9_.-]+$": "a file of the folder values/, such as values/service.yaml.j2",
     r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$": "a host name or address, such as 10.0.0.1",
     r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": (
-        f"parts of {_ANY}, '_' and '-', with '/' between them, such as fleet/one"
+        f"one or more parts with '/' between them (fleet/one), each of {_ANY}, '_' and '-'"
     ),
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
     r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",

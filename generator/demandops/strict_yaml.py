@@ -38,9 +38,10 @@ _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, Recursi
 _MISFIT = "not valid YAML: it has a tag, number or character that cannot be read"
 
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-"""Matches a quoted text, or the digits before the ``e`` of a JSON number like ``1e-09``.
+"""Finds the digits before the ``e`` of a JSON number like ``1e-09``.
 
-YAML 1.1 would read such a number as text.
+YAML 1.1 would read such a number as text. The pattern matches quoted texts as a whole, so that no
+digits inside them are found.
 """
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
@@ -71,7 +72,7 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""For each tag of a scalar that is not text, the function that makes the scalar's value."""
+"""The function that makes the value of a date, number, truth value or null, by YAML tag."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -79,14 +80,14 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a word that stands for a list is not the plain value of a field."""
+    """Raised if a text cannot be read with stand-ins for its lists (:data:`_STAND_IN`)."""
 
 
 class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
     Deep nesting is refused, because recursive code that reads the values could fail. ``lists`` maps
-    a word in the text (:data:`_STAND_IN`) to the list that the word stands for.
+    each stand-in in the text (:data:`_STAND_IN`) to the list that it replaces.
     """
 
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
@@ -256,7 +257,7 @@ _LONG = 200
 It is 20 times faster than PyYAML.
 """
 _STAND_IN = "demandops-list"
-"""The prefix of the words that replace long lists while PyYAML reads the rest of a text."""
+"""The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text."""
 
 
 def _load_around_lists(text: str) -> list[Any]:
@@ -397,7 +398,7 @@ def set_key(text: str, key: str, value: object) -> str:
     except (InvalidInput, TypeError):
         succeeded = False
     if not succeeded:
-        message = f"cannot be set automatically; write {short_repr(value)} there"
+        message = f"cannot be set automatically; set it to {short_repr(value)} by hand"
         raise InvalidInput.at(key, message)
     return changed
 

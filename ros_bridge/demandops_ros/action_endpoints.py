@@ -27,7 +27,7 @@ normally responds within milliseconds."""
 
 _ASK_AGAIN_S = 0.2
 
-_WITH_GOAL_S = 10
+_GOAL_KEPT_S = 10
 """How many seconds ROS keeps a goal that has ended."""
 _RESULT_S = 900
 """How many seconds :class:`LastingResults` keeps a result after ROS has forgotten the goal."""
@@ -215,7 +215,7 @@ class LastingResults(ActionServer):  # type: ignore[misc]
     def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401
         """Start the server; the arguments are those of :class:`ActionServer`."""
         self._lasting: OrderedDict[bytes, tuple[float, Any]] = OrderedDict()
-        super().__init__(*args, result_timeout=_WITH_GOAL_S, **options)
+        super().__init__(*args, result_timeout=_GOAL_KEPT_S, **options)
 
     async def _execute_expire_goals(self, expired_goals: Any) -> None:  # noqa: ANN401
         now = REAL.monotonic()

@@ -36,7 +36,7 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
     default=60.0,
     show_default=True,
     metavar="SECONDS",
-    help="How long to wait for the node and for an answer.",
+    help="How long to wait for the node and its answer together.",
 )
 @output_option
 def demand(

@@ -119,11 +119,11 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    more = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver", "services"}
+    others = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver", "services"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
     return messages.Application(
-        **_fields(data, _APPLICATION, more, "an application"),
+        **_fields(data, _APPLICATION, others, "an application"),
         **_fields(data.get("place", {}), _PLACE, set(), "a place"),
         services=[f"{name}={node}" for name, node in data.get("services", {}).items()],
         deliver=[
@@ -173,14 +173,16 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 
 
 def _fields(
-    data: Mapping[str, Any], names: Mapping[str, str], more: set[str], what: str
+    data: Mapping[str, Any], names: Mapping[str, str], others: set[str], what: str
 ) -> dict[str, Any]:
-    """Return the fields of ``data``, renamed by ``names``; leave out those in ``more``.
+    """Return the fields of ``data`` that ``names`` lists, under their names in the message.
+
+    ``others`` lists the fields that the caller converts.
 
     Raises:
-        ValueError: for a field of ``data`` that is neither in ``names`` nor in ``more``.
+        ValueError: for a field of ``data`` that is neither in ``names`` nor in ``others``.
     """
-    known = {*more, *names}
+    known = {*others, *names}
     for name in data:
         if name not in known:
             raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, known)}")

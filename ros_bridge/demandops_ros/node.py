@@ -211,7 +211,10 @@ class DemandNode(Node):  # type: ignore[misc]
         self._after(goal, goal.ticket.future, self._answer)
 
     def _forget_unless_accepted(self, goal: _Goal) -> None:
-        """Forget a goal whose client never got the acceptance; its demand is still carried out."""
+        """Forget a goal if its acceptance did not reach the client.
+
+        The goal's demand is still carried out.
+        """
         if goal.handle is None:
             del self._goals[id(goal.message)]
             self.get_logger().warning(
@@ -272,8 +275,8 @@ class DemandNode(Node):  # type: ignore[misc]
         if status is not None:
             problem = status.why_unreachable(target.domain for target in outcome.targets)
         if problem or status is None:
-            warnings = (*outcome.warnings, f"answered once pushed, not once {level}: {problem}")
-            self._finish(goal, replace(outcome, warnings=warnings))
+            warning = f"the goal is answered at 'pushed', and not at '{level}': {problem}"
+            self._finish(goal, replace(outcome, warnings=(*outcome.warnings, warning)))
             return
         rolled_out = status.follow(
             outcome.commit, outcome.targets, level, self._timeout_s, partial(self._tell, goal)

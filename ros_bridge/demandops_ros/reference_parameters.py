@@ -24,7 +24,7 @@ _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?
 
 _REPLACED = {
     "cluster_config": "a GitOps controller applies what is committed; give --clusters if the node "
-    "shall answer goals once they are reconciled or healthy",
+    "shall not answer a goal before its releases are reconciled or healthy",
     "helm_release_tag": "the GitOps controller removes releases that are no longer demanded",
     "url_application_registry": "registry/charts.yaml names where each chart comes from",
     "applications": "values of services are in the application definitions, appdefs/",

@@ -41,7 +41,7 @@ class ExecutorThread:
         atexit.register(self.close)  # in case no caller closes it
 
     def call(self, callback: Callable[[], object]) -> None:
-        """Call ``callback`` in the thread."""
+        """Call ``callback`` in the executor's thread."""
         self._executor.create_task(callback)
 
     def close(self) -> None:

@@ -323,8 +323,8 @@ def test_a_file_that_cannot_be_edited_by_the_program_is_told(
     ran = upgraded("--gitops", "argocd")
     assert (ran.code, ran.out, state.tip) == (1, "", before)
     assert ran.err == (
-        "error: demandops.yaml: argocd: cannot be set automatically; write {'url': "
-        f"'{URL}'}} there\n"
+        "error: demandops.yaml: argocd: cannot be set automatically; set it to {'url': "
+        f"'{URL}'}} by hand\n"
     )
 
 

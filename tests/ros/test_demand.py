@@ -147,7 +147,8 @@ def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: De
     answer = vehicle.put("healthy", connections=[link("healthy")], answer="healthy")
     assert (answer.outcome, answer.reached) == ("booked", "pushed")
     assert answer.warnings == (
-        "answered once pushed, not once healthy: this node has no access to the clusters",
+        "the goal is answered at 'pushed', and not at 'healthy': this node has no access to the "
+        "clusters",
     )
 
 

@@ -64,7 +64,7 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
 
 REPLACED = [
     f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; give "
-    "--clusters if the node shall answer goals once they are reconciled or healthy",
+    "--clusters if the node shall not answer a goal before its releases are reconciled or healthy",
     f"parameter k3d_image_registry {UNUSED} set the field 'registry' to "
     "k3d-registry.localhost:41671 in registry/images.yaml, and give the images the names that they "
     "have in that registry (docs/migration.md)",

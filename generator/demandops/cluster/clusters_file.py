@@ -19,9 +19,9 @@ from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
-    """Raised when the configuration does not say how to wake a controller.
+    """Raised if a controller cannot be woken, because an address or a kubeconfig is missing.
 
-    Its message contains no secret.
+    The message contains no secret.
     """
 
 

@@ -23,11 +23,11 @@ log = logging.getLogger("demandops")
 
 _LEASE_S = 15
 """How many seconds a Lease is valid if nobody renews it."""
-_RENEW_S = 10
-"""The process of a leader ends if it has not renewed its Lease for this many seconds."""
+_RENEW_WITHIN_S = 10
+"""A leader that has not renewed its Lease for this many seconds ends its process."""
 _CALL_S = 2
 """How many seconds a call of the API may take. A renewal has two calls, and must end before the
-Lease does: ``_RENEW_S + 2 * _CALL_S < _LEASE_S``."""
+Lease does: ``_RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S``."""
 _PAUSE_S = 2.0
 _RELEASED_S = 1
 _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-9])?)")
@@ -135,8 +135,8 @@ class Leadership:
             self._on_leader()
 
     def _require_renewed(self) -> None:
-        if self.is_leader and self._runtime.monotonic() - self._renewed >= _RENEW_S:
-            self._end(f"was not renewed for {_RENEW_S} s ({self._told})")
+        if self.is_leader and self._runtime.monotonic() - self._renewed >= _RENEW_WITHIN_S:
+            self._end(f"was not renewed for {_RENEW_WITHIN_S} s ({self._told})")
 
     def _read(self) -> dict[str, Any]:
         lease: dict[str, Any] = self._api.get_namespaced_custom_object(

@@ -47,7 +47,7 @@ class ObjectCache:
         self._watched: set[ObjectSelector] = set()
         self._known: set[ObjectSelector] = set()
         self._errors: dict[ObjectSelector, str] = {}
-        self._unread = "it has not been read yet"
+        self._unread = "some objects have not been read yet"
         self._closed = runtime.event()
         self._client: Any = None
 

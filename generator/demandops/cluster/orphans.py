@@ -46,7 +46,9 @@ def orphans(
     caches: Mapping[str, ObjectCache],
     history: History,
 ) -> Iterator[Orphan]:
-    """Yield the orphans on clusters, sorted by cluster, domain and object.
+    """Yield the objects that are left on clusters, although their releases are gone.
+
+    The objects are sorted by cluster, domain and key.
 
     Domains that cannot be read are skipped. Domains that have not applied ``commit`` are skipped
     too, because their controllers may still remove objects.

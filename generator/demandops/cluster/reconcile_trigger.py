@@ -3,9 +3,9 @@
 Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure,
 and the controller fetches at its next interval.
 
-Flux is woken only while it is idle. If kustomize-controller begins a second reconciliation right
-after the first, it may read the status that was written before the first (seen with 1.9). It then
-forgets which objects the first reconciliation created, and never removes them.
+Flux is woken only while it is idle. If kustomize-controller 1.9 begins a second reconciliation
+right after the first, the second may read the status from before the first. Kustomize-controller
+then forgets which objects the first reconciliation created, and never removes them.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class _Wake:
     idle_from: float = -inf
     """Since when the controller is known to be idle; infinity while it is busy."""
     handled: dict[str, str] = field(default_factory=dict)
-    """For each domain, the last request that its GitRepository had handled before the last call."""
+    """For each domain, what :meth:`Flux.handled_request` returned just before the last call."""
 
     @property
     def is_untried(self) -> bool:
-        """Whether a push came for which no call was made yet."""
+        """Whether a push needs a call, and no call has been tried for it yet."""
         return self.pushed is not None and self.pause == _FIRST_RETRY_S
 
     @property
@@ -221,8 +221,8 @@ class ReconcileTrigger:
             wake.handled = {}
             if wake.pause == _FIRST_RETRY_S:
                 log.warning(
-                    "cluster '%s' was not woken (%s); retrying for a minute; if that fails too, "
-                    "its controller fetches at its next interval",
+                    "cluster '%s' was not woken (%s); retrying for a minute; if no retry succeeds, "
+                    "the cluster's controller fetches at its next interval",
                     wake.cluster,
                     _reason(error),
                 )

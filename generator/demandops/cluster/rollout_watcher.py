@@ -65,7 +65,7 @@ class RolloutWatcher:
 
         Args:
             clusters: the access to each cluster; clusters without a kubeconfig are ignored.
-            history: the commits of the state repo; called from the status thread.
+            history: answers questions about the state repo's commits, in the status thread.
             runtime: provides the time and the threads.
         """
         self._history, self._runtime = history, runtime

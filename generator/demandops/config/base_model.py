@@ -129,15 +129,15 @@ def faults_of(
     return [
         fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
         for item in error.errors(include_url=False)
-        if not _counts_faulty_items(dict(item))
+        if not _is_wrongly_short(dict(item))
     ]
 
 
-def _counts_faulty_items(item: dict[str, Any]) -> bool:
-    """Return whether an error calls a list too short, although the list has enough items.
+def _is_wrongly_short(item: dict[str, Any]) -> bool:
+    """Return whether an error says that a list is too short, although it has enough items.
 
-    Pydantic counts only valid items. The caller leaves out such an error, because the faulty items
-    have faults of their own.
+    Pydantic counts only valid items. The error can be left out, because the faulty items have
+    faults of their own.
     """
     is_short = item["type"] == "too_short" and isinstance(item.get("input"), list)
     return is_short and len(item["input"]) >= item["ctx"]["min_length"]

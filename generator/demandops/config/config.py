@@ -66,10 +66,9 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return how a message names the files of a collection.
+    """Return the text for a collection's files: ``inventory/nodes.yaml or inventory/nodes/``.
 
-    The result is like ``inventory/nodes.yaml or inventory/nodes/``. ``files`` are the files that
-    have entries of the collection.
+    ``files`` are the files that have entries of the collection.
     """
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
@@ -80,12 +79,7 @@ def place_of_collection(collection: str, files: Iterable[str]) -> str:
 class Config:
     """What can run, where, and from which charts and images.
 
-    ``services`` maps each appdef to its own services and those of ``definitions`` that it uses.
-    ``files`` maps the path of each file below ``appdefs/`` to its text, for example of templates
-    and charts. ``overrides`` has every override; :class:`demandops.ledger.world.World` knows which
-    of them have ended. ``entry_files`` has a map for each collection, from each entry to
-    its file. ``hosts`` maps each node in a further access domain (``edge@city``) to the node
-    of the inventory (``edge``).
+    Most mappings go from the name of an entry to the entry.
     """
 
     repo_settings: RepoSettings
@@ -98,21 +92,27 @@ class Config:
     appdefs: Mapping[str, ApplicationDefinition]
     definitions: Mapping[str, ServiceDefinition]
     services: Mapping[str, Services]
+    """For each appdef, its own services and those of ``definitions`` that it uses."""
     domain_of: Mapping[str, AccessDomain]
+    """The access domain of each node."""
     files: Mapping[str, str]
+    """The text of each file below ``appdefs/``, such as a template or a chart, by path."""
     hosts: Mapping[str, str] = field(default_factory=dict)
+    """For each node in a further access domain (``edge@city``), the inventory's id (``edge``)."""
     overrides: Mapping[str, Override] = field(default_factory=dict)
+    """Every override; :class:`demandops.ledger.world.World` knows which of them have ended."""
     clients: ClientsFile = DEFAULT_SETTINGS
     versions: Mapping[str, VersionList] = field(default_factory=dict)
     entry_files: Mapping[str, Mapping[str, str]] = field(
         default_factory=dict, compare=False, repr=False
     )
+    """For each collection, a map from each entry to the file that has the entry."""
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """For each part of a topic name, the nodes for whose ids ``topic_part`` returns this part."""
+    """A map from each ``topic_part(id)`` to the ids of the nodes that have this topic part."""
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    """For each node type, its nodes, sorted by id. The empty type stands for all nodes."""
+    """For each role, the nodes with this ``type``, sorted by id. The empty role has all nodes."""
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
@@ -206,7 +206,7 @@ class Config:
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return how a message names the files of a collection (:func:`place_of_collection`)."""
+        """Return the text by which messages name a collection's files."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
@@ -238,7 +238,7 @@ class Config:
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return how a message names the files that list the versions of an appdef."""
+        """Return the text by which messages name the files that list the versions of an appdef."""
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
         return self.place_of(CHARTS_FILE)

@@ -130,9 +130,9 @@ class ConfigReader:
         """Return the file that has an item, and the item's path in this file, like ``nodes[3]``."""
         return self._places[collection][name]
 
-    def add_alias(self, collection: str, name: str, of: str) -> None:
-        """Register ``name`` as a further name of the item ``of``."""
-        self._places[collection][name] = self._places[collection][of]
+    def add_alias(self, collection: str, name: str, item: str) -> None:
+        """Register ``name`` as a further name of ``item``."""
+        self._places[collection][name] = self._places[collection][item]
 
     def is_missing(self, collection: str, name: str) -> bool:
         """Return whether a collection lacks an item.
@@ -164,9 +164,10 @@ class ConfigReader:
             return None
 
     def _items(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
-        """Return the raw value of ``field``, and add the faults of the file's other fields.
+        """Return the unchecked items of a file: the value of ``field``.
 
-        Return ``None`` if the value is missing or is not of the type ``kind``.
+        Check the other fields of the file, and add their faults. Return ``None`` if ``field`` is
+        missing or not of the type ``kind``.
         """
         raw = None
         try:

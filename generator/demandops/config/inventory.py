@@ -235,43 +235,51 @@ class FurtherDomain(CamelModel):
 class Node(CamelModel):
     """A C-ITS entity that runs services.
 
-    ``type`` is the role of the node and may be any word. ``capabilities`` are words for what the
-    node has, and ``properties`` are values with a type. A demand may say what it requires of these
-    three instead of naming a node. Then the generator chooses a node that is not ``drained``
-    (:mod:`demandops.plan.nodes.placement`). All services on the node together request at most its
-    ``capacity`` (:mod:`demandops.plan.nodes.capacity`).
-
-    ``selector`` defaults to ``{node_id: <id>}``, the label that the reference uses. If the access
-    domain has a ROS domain, the node has this ROS domain, and not the one in ``ros``. ``topics``
-    maps each input role to the node's usual topic. The names of releases and derived topics
-    contain the node. For a topic that is not the usual one, these names contain the topic too.
-
-    Zenoh and ROS connections reach the node through ``zenoh`` and ``wan``. ``types`` maps topics to
-    message types, for requests that give no type. ``bridged`` maps another node to the topics that
-    the initial deployment already carries to that node under the same name. Connections skip these
-    topics. ``access_domains`` are the node's further domains. For each of them, the configuration
-    has a further node ``<id>@<domain>`` (:meth:`in_domain`).
+    A demand may name the node, or say which ``type``, ``capabilities`` and ``properties`` a node
+    must have (:mod:`demandops.plan.nodes.placement`).
     """
 
     id: NodeId
     type: Word
+    """The role of the node; any word."""
     cluster: DnsLabel
     selector: dict[LabelKey, LabelValue] | None = None
+    """By default ``{node_id: <id>}``, the label that the reference uses."""
     topics: dict[Word, Topic] = Field(default_factory=dict)
+    """The node's usual topic for each input role.
+
+    The names of releases and derived topics contain the node's id. For any other topic, these names
+    also contain the topic.
+    """
     tolerations: Items[Toleration] = ()
     image_pull_secrets: Items[DnsLabel] = ()
     host_network: bool = True
     ros: Ros = Ros()
+    """A ROS domain of the access domain replaces the ROS domain that is given here."""
     zenoh: Zenoh | None = None
     wan: Wan | None = None
+    """The address at which ROS connections reach the node."""
     types: dict[Topic, MessageType] = Field(default_factory=dict)
+    """The message types of topics, for requests that give no type."""
     bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
+    """For each other node, the topics that the initial deployment already carries to that node.
+
+    The topics keep their names. Connections skip these topics.
+    """
     capabilities: Items[Word] = ()
+    """Words for what the node has."""
     properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
+    """The value of each property: a number, text, true or false."""
     position: Position | None = None
     drained: bool = False
+    """The generator chooses no drained node."""
     capacity: Resources | None = None
+    """What all services on the node may request together (:mod:`demandops.plan.nodes.capacity`)."""
     access_domains: Items[FurtherDomain] = ()
+    """The node's further domains.
+
+    For each further domain, the configuration has a node ``<id>@<domain>`` (:meth:`in_domain`).
+    """
 
     @model_validator(mode="after")
     def _findable(self) -> Node:

@@ -102,7 +102,7 @@ def load(files: Mapping[str, str]) -> Config:
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     services = {name: _resolve(appdef, definitions, reader) for name, appdef in appdefs.items()}
-    services = {name: _with_nodes(own, nodes.values()) for name, own in services.items()}
+    services = {name: _with_runs_at(own, nodes.values()) for name, own in services.items()}
     clients, client_files = _read_clients(reader)
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
@@ -131,8 +131,8 @@ def load(files: Mapping[str, str]) -> Config:
     return config
 
 
-def _with_nodes(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services, with ``runs_at`` set for those that run once for each cluster."""
+def _with_runs_at(services: Services, nodes: Iterable[Node]) -> Services:
+    """Return the services. Those that run once for each cluster get :attr:`Service.runs_at`."""
     found = dict(services)
     for name, service in services.items():
         if service.nodes:
@@ -288,8 +288,9 @@ def _in_further_domains(
                 message = f"no access domain has '{node.id}' in its nodes; add it to one"
                 reader.add_fault(file, where, message)
             elif domain is first or id in nodes:
-                message = f"'{node.id}' is already in '{further.name}', or a node has the id '{id}'"
-                message += "; remove this entry or the other one"
+                message = f"'{node.id}' is already in '{further.name}'; remove this entry"
+                if domain is not first and id not in hosts:
+                    message = f"a node of the inventory has the id '{id}'; rename that node"
                 reader.add_fault(file, f"{where}.name", message)
             elif domain is not None:
                 number = _in_ros_domain(node, domain).ros.domain_id

@@ -108,7 +108,9 @@ def _filled_in(model: FrozenModel) -> None:
     """Raise ValueError if the file has a field without a value, which would have no effect."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
-        raise ValueError(f"{' and '.join(empty)}: has no value; fill it in, or remove it")
+        raise ValueError(
+            sentences(f"'{name}' has no value; add one, or remove '{name}'" for name in empty)
+        )
 
 
 class Selector(FrozenModel):
@@ -179,8 +181,8 @@ class OverrideFile(FileModel):
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
-                "select: selects connections and services, but 'values' can have settings of "
-                "clients or Helm values, not both; write two overrides"
+                "select: selects both connections and services, but 'values' fits only connections "
+                "(settings of clients) or only services (Helm values); write two overrides"
             )
         for index, selector in enumerate(self.select):
             wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
@@ -254,7 +256,7 @@ class Shaping:
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image``, changed by the pins that the overrides have for the image ``name``."""
+        """Return ``image`` as the overrides pin it; ``name`` is its name in the registry."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)

@@ -68,10 +68,13 @@ class LeasePolicy(CamelModel):
     """The time that a demand's claims stay booked without a renewal.
 
     A demand that requests no lease gets ``default``, or ``longest`` if there is no ``default``. If
-    neither is set, its claims last forever. Goals of the reference's ``DeploymentRequest`` get a
-    lease only with ``deployment_requests``. A client must then send its goal again before the
-    lease ends. The recorded end of a lease may lag behind the last renewal by ``slack``, so the
-    generator may release a claim late by that much.
+    neither is set, the demand's claims last forever.
+
+    If ``deployment_requests`` is true, goals of the reference's ``DeploymentRequest`` get the
+    default lease. Their client must send a goal again before its lease ends.
+
+    The recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
+    release a claim late by that much.
     """
 
     default: Duration | None = None
@@ -124,7 +127,7 @@ KINDS = {
     }.items()
     for kind, resource in kinds.items()
 }
-"""The kinds that a policy may name by one word."""
+"""The kinds of Kubernetes objects that a policy may name by one word."""
 
 NOT_BY_DEFAULT = ("DaemonSet",)
 """Kinds that are allowed only if a policy names them.

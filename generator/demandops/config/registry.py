@@ -254,7 +254,7 @@ class ApplicationVersion:
         return tuple(map(precedence, [self.name] if self.name else charts))
 
     def image(self, name: str, image: Image) -> Image:
-        """Return an image of the registry, changed by the version's pin if there is one."""
+        """Return ``image`` as this version pins it; ``name`` is its name in the registry."""
         return self.images[name].over(image) if name in self.images else image
 
 

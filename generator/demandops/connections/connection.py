@@ -1,4 +1,4 @@
-"""Connections, which demands list, claims hold, and clients carry."""
+"""Connections: demands list them, claims hold them, and clients carry them."""
 
 from __future__ import annotations
 
@@ -116,7 +116,11 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return the connection without its broker ``node``, or ``None`` if ``node`` is an end."""
+        """Return what is left of the connection without ``node``, the node of an end or the broker.
+
+        Without an end, nothing is left, so return ``None``. Without the broker's node, return the
+        connection without a broker.
+        """
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:

@@ -152,7 +152,7 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return this type's connection ``id``, or ``None`` if no claim holds it.
+        """Return the connection of this type with the id ``id``; ``None`` if no claim holds it.
 
         Raises:
             Refused: if the type cannot carry the connection.

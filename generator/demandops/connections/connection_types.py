@@ -28,7 +28,7 @@ def type_numbered(number: int) -> ConnectionType | None:
 
 
 def type_named(word: str) -> ConnectionType:
-    """Return the type whose :attr:`word`, its name in files, is ``word``, or raise ``KeyError``."""
+    """Return the type that files call ``word``; raise ``KeyError`` if there is none."""
     return {known.word: known for known in CONNECTION_TYPES}[word]
 
 
@@ -43,9 +43,9 @@ def by_number() -> list[ConnectionType]:
 
 
 def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
-    """Return the validator of a field that accepts ``before``, the types' words and ``after``.
+    """Return the validator of a field that accepts the words of all types, and a few others.
 
-    A message about another word lists the accepted words in this order.
+    Messages list the accepted words: first ``before``, then the words of the types, then ``after``.
     """
 
     def words() -> tuple[str, ...]:

@@ -153,7 +153,7 @@ class MqttEnd(End):
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Yield the entries that :class:`End` yields, and the broker's entry."""
+        """Yield the configuration's entries that affect every end, and the broker's entry."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield (
@@ -165,7 +165,7 @@ class MqttEnd(End):
     def environment(self, settings: ClientSettings) -> dict[str, str]:
         """Return the variables that set the ROS domain and the middleware.
 
-        Without a variable for the middleware, the image chooses it.
+        If the middleware is ``image``, there is no variable for it, so the image chooses one.
         """
         ros = self.node.ros
         rmw = (isinstance(settings, MqttClientSettings) and settings.rmw) or ros.rmw

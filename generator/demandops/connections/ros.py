@@ -185,10 +185,7 @@ class RosEnd(End):
         }
 
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return the configuration without the list of topics.
-
-        A running router reads the list again, so a change of the list needs no restart.
-        """
+        """Return what a router reads only at its start: all but the list of topics."""
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 
 
@@ -206,8 +203,8 @@ def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
 def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
     """Return a topic's QoS settings in the router's format.
 
-    ``reads`` is true for the end that reads the topic. Only this end limits the rate, so that no
-    surplus messages cross the link.
+    ``reads`` says whether the router is at the end that reads the topic from ROS. Only that router
+    limits the rate, so that no surplus messages cross the link.
     """
     qos: dict[str, Any] = {}
     if route.reliability:

@@ -50,7 +50,7 @@ class Zenoh(ConnectionType):
                 ).within(file)
 
     def shares_clients(self, config: Config) -> bool:
-        """Return whether any node has a bridge, which may carry several connections."""
+        """Return whether any node has a bridge: a bridge may carry several connections."""
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
@@ -84,7 +84,7 @@ class Zenoh(ConnectionType):
         return ClientKey(self, source), ClientKey(self, target)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
-        """Return the bridge of a node, or ``None`` if the bridge would carry no topic."""
+        """Return a node's bridge, the client of all its connections; ``None`` without topics."""
         publishers: dict[str, tuple[float, str]] = {}
         subscribers: set[str] = set()
         peers: dict[str, str] = {}
@@ -101,10 +101,9 @@ class Zenoh(ConnectionType):
                 rate, other = publishers.setdefault(route.read_topic, (route.rate, id))
                 if rate != route.rate:
                     message = (
-                        f"rate {route.rate} of '{route.read_topic}' in connection '{id}' "
-                        f"contradicts an existing claim: connection '{other}' carries the topic "
-                        f"from '{key.id}' with rate {rate}, and the node's bridge "
-                        "has one rate for each topic; use the same rate"
+                        f"connections '{other}' and '{id}' carry '{route.read_topic}' from "
+                        f"'{key.id}' with the rates {rate} and {route.rate}, but a Zenoh bridge "
+                        "has one rate for each topic; use the same rate in both connections"
                     )
                     raise Refused.at("connections", message, code="conflict")
         if not peers:

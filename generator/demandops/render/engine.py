@@ -116,7 +116,7 @@ def _literal(value: str, indent: int) -> _Verbatim:
 
 
 def _bare(value: str) -> _Verbatim:
-    """Return a path as text that a template writes into a comment without quotes.
+    """Return a path as text that a template writes, unquoted, into a comment.
 
     Raises:
         ValueError: if the path has characters that need quotes.

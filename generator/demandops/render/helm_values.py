@@ -47,7 +47,10 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
 
 
 def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
-    """Yield the faults. Each message names the overrides that change the template's variables."""
+    """Yield the faults of ``error``.
+
+    Each message also names the overrides that change the template's variables.
+    """
     changing = {"version", "images", "replicas", "node"}
     files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
     note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"

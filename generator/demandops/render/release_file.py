@@ -19,13 +19,16 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 
 _START = "# override overrides/"
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
-"""Effects that do not change the body. Their comments change even if a hold keeps the body."""
+"""The effects of overrides that change only a release's comments, and not the body.
+
+The comments on these effects are updated even in a held file.
+"""
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, engine: Engine, current: str | None) -> str:
-    """Return the text of a release's file. If an override holds the file, the body stays the same.
+    """Return the text of a release's file. A held release keeps the body of ``current``.
 
     Args:
         release: the release.
@@ -78,8 +81,8 @@ def kept_charts(
 ) -> dict[str, str]:
     """Return, by path, the chart sources that stay because a held release may still use them.
 
-    If the files of a chart are in the state repo, the old source is not kept, because it would
-    fetch the changed chart.
+    The source of a chart in a folder of the state repo is not kept, because it would fetch the
+    newest version of the folder.
 
     Args:
         files: the new generated files.

@@ -52,10 +52,10 @@ _FILTERS = re.findall(
     "select selectattr slice sort string sum title trim truncate unique upper urlencode "
     "wordcount",
 )
-_PARTS = frozenset({"count", "d", "default", "first", "last", "length"})
-"""Filters that take one step for a value of any size, because they do not process its parts."""
+_ONE_STEP = frozenset({"count", "d", "default", "first", "last", "length"})
+"""Filters that take only one step from the budget. They do not process the parts of a value."""
 _EACH = frozenset({"map", "reject", "rejectattr", "select", "selectattr"})
-"""Filters that call another filter or test for each item; each call takes its own steps."""
+"""Filters that call another filter or test for each item. Each such call takes steps too."""
 _SLOW = dict.fromkeys(("dictsort", "groupby", "sort", "title", "urlencode", "wordcount"), 8)
 """For each slow filter, the factor by which its steps are multiplied."""
 _PADDING = frozenset(
@@ -136,8 +136,11 @@ def _size(value: object, *, data: bool = True) -> int:
     return size + (text >> 4)
 
 
-def _kept(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
-    """Take a step for each part of a value, and return the value. An iterator becomes a list."""
+def _counted_value(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
+    """Take a step from the budget for each part of a value, and return the value.
+
+    An iterator becomes a list.
+    """
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
     if isinstance(value, str) and len(value) > MAX_LENGTH:
@@ -187,28 +190,28 @@ def _refuse_growth(name: str, values: tuple[Any, ...]) -> None:
 
 @lru_cache(maxsize=256)  # each configuration has a sandbox, but all have the same filters
 def _counted_filter(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a Jinja filter that takes steps from the budget and refuses too large a result."""
+    """Change a Jinja filter so that it takes steps from the budget and refuses a large result."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
     def counted(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
         values = (*args[passed:], *kwargs.values())
         steps = _budget.get()
-        if name in _PARTS:
+        if name in _ONE_STEP:
             steps.take(1)
             return function(*args, **kwargs)
         for value in values:
             of_items = name in _EACH and isinstance(value, list | tuple)
             steps.take(len(value) if of_items else _size(value) * _SLOW.get(name, 1))
         _refuse_growth(name, values)
-        return _kept(function(*args, **kwargs))
+        return _counted_value(function(*args, **kwargs))
 
     return counted
 
 
 @lru_cache(maxsize=256)
 def _counted_test(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a Jinja test (``is …``) that takes as many steps as its arguments have parts."""
+    """Change a Jinja test (``is …``) so that each part of its arguments takes a step."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -245,7 +248,7 @@ def _concatenated(context: Context, parts: list[Any]) -> str:
 
 
 class _Counting(NodeTransformer):
-    """Changes a parsed template so that its loops, literals and comparisons take steps."""
+    """Changes a parsed template: loops, literals and comparisons take steps from the budget."""
 
     def __init__(self, environment: Sandbox) -> None:
         self._environment = environment
@@ -322,7 +325,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         super().__init__(**options)
         written = self.finalize
         assert written is not None  # noqa: S101 - our own options
-        self.finalize = lambda value: written(_kept(value, data=True))
+        self.finalize = lambda value: written(_counted_value(value, data=True))
         kept = {name: one for name, one in self.filters.items() if name in _FILTERS}
         self.filters = {
             name: _counted_filter(name, one) for name, one in {**kept, **filters}.items()
@@ -371,10 +374,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
             _refuse_large(operator, length * int(times))
         elif not isinstance(left, float) and not isinstance(right, float):
             _refuse_large(operator, _size(left) + _size(right), MAX_SIZE)
-        return _kept(super().call_binop(context, operator, left, right))
+        return _counted_value(super().call_binop(context, operator, left, right))
 
     def getitem(self, obj: Any, argument: Any) -> Any:  # noqa: ANN401
-        """Return an item of a value. A key that is a tuple takes as many steps as it has parts."""
+        """Return an item of a value. Each part of a tuple as key takes a step from the budget."""
         if isinstance(argument, tuple):
             _budget.get().take(_size(argument))
         return super().getitem(obj, argument)
@@ -396,7 +399,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
                     raise SecurityError(f"the method '{__obj.__name__}' is unsafe here")
                 _refuse_growth(__obj.__name__, (owner, *args, *kwargs.values()))
         steps.take(1)
-        return _kept(super().call(__context, __obj, *args, **kwargs))
+        return _counted_value(super().call(__context, __obj, *args, **kwargs))
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
         """Return a function that replaces ``str.format`` and refuses too large a result.

@@ -103,9 +103,9 @@ def overridden_releases(
 def render_trial_demands(world: World, engine: Engine) -> None:
     """Render every service of every appdef, with invented claims on a real node.
 
-    A service is rendered for each version that ``registry/versions.yaml`` lists. This checks an
-    appdef before its first demand, both without overrides and with each override that is in effect.
-    An override counts as faulty only if no appdef that it applies to can be rendered with it.
+    So each appdef is checked before its first demand. A service is rendered for each version that
+    ``registry/versions.yaml`` lists, and with each override that is in effect. If at least one of
+    the appdefs that an override affects can be rendered, the override counts as valid.
 
     Raises:
         Refused, InvalidInput: if a service cannot be planned or rendered. The error names the

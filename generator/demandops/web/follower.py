@@ -37,8 +37,8 @@ MOST_COMMITS = 5_000
 
 _LOOK_S = 0.2
 """The pause in seconds between checks of a local repository; each check reads one file."""
-_MOST_OF_TIME = 4
-"""The pause after a new situation, as a multiple of the time that its computation took.
+_PAUSE_FACTOR = 4
+"""After a new situation, the follower pauses this many times as long as the computation took.
 
 The pause keeps the load of the processor low. It lasts at most one second.
 """
@@ -167,7 +167,7 @@ class Follower:
             began, version = self._runtime.monotonic(), self.version
             self._look()
             if self.version != version:
-                self.closed.wait(min(1.0, _MOST_OF_TIME * (self._runtime.monotonic() - began)))
+                self.closed.wait(min(1.0, _PAUSE_FACTOR * (self._runtime.monotonic() - began)))
 
     def _look(self) -> None:
         known = self._newest

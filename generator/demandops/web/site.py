@@ -55,9 +55,9 @@ _DOCS_HEADERS = _HEADERS | {
         "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     )
 }
-"""Headers of the documentation's pages, which contain inline scripts and styles.
+"""HTTP headers that allow inline scripts and styles, as the documentation's pages contain.
 
-Allowing them is safe, because the documentation contains no data of a state repo.
+This is safe, because the documentation contains no data of a state repo.
 """
 _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0

@@ -56,9 +56,9 @@ class Planned:
 class ReusableRows:
     """The rows of a list, kept for the next time that the page shows the list.
 
-    ``rows`` maps the id of each entry to the entry's values and to the row that was made from them.
-    ``statuses`` has the status of each release when the rows were made. It is None if the rows were
-    made for an earlier commit.
+    ``rows`` maps the id of each entry to a pair: the entry's values, and the row made from the
+    values. ``statuses`` has the status of each release when the rows were made. If the rows were
+    made for an earlier commit, ``statuses`` is None.
     """
 
     statuses: object
@@ -137,9 +137,9 @@ class CommitState:
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield the planned releases of ``before`` whose claims on ``subjects`` have changed.
+        """Yield the planned releases of ``before`` that other claims on ``subjects`` need now.
 
-        The yielded values have the new claims.
+        Each yielded release has the claims that need it now.
         """
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
@@ -240,7 +240,7 @@ def _subjects_of(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
 def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
     """Return the subjects whose claims differ between two ledgers.
 
-    Comparing identities suffices, because ledgers share the claims of an unchanged subject.
+    Ledgers share the collection of an unchanged subject's claims, so only ``id()`` is compared.
     """
     before = {id(claims): subject for subject, claims in old.claims.items()}
     after = {id(claims): subject for subject, claims in new.claims.items()}

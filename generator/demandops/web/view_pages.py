@@ -46,7 +46,7 @@ View = Callable[["ViewRequest"], tuple[str, Data]]
 
 
 class ViewRequest:
-    """A request for a view: the parameters, and the situation and filter that these choose."""
+    """A request for a view: its parameters, the chosen situation and the chosen filter."""
 
     def __init__(self, follower: Follower, request: Request) -> None:
         self.follower = follower
@@ -186,4 +186,4 @@ VIEWS: Mapping[str, View] = {
     "/overrides": _overrides,
     "/rates": _rates,
 }
-"""For each address, the function that returns the template and the data of the view there."""
+"""A map from the address of each view to the function that returns its template and data."""

@@ -155,7 +155,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             missing += "demanded; start a node that publishes /clock, or set use_sim_time to false"
         else:
             missing = "no bookkeeping has come, so nothing is demanded; start demandops serve, or "
-            missing += "set the parameter bookkeeping_topic to the topic on which it comes"
+            missing += "set the parameter bookkeeping_topic to the topic of the bookkeeping"
         self.get_logger().warning(missing)
 
     # ---- periodic work ----

@@ -24,7 +24,8 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     ),
     "bookkeeping_topic": (
         "/demandops/bookkeeping",
-        "Topic of the bookkeeping, which the detector reads at its start; if empty, it reads none.",
+        "Topic of the bookkeeping that the detector reads at its start. Without a topic, the "
+        "detector does not read the bookkeeping.",
         None,
     ),
     "settling_time": (

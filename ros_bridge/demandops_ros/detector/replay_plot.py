@@ -57,13 +57,13 @@ class _Scale:
         return _EDGE + (x - self._x) * self.factor, _EDGE + (self._y - y) * self.factor
 
 
-def _round(metres: float) -> float:
-    """Return a round number of at most a quarter of ``metres``, but at least 0.1.
+def _round(span: float) -> float:
+    """Return the largest of 0.1, 0.2, 0.5, 1, 2, 5, 10 … that is at most a quarter of ``span``.
 
-    The scale bar has this length. The time axis uses the function too, with seconds.
+    For a small ``span``, return 0.1.
     """
-    lengths = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
-    return max((one for one in lengths if one <= metres / 4), default=lengths[0])
+    steps = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
+    return max((one for one in steps if one <= span / 4), default=steps[0])
 
 
 def _map(replay: Replay, colors: _Colors) -> Iterator[str]:

@@ -35,8 +35,8 @@ class ParameterSetter:
         self._set: tuple[Any, int] | None = None
         self._call: Any = None
         self._called_at = 0.0
-        self._changed = node.create_guard_condition(self._look)
-        node.create_timer(_LOOK_S, self._look)
+        self._changed = node.create_guard_condition(self._set_if_needed)
+        node.create_timer(_LOOK_S, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
         """Replace the parameters that the target must have; any thread may call this method.
@@ -49,7 +49,7 @@ class ParameterSetter:
             self._wanted, self._version = wanted, self._version + 1
         self._changed.trigger()
 
-    def _look(self) -> None:
+    def _set_if_needed(self) -> None:
         """Set the wanted parameters if the target does not have them yet."""
         endpoints = self._endpoints()
         with self._lock:

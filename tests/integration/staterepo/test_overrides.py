@@ -167,7 +167,7 @@ def test_a_held_file_stays_byte_for_byte_until_it_is_let_go(
     assert body(bare, path) == before
     (late,) = rig.book(generator, rig.goal(6))  # adds an input to the held fusion
     assert late.warnings[-1] == (
-        f"{fusion} is held by overrides/frozen.yaml; its changes wait until the hold ends"
+        f"{fusion} will not change until the 'hold' of overrides/frozen.yaml ends"
     )
     person.edit("registry/images.yaml", "2025-04", "2025-05")
     next_demand(generator, 3)

@@ -108,7 +108,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
               finishedAt=AT, resources=[FAILED])),
          "waiting", "one failed. Retrying; Application od-edge: forbidden", True),
         (over(sync="OutOfSync", at="a", operation=synced("Running", "a", "no", finishedAt=AT)),
-         "waiting", "has not applied the commit yet; for a it reports: no", False),
+         "waiting", "has not applied the commit yet; Argo CD reports for a: no", False),
         (over(sync="Unknown", at="", conditions=(condition("ComparisonError", "", "no route"),)),
          "waiting", "ComparisonError: no route", True),
         (over(sync="Synced", at="a", conditions=(condition("OrphanedResourceWarning", "", "w"),)),

@@ -64,7 +64,7 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     read.read_once([OVER, CHILDREN])
     assert read.why_unknown([OVER]) == "applications in argocd: Forbidden"
     assert read.why_unknown([CHILDREN]) == ""
-    assert read.why_unknown([DEPLOYMENTS]) == "it has not been read yet"
+    assert read.why_unknown([DEPLOYMENTS]) == "some objects have not been read yet"
 
 
 def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:

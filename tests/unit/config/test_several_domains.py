@@ -181,14 +181,12 @@ def test_a_node_that_leaves_leaves_all_its_domains() -> None:
         (
             [{"name": "fleet"}],
             (FLEET, CITY),
-            "accessDomains[0].name: 'edge' is already in 'fleet', or a node has the id "
-            "'edge@fleet'; remove this entry or the other one",
+            "accessDomains[0].name: 'edge' is already in 'fleet'; remove this entry",
         ),
         (
             [{"name": "city"}, {"name": "city"}],
             (FLEET, CITY),
-            "accessDomains[1].name: 'edge' is already in 'city', or a node has the id "
-            "'edge@city'; remove this entry or the other one",
+            "accessDomains[1].name: 'edge' is already in 'city'; remove this entry",
         ),
         (
             [{"name": "city"}],
@@ -210,3 +208,15 @@ def test_a_domain_that_does_not_fit_is_a_fault(
     with pytest.raises(InvalidInput) as raised:
         MemoryRepo(files(further, *domains))
     assert fault in str(raised.value)
+
+
+def test_no_node_has_the_id_that_another_node_gets_in_a_further_domain() -> None:
+    taken = {"id": "edge@city", "type": "edge", "cluster": "c-its", "selector": {"host": "other"}}
+    given = files([{"name": "city"}])
+    nodes = yaml.safe_load(given["inventory/nodes.yaml"])
+    nodes["nodes"].append(taken)
+    with pytest.raises(InvalidInput) as raised:
+        MemoryRepo(given | {"inventory/nodes.yaml": yaml.safe_dump(nodes)})
+    assert (
+        "accessDomains[0].name: a node of the inventory has the id 'edge@city'; rename that node"
+    ) in str(raised.value)

@@ -124,8 +124,9 @@ def test_settings_and_patches_that_are_not_valid_are_named() -> None:
     ]
     both = [{"connections": ["*"]}, {"nodes": ["edge"]}]
     assert refusals({PATCH: override(*both, values={"env": {}})}) == [
-        "overrides/tested.yaml: select: selects connections and services, but 'values' can have "
-        "settings of clients or Helm values, not both; write two overrides"
+        "overrides/tested.yaml: select: selects both connections and services, but 'values' fits "
+        "only connections (settings of clients) or only services (Helm values); write two "
+        "overrides"
     ]
     patch = override({"connections": ["*"]}, values={"resources": {"limits": {"memory": 1}}})
     assert refusals({PATCH: patch}) == [

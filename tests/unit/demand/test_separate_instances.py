@@ -248,7 +248,7 @@ values: values/follower.yaml.j2
         MemoryRepo(changed)
     assert [str(fault) for fault in raised.value.faults] == [
         "appdefs/object-detection-fusion/appdef.yaml: uses.follower.lists: is "
-        "'object-detection.object_list', and each version runs its own 'object-detection' "
-        "(versions: separate), but the shared service 'follower' runs once for all versions; "
-        "define 'follower' in this appdef, or make 'object-detection' a shared service too"
+        "'object-detection.object_list', but 'object-detection' runs once for each version "
+        "(versions: separate), and the shared service 'follower' once for all versions; make "
+        "'object-detection' a shared service too, or define 'follower' in this appdef"
     ]

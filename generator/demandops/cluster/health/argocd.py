@@ -56,11 +56,12 @@ class ArgoCd(HealthReader):
         if not message:
             return Health("waiting", waiting, name)
         if revision and not history.includes(revision, commit):
-            return Health("waiting", f"{waiting}; for {revision[:10]} it reports: {message}", name)
+            reason = f"{waiting}; Argo CD reports for {revision[:10]}: {message}"
+            return Health("waiting", reason, name)
         return Health("waiting", message, name, failing=True)
 
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the key of the Application of the domain's folder."""
+        """Return the key of the Application that applies the domain's folder."""
         return "Application", *_folder_application(domain)
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
@@ -92,7 +93,7 @@ class ArgoCd(HealthReader):
     def _service_state(self, status: Object) -> Object:
         return status.get("health") or {}
 
-    def _made(self, target: Target, deployment: Object) -> bool:
+    def _owns(self, target: Target, deployment: Object) -> bool:
         annotations = deployment["metadata"].get("annotations") or {}
         tracked = f"{target.domain.namespace}_{target.name}:"
         return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)

@@ -67,7 +67,7 @@ class Flux(HealthReader):
         return Health("waiting", "has not applied the commit yet", name)
 
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the key of the domain's Kustomization."""
+        """Return the key of the Kustomization that applies the domain's folder."""
         return "Kustomization", domain.namespace, domain.name
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
@@ -130,7 +130,7 @@ class Flux(HealthReader):
     def _service_state(self, status: Object) -> Object:
         return condition(status, "Ready")
 
-    def _made(self, target: Target, deployment: Object) -> bool:
+    def _owns(self, target: Target, deployment: Object) -> bool:
         return (deployment["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
 
 

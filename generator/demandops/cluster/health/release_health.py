@@ -147,7 +147,7 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a release at ``commit``, which its domain has applied.
+        """Return the health of a release whose domain has applied ``commit``.
 
         A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
         gone.
@@ -180,7 +180,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        """Return whether the object that applies a domain's folder has created ``item``."""
+        """Return whether ``item`` was created by a domain's :meth:`follower`."""
 
     def last_transition(self, target: Target, objects: Objects) -> str:
         """Return when the state of a release last changed; empty if the cluster does not say."""
@@ -196,11 +196,14 @@ class HealthReader(ABC):
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:
-        """Return the part of a service's status that has the time of the last change."""
+        """Return the part of ``status`` that has the field ``lastTransitionTime``.
+
+        ``status`` is that of the object that represents a service.
+        """
 
     @abstractmethod
-    def _made(self, target: Target, deployment: Object) -> bool:
-        """Return whether a Deployment belongs to the release of a service."""
+    def _owns(self, target: Target, deployment: Object) -> bool:
+        """Return whether a service's release owns a Deployment."""
 
     def _why_not_removed(self, item: Object) -> str:
         """Return why the controller fails to remove a service; empty if no failure is known."""
@@ -212,7 +215,7 @@ class HealthReader(ABC):
             for (kind, namespace, _), item in objects.items()
             if kind == "Deployment"
             and namespace == target.domain.namespace
-            and self._made(target, item)
+            and self._owns(target, item)
         ]
 
     def _removal_health(self, target: Target, item: Object | None, objects: Objects) -> Health:

@@ -20,29 +20,29 @@ from demandops.errors import suggestion
 
 
 class Service(Deployed):
-    """A service of one appdef, with the origins of its inputs.
-
-    ``folder`` is the folder in ``appdefs/`` that has the service's definition. ``inputs`` maps each
-    input of the service to its origin: a role of the appdef, or ``<service>.<output>``. A service
-    with ``each`` runs once for each topic of the role ``root``. ``roots`` is set if each instance
-    serves a single source. ``roots`` lists the roles whose topics the instance reads from this
-    source, directly or through other services.
-
-    ``nodes`` and ``runs_at`` are set if the service runs once for each cluster. ``nodes`` maps a
-    cluster to the node where the service runs. ``runs_at`` maps the node of an application to the
-    node of the service in the same cluster.
-    """
+    """A service of one appdef, with the origins of its inputs."""
 
     name: str
     folder: str
+    """The folder in ``appdefs/`` that has the service's definition."""
     shared: bool
     scope: Scope
     inputs: dict[str, str]
+    """The origin of each input: a role of the appdef, or ``<service>.<output>``."""
     parameters: dict[str, Parameter]
     root: str | None = None
+    """The role for each of whose topics a service with ``each`` runs once."""
     roots: tuple[str, ...] = ()
+    """The roles whose topics an instance reads from its only source.
+
+    The instance reads them directly or through other services. The roles are empty if an instance
+    may have several sources.
+    """
     nodes: dict[str, str] = Field(default_factory=dict)
+    """For a service that runs once for each cluster: the service's node in each cluster."""
     runs_at: dict[str, str] = Field(default_factory=dict)
+    """For a service that runs once for each cluster: a map from the node of an application to the
+    node of the service in the same cluster."""
 
     @property
     def at_source(self) -> bool:
@@ -79,11 +79,7 @@ Problem: TypeAlias = "tuple[str, str]"
 def resolved_services(
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> tuple[Services, list[Problem]]:
-    """Return all services of an appdef, and the problems that its services have.
-
-    The services are those that the appdef defines, and the shared ones that it uses. If there is a
-    problem, no service is returned.
-    """
+    """Return all services of an appdef and no problem, or no service and all problems."""
     services = {
         name: Service.model_construct(
             **{**dict(own), "inputs": _with_each(own)},
@@ -183,8 +179,9 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
             )
             yield (
                 _place(service, role),
-                f"'{origin}' is published at the node of each application, so several nodes may "
-                f"publish it under one name; run '{producer.name}' at the source, or {other}",
+                f"'{origin}' is published at the application's node, so applications on several "
+                "nodes may publish it under one name; run "
+                f"'{producer.name}' at the source, or {other}",
             )
         if role == service.each:
             root = producer.root if producer else origin
@@ -202,8 +199,8 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
             if others and root not in others:
                 yield (
                     _place(service, role),
-                    f"the service runs once for each topic of '{root}', but these topics do not "
-                    f"each have their own '{service.inputs[role]}'; read "
+                    f"the service runs once for each topic of '{root}', but "
+                    f"'{service.inputs[role]}' does not come from such a topic; read "
                     f"'{service.inputs[role]}' in a service that runs once for the application "
                     "or the node",
                 )

@@ -58,9 +58,10 @@ class Scaling(CamelModel):
     ``sizes``, a parameter names a size, and each size has its number of replicas. ``autoscaler``
     has the targets of a HorizontalPodAutoscaler, in percent of what the pods request.
 
-    ``divides_work`` says that no two replicas publish the same data. Additional replicas start
-    without delay. With ``down_after``, the service keeps additional replicas for this time after
-    the last demand that needed them has ended (:mod:`demandops.ledger.kept_replicas`).
+    ``divides_work`` says that no two replicas publish the same data.
+
+    Additional replicas start without delay. Additional replicas stop ``down_after`` after the last
+    demand that needed them has ended (:mod:`demandops.ledger.kept_replicas`).
     """
 
     min: Count = 1
@@ -95,7 +96,7 @@ class Scaling(CamelModel):
             yield f"{' and '.join(deciding)} each decide the number of replicas; keep one"
         for name in sorted({"min", "max"} & self.model_fields_set) if self.sizes else ():
             yield (
-                f"'sizes' gives the number of replicas for each size, so {name} does nothing; "
+                f"'sizes' alone decides the number of replicas, so {name} does nothing; "
                 f"remove {name}"
             )
         for name in ("per", "autoscaler"):

@@ -107,7 +107,8 @@ class OwnService(Deployed):
     def _consistent(self) -> OwnService:
         if self.placement == "source" and not self.each:
             raise ValueError(
-                "placement 'source' needs 'each', because an application has no single source"
+                "'placement: source' needs 'each: <input>', because a service without 'each' runs "
+                "once for the application, which has no single source"
             )
         if self.placement == "source" and self.place:
             raise ValueError("'place' and 'placement: source' both choose the node; keep one")

@@ -196,9 +196,10 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
 
 
 def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    """Yield (file, path in the file, name, definition) for each service.
+    """Yield (file, prefix, name, definition) for each service.
 
-    The path is the start of the paths of the service's fields: ``services.<name>.``, or empty.
+    The path of each field of the service in the file starts with the prefix. The prefix is
+    ``services.<name>.`` in an ``appdef.yaml``, and empty in a ``service.yaml``.
     """
     for appdef in config.appdefs.values():
         for name, service in appdef.services.items():
@@ -208,10 +209,9 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Check the nodes of shared services, and the origins of the services' inputs.
+    """Check the nodes of shared services, and the input that a shared service names in ``each``.
 
-    If a shared service has ``each``, all appdefs that use the service must give the same origin to
-    the input that ``each`` names.
+    The input must have the same origin in all appdefs that use the service.
     """
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
@@ -278,10 +278,10 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Add a fault for each shared service that runs once for each topic of an unshared service.
+    """Refuse ``versions: separate`` if a shared service runs for each topic of an unshared one.
 
-    With ``versions: separate``, each version has its own instance of the unshared service, but the
-    shared service runs once for all versions.
+    Each version has its own instance of the unshared service, but one instance of the shared
+    service would serve all versions.
     """
     services = config.services.get(appdef, {})
     for name, service in services.items():
@@ -291,9 +291,9 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 f"appdefs/{appdef}/appdef.yaml",
                 f"uses.{name}.{service.each}",
-                f"is '{origin}', and each version runs its own '{producer.name}' (versions: "
-                f"separate), but the shared service '{name}' runs once for all versions; "
-                f"define '{name}' in this appdef, or make '{producer.name}' a shared service too",
+                f"is '{origin}', but '{producer.name}' runs once for each version (versions: "
+                f"separate), and the shared service '{name}' once for all versions; make "
+                f"'{producer.name}' a shared service too, or define '{name}' in this appdef",
             )
 
 

@@ -39,7 +39,7 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
                 other.path,
                 "priority",
                 f"is {other.priority}, as in {one.path}, and both overrides may set {names} of the "
-                "same release; give one override another priority, or select different releases",
+                "same release; change one of the priorities, or select different releases",
             )
 
 
@@ -100,7 +100,10 @@ def _selects_services(selector: Selector) -> bool:
 
 
 def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
-    """Yield the fields in which both selectors must overlap to match the same release."""
+    """Yield the fields that can separate two selectors.
+
+    If both selectors have one of these fields and do not overlap in it, no release matches both.
+    """
     yield from ("services", "nodes")
     if not any(_shared(one, other, services) for services in config.services.values()):
         yield from ("applications", "appdefs")

@@ -61,9 +61,9 @@ class Changeset:
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """For each key of a release that may differ, the release after the change."""
+    """Each release that the change may affect, as it is after the change."""
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """For each key of ``plans``, the release before the change."""
+    """Each release of ``plans``, as it was before the change."""
 
 
 def build_changeset(
@@ -200,11 +200,11 @@ def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
 
 
 def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
-    """Yield a warning if a hold keeps a release from changing."""
+    """Yield a warning if an override with the effect ``hold`` prevents a change of a release."""
     if new is None or not new.shaping.held or (old and old.facts()) == new.facts():
         return
     by = " and ".join(override.path for override, effects in new.shaping.by if "hold" in effects)
-    yield f"{new.name} is held by {by}; its changes wait until the hold ends"
+    yield f"{new.name} will not change until the 'hold' of {by} ends"
 
 
 def _overrides(release: Release | None) -> list[str]:

@@ -84,11 +84,10 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
 
 
 def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
-    """Return the faults that keep releases from being planned or rendered.
+    """Return the faults because of which releases cannot be planned or rendered.
 
-    Each fault names one file. If a claim that needs the release is in a file in ``edited``, the
-    fault names that file. Otherwise the fault keeps the file that it names. A fault that names no
-    file gets the file of the first claim that needs the release.
+    A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
+    the release; the file that the fault names; the file of the first claim that needs the release.
     """
     faults: list[Fault] = []
     files: dict[ReleaseKey, list[str]] = {}

@@ -2,8 +2,11 @@
 
 This module runs nothing. It returns instructions and commands for a person, and their order
 matters. First the person stops the old controller, because it would remove the workloads when its
-releases leave the state repo. The person suspends Flux, and deletes its objects only after Argo CD
-has taken over. The person deletes Argo CD's Applications at once, but without their finalizers.
+releases leave the state repo.
+
+To stop Flux, the person suspends Flux, and deletes Flux's objects only after Argo CD has taken
+over. To stop Argo CD, the person removes the finalizers of its Applications, and then deletes the
+Applications.
 """
 
 from __future__ import annotations

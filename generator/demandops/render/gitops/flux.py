@@ -46,7 +46,8 @@ def chart_object(name: str, chart: ChartSource) -> str:
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return the files that do not depend on demands, by path.
 
-    These are the bootstrap files, and a placeholder and the chart sources for each access domain.
+    These are the bootstrap files and, for each access domain, its chart sources and a file that
+    keeps its folder.
     """
     flux = config.repo_settings.flux
     files = {

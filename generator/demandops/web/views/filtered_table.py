@@ -49,12 +49,12 @@ class Cell:
 
     @property
     def shown(self) -> tuple[Part, ...]:
-        """The first texts of the cell, which the page shows."""
+        """The texts of the cell that the page shows: the first few."""
         return self.parts[:_MOST_PARTS]
 
     @property
     def more(self) -> int:
-        """The number of further texts, which the page leaves out."""
+        """The number of texts of the cell that the page leaves out."""
         return max(0, len(self.parts) - _MOST_PARTS)
 
     @property
@@ -119,7 +119,7 @@ class Table:
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
-    """Return a cell with the non-empty texts."""
+    """Return a cell with all of ``texts`` that are not empty."""
     parts = (one if isinstance(one, Part) else Part(str(one)) for one in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 

@@ -54,27 +54,29 @@ class Mass:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The whole map.
-
-    ``nodes`` and ``lines`` are drawn one by one, with details. ``many_nodes`` and ``many_lines``
-    are drawn as one shape for each color. ``is_dimmed`` is true if a filter highlights a part of
-    the map. ``only_lit`` is true if only highlighted nodes are drawn. ``lit`` counts the
-    highlighted nodes, ``total`` all nodes.
-    """
+    """The whole map. Nodes and lines that match the filter are lit."""
 
     width: float
     height: float
     boxes: tuple[Box, ...]
     nodes: tuple[NodeCard, ...]
+    """The nodes that are drawn one by one, with details."""
     lines: tuple[Line, ...]
+    """The lines that are drawn one by one."""
     many_nodes: tuple[Mass, ...]
+    """The other nodes, drawn as one shape for each color."""
     many_lines: tuple[Mass, ...]
+    """The other lines, drawn as one shape for each color."""
     total: int
+    """The number of all nodes."""
     only_lit: bool
+    """Whether only lit nodes are drawn."""
     layout: str
     layouts: tuple[str, ...]
     is_dimmed: bool
+    """Whether the parts that are not lit are drawn dimmed."""
     lit: int
+    """The number of lit nodes."""
 
 
 @dataclass(slots=True)
@@ -91,8 +93,8 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     """Return the map of a situation.
 
     Args:
-        now: the situation.
-        wanted: the filter; services, connections and nodes that match are highlighted.
+        now: the situation to draw.
+        wanted: the filter; services, connections and nodes that match are lit.
         layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
             position, and ``cluster`` otherwise. If no node has a position, the layout is always
             ``cluster``.

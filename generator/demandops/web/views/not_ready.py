@@ -63,7 +63,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """An application, one word for its state, and the causes that keep it from being ready."""
+    """Whether an application is ready: one word for its state, and the causes if it is not."""
 
     application: str
     word: str

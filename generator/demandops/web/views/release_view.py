@@ -37,8 +37,8 @@ class Explained:
     """A release that runs, that an override denies, or that ran before.
 
     ``release`` is None if the release does not run. ``difference`` is the diff of the newest change
-    of the release's file. The page proposes an override that stops the release; ``stop_with_it``
-    names the other releases that this override would stop too.
+    of the release's file. The page proposes an override that stops the release. ``stop_with_it``
+    names the other releases that such an override would stop.
     """
 
     name: str

@@ -66,7 +66,10 @@ def remedy_of(
     if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
-            who = f"the GitOps controller of cluster {cluster} by itself; if it fails, its operator"
+            who = (
+                f"the GitOps controller of cluster {cluster} by itself; if the controller fails, "
+                "its operator"
+            )
         return Remedy(who, "", command)
     if kind == "starting":
         who = f"nobody yet; if this lasts, the operator of cluster {cluster}"
