@@ -37,7 +37,7 @@ class Fault:
     line: int | None = None
 
     def __post_init__(self) -> None:
-        """Escape the message, which may contain any text; ``file`` and ``field`` stay exact."""
+        """Escape the message, because it may contain any text."""
         object.__setattr__(self, "message", one_line(self.message))
 
     def __str__(self) -> str:

@@ -39,7 +39,7 @@ class Step:
 
 
 def steps(outcome: Outcome) -> list[Step]:
-    """Return the events with their consequences, except events that formed no demand."""
+    """Return each event that formed a demand, with its consequences."""
     formed: defaultdict[str, list[Formed]] = defaultdict(list)
     for one in outcome.formed:
         formed[str(one)].append(one)
@@ -133,7 +133,7 @@ def savings(outcome: Outcome) -> list[Saving]:
 
 
 def _payload(outcome: Outcome) -> dict[str, int]:
-    """Return how many bytes of each topic were carried to the edge, by its name at the source."""
+    """Return how many bytes of each topic were carried to the edge, by the topic's source name."""
     found: defaultdict[str, int] = defaultdict(int)
     for topic, size in outcome.carried.items():
         if not topic.startswith(("mqtt_client/", "$SYS/")):

@@ -159,7 +159,7 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         for number in (1, 2, 3)
     }
     assert warnings[0] == (
-        f"{CONNECTION}: is not imported, because its last request was a shutdown and the "
+        f"{CONNECTION} is not imported, because its last request was a shutdown and the "
         "bookkeeping files do not say who still holds it"
     )
     assert warnings[1] == (
@@ -167,5 +167,5 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         "requester of its last request is imported once, and nobody else"
     )
     assert warnings[-1] == (
-        "od-edge-station00: is not imported, because no application holds its object list"
+        "od-edge-station00 is not imported, because no application holds its object list"
     )

@@ -58,7 +58,7 @@ def faults_of_demand(
 
 
 def _number_for_text(text: str) -> str:
-    """Return a message if ``text`` is only a number's name in braces, like ``{x}``; else empty."""
+    """Return a message if ``text`` stands for a number, as ``{x}`` does, or an empty text."""
     if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
         return f"{quoted(text)} alone becomes a number, but this field needs text; add a word to it"
     return ""
