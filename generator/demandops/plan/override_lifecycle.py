@@ -79,9 +79,9 @@ def update_ledger(
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """After claims changed, update the kept claims and the moved services.
+    """After claims changed, update the kept claims and the moved services on these subjects.
 
-    Return the ledger, and the files to write. The overrides are as they were before the change.
+    Return the ledger, and the files to write.
 
     Args:
         before: the ledger before the change.
