@@ -246,7 +246,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
 
 
 def _unfit_named_nodes(one: Demanded, app: Application, world: World) -> Iterator[Fault]:
-    """Yield a fault for each node that the demand names and that lacks what its service requires."""
+    """Yield a fault for each node that the demand names, if it lacks what its service requires."""
     for name in app.named:
         service = world.config.services.get(app.appdef, {}).get(name)
         node = world.config.nodes.get(app.services[name])
