@@ -245,10 +245,11 @@ def _drain(
 
 
 class _Signals:
-    """Handles Ctrl-C and SIGTERM: the first signal stops the program once its goals are finished.
+    """Handles Ctrl-C and SIGTERM.
 
-    A second signal stops the program at once. The kernel may deliver a signal to any thread, so
-    Python writes each signal to a wake-up pipe that the main thread reads.
+    After the first signal, the program finishes its goals and stops. A second signal stops the
+    program at once. The kernel may deliver a signal to any thread, so Python writes each signal to
+    a wake-up pipe that the main thread reads.
     """
 
     def __init__(self) -> None:

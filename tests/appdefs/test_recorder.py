@@ -23,7 +23,7 @@ from tests.scenarios.running import configuration
 HERE = Path(__file__).parent
 RECORDER, MONITOR = 2, 3
 UNCARRIED = (
-    "application 'edge/record': no connection carries driver.points /vehicle00/driver/points of "
+    "application 'edge/record': no connection carries /vehicle00/driver/points (driver.points) of "
     "'vehicle00' to 'edge'"
 )
 

@@ -75,7 +75,7 @@ def interrupted(rig: Rig) -> None:
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
     """Damage one file of each class: change a byte, or cut the file.
 
-    Yield for each damage the result of the next start.
+    Yield the result of the next start after each damage.
     """
     rig.restore()
     classes: dict[str, tuple[Path, int]] = {}

@@ -44,8 +44,8 @@ NO_REVISION = (
 )
 REQUEST_KEYS = ["index", "request", "outcome", "commit", "faults", "warnings", "not_held", "placed"]
 NO_CARRIER = (
-    "application 'edge/object_detection_fusion': no connection carries point_cloud "
-    "/vehicles/vehicle00/drivers/lidar/pointcloud of 'vehicle00' to 'edge'"
+    "application 'edge/object_detection_fusion': no connection carries "
+    "/vehicles/vehicle00/drivers/lidar/pointcloud (point_cloud) of 'vehicle00' to 'edge'"
 )
 
 Run = Callable[..., Any]

@@ -1,4 +1,4 @@
-"""For recorded bags, rules give the same demands as a plain script on the same poses."""
+"""On a recorded bag, rules give the same demands as a plain script gives on the same poses."""
 
 from __future__ import annotations
 

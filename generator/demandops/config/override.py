@@ -228,7 +228,7 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @classmethod
     def from_file(cls, name: str, file: OverrideFile) -> Override:
-        """Return the override ``name`` that a parsed file declares."""
+        """Return the override in a parsed file; ``name`` is the override's name."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 
     def __eq__(self, other: object) -> bool:

@@ -298,7 +298,7 @@ def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.N
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state in which a service no longer keeps the replicas whose time has ended.
+    """Return the state after a service scales down because a step of its kept replicas has ended.
 
     The second value is the changeset, which has the files to write.
 

@@ -53,8 +53,8 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
             for flow in flows(world.config, held):
                 if not ledger.is_carried_to(flow.receiver, flow.target):
                     yield (
-                        f"application '{held.id}': no connection carries {flow.name} "
-                        f"{flow.topic} of '{flow.sender}' to '{flow.receiver}'"
+                        f"application '{held.id}': no connection carries {flow.topic} "
+                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
                     )
             continue
         if one.note:

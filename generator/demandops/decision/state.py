@@ -1,4 +1,4 @@
-"""The state that a demand is decided on: the world at one commit, with its template engine."""
+"""What a decision about a demand starts from: the world at one commit, with a template engine."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ class _Claim(FrozenModel):
         raise NotImplementedError
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a fault for each topic with a requester that the claim does not have."""
+        """Yield a fault for each topic that lists a requester who is not among the claim's."""
         for place, _, names in self.partial():
             if unknown := set(names) - set(self.requesters):
                 message = (

@@ -5,7 +5,8 @@ the highest number of replicas that its demands needed within this time. A servi
 kept replicas has one record, the file ``ledger/replicas/<hh>/<name>.yaml``. The record lists each
 number of replicas above the present need, with the time until which the service keeps this number.
 When that time passes, the generator publishes a commit that removes the number from the record.
-Only this commit reduces the replicas, so a replay gives the same bytes.
+The replicas depend on the record, never on the clock, so ``demandops verify`` computes the same
+bytes again.
 """
 
 from __future__ import annotations
@@ -36,34 +37,40 @@ from demandops.settings import LEDGER_API_VERSION
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
 Instance: TypeAlias = "tuple[str, ...]"
-"""The identity of a service instance: the word ``replicas``, then the values of ``_FIELDS``."""
+"""The key of a service instance: the text ``replicas``, then the values of ``_FIELDS``.
+
+The text tells the key apart from the entries of the ledger's index.
+"""
 
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
 
 
 class Kept(NamedTuple):
-    """A step: the service has at least ``replicas`` replicas until the time ``until``."""
+    """One step of scaling down: a service keeps ``replicas`` replicas until the time ``until``."""
 
     replicas: int
     until: datetime
 
 
 Steps: TypeAlias = "tuple[Kept, ...]"
-"""The replicas that one service keeps.
+"""The steps in which one service scales down.
 
 Each step has fewer replicas and a later end than the previous step.
 """
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    """Return the steps of a service after its demands begin to need more or fewer replicas.
+    """Return the steps of a service whose demands now need more or fewer replicas.
+
+    If the demands need fewer, one step more keeps ``was_needed`` replicas until ``until``. A step
+    that keeps no more than ``needed`` replicas is left out.
 
     Args:
-        steps: the steps before.
-        needed, was_needed: the replicas that the demands need now, and those that they needed
-            before.
+        steps: the steps so far.
+        needed: how many replicas the demands need now.
+        was_needed: how many replicas the demands needed before.
         now: the time.
-        until: when the service stops keeping the replicas that were needed before.
+        until: the end of an additional step.
     """
     if was_needed > needed:
         steps = (*(one for one in steps if one.replicas > was_needed), Kept(was_needed, until))
@@ -83,8 +90,8 @@ def _minute(moment: datetime) -> str:
 class KeptReplicas:
     """The replicas that all services keep.
 
-    ``steps`` maps each service instance to its steps. ``by_minute`` maps a minute to the instances
-    whose first step ends in this minute.
+    ``steps`` maps each service instance to its steps: how many replicas it keeps until when.
+    ``by_minute`` maps a minute to the instances whose first step ends in this minute.
     """
 
     steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
@@ -109,13 +116,13 @@ class KeptReplicas:
         return KeptReplicas(all_steps, by_minute)
 
     def due(self, now: datetime) -> list[Instance]:
-        """Return the instances with a step that has ended, sorted."""
+        """Return the instances that are to scale down, as their first step has ended, sorted."""
         minutes = [minute for minute in self.by_minute if minute <= _minute(now)]
         instances = (one for minute in minutes for one in self.by_minute[minute])
         return sorted(one for one in instances if self.steps[one][0].until <= now)
 
     def next_end(self) -> datetime | None:
-        """Return when the first step ends, or ``None`` if there is no record."""
+        """Return when the next instance is to scale down, or ``None`` if none keeps replicas."""
         if not self.by_minute:
             return None
         return min(self.steps[one][0].until for one in self.by_minute[min(self.by_minute)])

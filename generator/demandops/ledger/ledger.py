@@ -130,33 +130,30 @@ class Ledger:
                 return found[0]
         return None
 
-    def has_usual_topic(self, role: str, source: str, *, but_of: str | None = None) -> bool:
+    def has_usual_topic(self, role: str, source: str, *, except_demand: str | None = None) -> bool:
         """Return whether a claim has the usual topic of ``source`` as an input in ``role``.
 
-        The claims of the demand ``but_of`` are not considered.
+        Claims of the demand ``except_demand`` do not count.
         """
         keys = self.index.get(("usual", source, role)) or ()
-        return any(key.demand != but_of for key in keys)
+        return any(key.demand != except_demand for key in keys)
 
-    def usual_topics(self, role: str, source: str, *, but: str) -> Iterator[str]:
-        """Yield each usual topic of ``source`` that a claim has as an input in ``role``.
-
-        The topic ``but`` is left out.
-        """
+    def usual_topics(self, role: str, source: str, *, excluded: str) -> Iterator[str]:
+        """Yield each usual topic of ``source`` that is booked in ``role``, except ``excluded``."""
         keys = self.index.get(("usual", source, role)) or ()
-        if len(keys) == len(self.index.get(("usual", source, role, but)) or ()):
-            return  # all these claims have the topic ``but``
+        if len(keys) == len(self.index.get(("usual", source, role, excluded)) or ()):
+            return  # all these claims have the topic ``excluded``
         found = (claim for key in keys if (claim := self.get(key)))
         topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
         usual = {one.topic for one in topics if one.source == source and not one.further}
-        yield from sorted(usual - {but})
+        yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for each input in ``role`` that is called ``part`` in topic names.
+        """Yield (input, version) for inputs in ``role`` for which ``part`` replaces ``{instance}``.
 
-        ``part`` is the text that replaces ``{instance}`` in output patterns. Only further topics
-        and the inputs of separate instances are yielded. ``version`` is the version of the separate
-        instance; it is empty for an input of any other application.
+        An input with the usual topic of its source is yielded only if its application is a separate
+        instance. ``version`` is the version of the separate instance; it is empty for an input of
+        any other application.
         """
         for claim in self._claims("further", part):
             app = claim.application
@@ -320,7 +317,7 @@ class Ledger:
         return ledger
 
     def without_waiting(self, demands: Iterable[str]) -> Ledger:
-        """Return the ledger in which these demands do not wait."""
+        """Return the ledger without these waiting demands."""
         waiting = self.waiting
         for demand in demands:
             waiting = waiting.discard(demand)
@@ -345,10 +342,9 @@ class Ledger:
 def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
-    """Return ``counts`` after the first claim on an application changed.
+    """Return ``counts`` (:attr:`Ledger.applications_on`) with one application counted anew.
 
-    ``counts`` is :attr:`Ledger.applications_on`. The first claim was ``before`` and is ``after``
-    now.
+    ``before`` and ``after`` are the old and the new first claim on the application.
     """
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):

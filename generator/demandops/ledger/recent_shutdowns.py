@@ -86,9 +86,10 @@ class RecentShutdowns:
     by_minute: _Index = field(default_factory=HashTrieMap)
 
     def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
-        """Return the record of the same shutdown.
+        """Return the record of the shutdown that ``shutdown`` repeats, or ``None``.
 
-        Return ``None`` if no such record is within 15 minutes of the time of ``shutdown``.
+        A shutdown repeats another one if both have the same digest and are at most 15 minutes
+        apart.
         """
         known = self.by_digest.get(shutdown.digest)
         return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None

@@ -111,7 +111,7 @@ class _WaitingFile(FrozenModel):
 def read(text: str, path: str) -> WaitingDemand | None:
     """Return the waiting demand in a file, or ``None`` if the file is not valid.
 
-    The file is not valid if its goal is one of the reference's action or belongs to another demand.
+    A valid file contains a goal of the action ``Demand``, for the demand that the file names.
     """
     try:
         file = parse_file(_WaitingFile, text, path)

@@ -64,7 +64,7 @@ def _rewritten(name: str) -> Fault:
 def _last_request_only(name: str, shutdown: bool) -> str:
     if shutdown:
         return (
-            f"{name}: is not imported, because its last request was a shutdown and the bookkeeping "
+            f"{name} is not imported, because its last request was a shutdown and the bookkeeping "
             "files do not say who still holds it"
         )
     return (
@@ -77,7 +77,7 @@ def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
     """Return a warning for each detection whose object list no application holds."""
     topics = {topic for found in joins.values() for join in found for topic in join.topics}
     return [
-        f"{name}: is not imported, because no application holds its object list"
+        f"{name} is not imported, because no application holds its object list"
         for name, spec in files.specs_of(ObjectDetection).items()
         if f"/{spec.source}_local_objectlist" not in topics
     ]

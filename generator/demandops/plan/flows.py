@@ -20,12 +20,11 @@ from demandops.subject import TopicKey
 
 
 class PublishedTopic(NamedTuple):
-    """A topic that a service reads, and the node that publishes the topic.
+    """A topic of an application, and the node that publishes the topic.
 
-    ``root`` is the key of the demanded topic from which ``topic`` comes. If the demand lists
-    ``topic`` as an input, this is the key of ``topic`` itself. Otherwise it is the key of the input
-    from which services make ``topic``. ``root`` is empty if a service makes ``topic`` from all its
-    inputs together.
+    ``root`` is the key of the demanded input from which ``topic`` comes: ``topic`` itself, or the
+    input from which services make ``topic``. ``root`` is empty if a service makes ``topic`` from
+    all its inputs together.
     """
 
     topic: InputTopic
@@ -39,9 +38,9 @@ class Flow:
 
     ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
     topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
-    flow is needed. ``delivery`` is the index, in the application's ``deliver``, of the delivery
-    that needs the flow. It is ``None`` if a service reads the topic. ``type`` is the message type;
-    it is empty unless the demand names the type.
+    flow is needed. ``delivery`` is the position in ``deliver`` of the delivery that needs the flow,
+    or ``None`` if a service reads the topic. ``type`` is the message type; it is empty unless the
+    demand names the type.
     """
 
     name: str
@@ -97,7 +96,7 @@ def version_of_instance(app: Application, service: Service) -> str:
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
-    """Return the keys of an application's inputs for which the service instance at ``key`` runs."""
+    """Return the inputs of an application for which a service instance runs, as topic keys."""
     if service.root is not None:
         found = app.inputs_from(service.root, str(key.source), str(key.topic))
         return [(service.root, one.topic, one.source) for one in found]

@@ -28,10 +28,10 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 def _input_field(field: str, path: str) -> str:
-    """Return the field of the goal to which a fault at ``path`` in an implied connection belongs.
+    """Return where in the goal to report a fault at ``path`` of an implied connection.
 
-    The goal does not list the connection, so this is ``field``: the input, delivery or node because
-    of which the connection is needed. But if the fault concerns a requester, this is ``path``.
+    A fault of a requester is reported at ``path``. Any other fault is reported at ``field``: the
+    input, delivery or node that needs the connection.
     """
     return path if path.startswith("requesters") else field
 
@@ -88,10 +88,9 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
 
 
 def _note(needed: Connection, type: str) -> str:
-    """Return a note for the requester, or an empty text if there is nothing to note.
+    """Return a note if a claimed connection of another type than ``type`` carries the topic.
 
-    There is a note if the connection ``needed`` is claimed already, with another type than
-    ``type``.
+    Return an empty text if there is nothing to note.
     """
     if needed.type is None or type in ("auto", needed.type.word):
         return ""
@@ -116,9 +115,9 @@ def without_idle_deliveries(
     """Return the ledger and changes, both without deliveries of outputs that are no longer made.
 
     If a node is decommissioned, a demand may lose an input, and with the input an output of its
-    application. The demand may still hold the connection that delivers this output between two
-    other nodes. Then this function removes the output's topic from the demand's claim on that
-    connection.
+    application. The demand may still hold the connection that delivers this output from one
+    remaining node to another. This function removes the output's topic from the demand's claim on
+    the connection.
 
     Args:
         before: the ledger before the node is decommissioned.

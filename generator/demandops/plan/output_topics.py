@@ -49,10 +49,10 @@ def instance_of(config: Config, role: str, topic: InputTopic, version: str = "")
 
 
 def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text that makes topic names differ although their source is the same.
+    """Return the text by which names that are made from topics of one source differ.
 
-    The text contains ``topic`` if ``topic`` is a further topic of its source, and ``version`` if
-    it is not empty. In any other case, the text is empty.
+    The text contains ``topic`` if ``topic`` is a further topic of its source. The text also
+    contains ``version``, which may be empty.
     """
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
@@ -95,7 +95,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
             if known is not None:
                 return known.further
             place = (role, topic.source)
-            if place not in first and ledger.has_usual_topic(*place, but_of=own):
+            if place not in first and ledger.has_usual_topic(*place, except_demand=own):
                 return True
             usual = first.setdefault(place, topic.topic)
         return topic.topic != usual
@@ -115,10 +115,10 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return the ledger with ``further`` set in each input that is a further topic.
+    """Return the ledger with ``further`` set in claims that were read from an earlier format.
 
-    The claims were read from files of an earlier format without ``further``. The usual topic of a
-    source is the one in the inventory or, if there is none, the one that was booked first.
+    In this format, the files of claims do not say which topics are further topics. The usual topic
+    of a source is the one in the inventory or, if there is none, the one that was booked first.
     """
     first: dict[tuple[str, str], str] = {}
 

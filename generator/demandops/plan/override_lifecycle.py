@@ -48,7 +48,7 @@ def update_ledger(
     Args:
         before, after: the world before and after the change.
         subjects: the subjects whose claims a person changed.
-        markers: all markers in the ledger, as a map from path to text.
+        markers: the ledger's markers of ended overrides, as a map from path to text.
         now: the current time. A new override whose end has passed does not apply.
     """
     known = {one.name: one for one in before.overrides}
@@ -79,15 +79,15 @@ def update_ledger(
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """Return the ledger that a change of claims requires, and the files to write.
+    """After claims changed, update the kept claims and the moved services on these subjects.
 
-    The configuration does not change.
+    Return the ledger, and the files to write.
 
     Args:
         before: the ledger before the change.
         after: the world after the change.
         subjects: the subjects whose claims changed.
-        now: the booking time of new kept claims.
+        now: the booking time of each claim that an override books.
     """
     subjects = tuple(subjects)
     ledger, kept = update_kept_claims(before, after, subjects, now)
@@ -136,7 +136,7 @@ def expired_overrides(world: World, now: datetime) -> list[Override]:
 
 
 def changed_override_files(before: World, after: World) -> list[str]:
-    """Return the paths of the overrides that took effect, changed or no longer apply, sorted."""
+    """Return, sorted, the paths of the overrides that come into effect, change or end."""
     old = {one.name: one for one in before.overrides}
     new = {one.name: one for one in after.overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]

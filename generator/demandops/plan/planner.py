@@ -288,7 +288,7 @@ class _ClaimedConnections:
         return self.world.ledger.connections_at(self.type, node)
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection with an id, or ``None`` if no claim has it with this type.
+        """Return the connection with an id, or ``None`` if no connection of :attr:`type` has it.
 
         Raises:
             Refused: if a person wrote a claim with a route that this type cannot carry, or

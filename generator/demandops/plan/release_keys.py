@@ -1,4 +1,4 @@
-"""The keys of releases: which releases claims need, and which a change of claims affects.
+"""The keys of the releases that claims need, and of those that a change of claims affects.
 
 Only the releases that :func:`affected_keys` returns are planned again for a demand, so the cost of
 a demand does not grow with the number of other demands. :mod:`demandops.plan.planner` plans the

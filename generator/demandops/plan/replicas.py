@@ -72,11 +72,10 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return how many replicas a service has, and the step that keeps more than its demands need.
+    """Return how many replicas a service has, and the step that decides this number.
 
-    A service may keep replicas for a while (``scaling.downAfter``). ``steps`` say how many replicas
-    the service keeps, and how long (:mod:`demandops.ledger.kept_replicas`). If the demands need at
-    least as many replicas as the service keeps, ``None`` is returned instead of a step.
+    The step is ``None`` if ``needed`` decides the number. ``steps`` say how many replicas the
+    service keeps for a while (:mod:`demandops.ledger.kept_replicas`).
     """
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None

@@ -40,7 +40,7 @@ def newest_asked(
 
 
 def same_version(one: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
-    """Return whether two versions of one appdef are the same."""
+    """Return whether two versions of one appdef have the same rank, or both are ``None``."""
     return (one and one.rank) == (other and other.rank)
 
 

@@ -64,7 +64,7 @@ def _number(release: ServiceRelease | None) -> int:
 
 
 def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    """Return the ledger in which ``instance`` no longer keeps replicas whose time has ended."""
+    """Return the ledger without the steps of ``instance`` that have ended."""
     kept = world.ledger.kept
     left = tuple(one for one in kept.steps.get(instance) or () if one.until > now)
     return replace(world.ledger, kept=kept.replace(instance, left))

@@ -1,8 +1,8 @@
-"""``demandops upgrade``: one commit that renders everything again with this program's version.
+"""``demandops upgrade``: one commit in which this program renders everything again.
 
 The state repo changes to another render version or GitOps controller in this one commit, so two
 versions never undo each other's files. If the tip moves meanwhile, the commit is made again on the
-new tip. It is never pushed by force.
+new tip. The commit is never pushed by force.
 """
 
 from __future__ import annotations

@@ -57,12 +57,12 @@ class Namespace:
         return found
 
     def find(self, kind: str, instance: str = "") -> list[Manifest]:
-        """Return the namespace's objects of a kind; with ``instance``, only that release's."""
+        """Return the objects of a kind; with ``instance``, only those of this release."""
         selector = f"{_INSTANCE}={instance}" if instance else ""
         return self.kube.find(kind, self.namespace, selector)
 
     def lines(self) -> frozenset[str]:
-        """Return the existing objects as lines in the form of the module `expected`."""
+        """Return the objects that exist, as lines that the module `expected` describes."""
         found = [f"release {name_of(item)}" for item in self.find(self.RELEASE)]
         found += [f"Deployment {name_of(item)}" for item in self.find("Deployment")]
         for config in self.find("ConfigMap"):
@@ -118,11 +118,11 @@ class Namespace:
         raise NotImplementedError
 
     def wait_fetched(self, commit: str) -> float:
-        """Wait until the controller has fetched a commit; return the monotonic time."""
+        """Wait until the controller has fetched a commit; return the time (`time.monotonic`)."""
         raise NotImplementedError
 
     def wait_applied(self, commit: str) -> float:
-        """Wait until the controller has applied a commit; return the monotonic time."""
+        """Wait until the controller has applied a commit; return the time (`time.monotonic`)."""
         raise NotImplementedError
 
     def wait_attempted(self, commit: str) -> None:
@@ -154,7 +154,7 @@ class Namespace:
     # --- waiting ----------------------------------------------------------------------------
 
     def wait_lines(self, wanted: frozenset[str], timeout: float = 60.0) -> float:
-        """Wait until `lines` returns exactly the wanted lines; return the monotonic time."""
+        """Wait until `lines` returns just the wanted lines; return the time (`time.monotonic`)."""
         return self._wait_same(self.lines, wanted, timeout)
 
     def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:

@@ -136,7 +136,7 @@ def held(bare: Path) -> set[tuple[str, ...]]:
             "edge/d1",
             "has the invisible character U+2060; choose an id without it",
         ),
-        ("user1", 10, "edge-d1", "which application 'edge/d1' publishes on 'edge' already; use an"),
+        ("user1", 10, "edge-d1", "application 'edge/d1' already publishes this topic on 'edge'"),
     ],
 )
 def test_a_claim_by_hand_that_a_demand_could_not_book_is_held_back(

@@ -106,9 +106,9 @@ def warned(files: dict[str, str]) -> list[str]:
 
 
 SHARED = (
-    f"{DOMAINS}: access domains 'city' and 'fleet' share ROS domain 0 on the host's network of "
-    "cluster 'c-its', so each may read and write the topics of the others; give each access domain "
-    "its own ros.domainId"
+    f"{DOMAINS}: access domains 'city' and 'fleet' share ROS domain 0 on the network of the hosts "
+    "of cluster 'c-its', so each may read and write the topics of the others; give each access "
+    "domain its own ros.domainId"
 )
 CLOSED = (
     f"{DOMAINS}: 'network: namespace' of access domain 'fleet' has no effect on nodes whose "

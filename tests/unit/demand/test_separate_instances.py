@@ -183,7 +183,7 @@ def test_what_several_definitions_share_runs_once_so_another_version_of_it_is_re
     repo.send(record("a", ""))
     assert repo.faults(record("b", "1.1.0")) == [
         "applications[0].version: driver for /points of 'vehicle00' would run in version 1.1.0, "
-        "but is shared with 'edge/record' in version 1.0.0; request the same version"
+        "but is shared with 'edge/record' in version 1.0.0; request version 1.0.0"
     ]
     assert repo.send(record("b", "1.0.1")).outcome == "booked"
     services = repo.books()["services"]

@@ -95,7 +95,7 @@ RUNS = f"{EDGE} runs version"
         ),
         pytest.param(
             "update", "2.0.0", "1.1.0",
-            f"{ASKS}version 1.1.0 of {EDGE}, which runs 2.0.0",
+            f"{ASKS}version 1.1.0 of {EDGE}, which runs in version 2.0.0",
             f"{RUNS} 2.0.0, which others ask for, not 1.1.0", id="an older major version by name",
         ),
     ],
@@ -151,7 +151,7 @@ def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
     # a third demand shares the version that already runs
     assert repo.send(put("c", "2.0.0", id="edge/c")).approval == ()
     older = repo.send(put("d", "1.0.0", id="edge/d"))
-    assert older.approval == (f"{ASKS}version 1.0.0 of {what}, which runs 2.0.0",)
+    assert older.approval == (f"{ASKS}version 1.0.0 of {what}, which runs in version 2.0.0",)
     assert older.warnings == (f"{what} runs version 2.0.0, which others ask for, not 1.0.0",)
 
 
@@ -159,11 +159,12 @@ def test_two_applications_of_one_demand_must_agree_where_versions_are_refused() 
     repo = MemoryRepo(config("refuse"))
     goal = put("a", "1.0.0")
     goal["applications"] += put("a", "1.1.0", id="edge/b")["applications"]
-    end = "request the same version"
     what = "version: object-detection for /points of 'edge' would run in version"
     assert repo.faults(goal) == [
-        f"applications[0].{what} 1.0.0, but is shared with 'edge/b' in version 1.1.0; {end}",
-        f"applications[1].{what} 1.1.0, but is shared with 'edge/a' in version 1.0.0; {end}",
+        f"applications[0].{what} 1.0.0, but is shared with 'edge/b' in version 1.1.0; request "
+        "version 1.1.0",
+        f"applications[1].{what} 1.1.0, but is shared with 'edge/a' in version 1.0.0; request "
+        "version 1.0.0",
     ]
 
 

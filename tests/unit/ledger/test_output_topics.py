@@ -115,8 +115,8 @@ def test_an_application_whose_topics_another_publishes_is_refused() -> None:
     repo.send(join(CLOUD, id="edge/fusion-1"))
     assert repo.faults(join(CLOUD, id="edge-fusion/1")) == [
         "apps[0].header.id: output fused_objects of object-fusion is "
-        "/edge_fusion_1_global_objectlist, which application 'edge/fusion-1' publishes on 'edge' "
-        "already; use another application id"
+        "/edge_fusion_1_global_objectlist, but application 'edge/fusion-1' already publishes this "
+        "topic on 'edge'; use another application id"
     ]
     repo.send(goal([application("edge-fusion/1", node="cloud")]))
 
@@ -126,8 +126,8 @@ def test_a_source_whose_topic_another_publishes_is_refused() -> None:
     repo.send(join(("/a", "robo-1")))
     assert repo.faults(join(("/b", "robo/1"), id="edge/other")) == [
         "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
-        "object_list of object-detection is /robo_1_local_objectlist, which object-detection for "
-        "/a of 'robo-1' publishes on 'edge' already; give 'robo/1' another id in "
+        "object_list of object-detection is /robo_1_local_objectlist, but object-detection for /a "
+        "of 'robo-1' already publishes this topic on 'edge'; give 'robo/1' another id in "
         "inventory/nodes.yaml"
     ]
 
@@ -141,9 +141,9 @@ def test_two_usual_clouds_which_a_person_wrote_are_told_apart_by_the_inventory()
     repo.send(goal([application("cloud/x", node="cloud", clouds=[FRONT])]))
     assert repo.faults(goal([application("cloud/y", node="cloud", clouds=[REAR])])) == [
         "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
-        "object_list of object-detection is /vehicle01_local_objectlist, which object-detection "
-        "for /front/points of 'vehicle01' publishes on 'cloud' already; choose one of the two "
-        "topics as the usual one, and list it in topics.point_cloud of 'vehicle01' in "
+        "object_list of object-detection is /vehicle01_local_objectlist, but object-detection "
+        "for /front/points of 'vehicle01' already publishes this topic on 'cloud'; choose one of "
+        "the two topics as the usual one, and list it in topics.point_cloud of 'vehicle01' in "
         "inventory/nodes.yaml"
     ]
 
@@ -162,7 +162,7 @@ def test_an_application_whose_topic_a_connection_brings_is_refused(at_once: bool
         repo.send(link)
     assert repo.faults(app) == [
         "apps[0].header.id: output fused_objects of object-fusion is /edge_1_global_objectlist, "
-        "which connection 'link' brings to 'edge' already; use another application id"
+        "but connection 'link' already brings this topic to 'edge'; use another application id"
     ]
 
 
@@ -171,8 +171,8 @@ def test_a_source_whose_topic_a_connection_brings_is_refused() -> None:
     repo.send(bringing(PLAIN))
     assert repo.faults(join(FRONT)) == [
         "apps[0].object_detection_fusion_app.pointcloud_topics[0].topic_name: output "
-        f"object_list of object-detection is {PLAIN}, which connection 'link' brings to 'edge' "
-        "already; let the connection bring the topic under another name"
+        f"object_list of object-detection is {PLAIN}, but connection 'link' already brings this "
+        "topic to 'edge'; let the connection bring the topic under another name"
     ]
     repo.send(join(REAR, FRONT, shutdown=False) | {"apps": [application(node="cloud")]})
 
@@ -228,8 +228,8 @@ def test_a_claim_that_a_person_writes_or_restores_must_not_bring_a_topic_twice()
     assert sorted(str(refusal).splitlines()) == sorted(found)
     assert found == [
         f"{path_of(app.key)}: id: output fused_objects of object-fusion is "
-        "/edge_fusion_1_global_objectlist, which application 'edge/fusion-1' publishes on 'edge' "
-        "already; use another application id",
+        "/edge_fusion_1_global_objectlist, but application 'edge/fusion-1' already publishes this "
+        "topic on 'edge'; use another application id",
         f"{path_of(link.key)}: topics[0].target: connection 'link' brings "
         "/edge_fusion_1_global_trajectories to 'edge', where application 'edge/fusion-1' "
         "already publishes this topic; use a connection that brings the topic under another name",
@@ -285,6 +285,6 @@ def test_a_topic_in_another_role_hides_no_usual_topic() -> None:
     repo.send(goal([application("edge/a", who=["v"], ego=[ego], clouds=[])], id="a"))
     repo.send(goal([application("edge/b", who=["v"], clouds=[FRONT])], id="b"))
     usual = repo.state.ledger.usual_topics
-    assert [*usual("ego_data", "vehicle01", but=FRONT[0])] == ["/odd/ego"]
-    assert [*usual("ego_data", "vehicle01", but="/odd/ego")] == []
-    assert [*usual("point_cloud", "vehicle01", but="")] == [FRONT[0]]
+    assert [*usual("ego_data", "vehicle01", excluded=FRONT[0])] == ["/odd/ego"]
+    assert [*usual("ego_data", "vehicle01", excluded="/odd/ego")] == []
+    assert [*usual("point_cloud", "vehicle01", excluded="")] == [FRONT[0]]

@@ -121,8 +121,8 @@ class TestContradictions:
     def test_a_topic_that_somebody_has_carried_back_to_another(self) -> None:
         ledger = joined(Ledger(), Route("/a", "/x", reverse=True))
         assert refusal(ledger, Route("/b", "/x", reverse=True)) == [
-            "connections[0].topics[0].target: '/x' is already carried back to '/a': connection 'c' "
-            "is held by v; a connection carries a target topic back to only one source topic, so "
+            "connections[0].topics[0].target: connection 'c' is held by v and already carries '/x' "
+            "back to '/a'; a connection carries a target topic back to only one source topic, so "
             "use a second connection"
         ]
         assert joined(ledger, Route("/b", "/x"), who="w")

@@ -156,7 +156,7 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         for number in (1, 2, 3)
     }
     assert warnings[0] == (
-        f"{CONNECTION}: is not imported, because its last request was a shutdown and the "
+        f"{CONNECTION} is not imported, because its last request was a shutdown and the "
         "bookkeeping files do not say who still holds it"
     )
     assert warnings[1] == (
@@ -164,5 +164,5 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         "the requesters that its last request lists are imported, each with one hold"
     )
     assert warnings[-1] == (
-        "od-edge-station00: is not imported, because no application holds its object list"
+        "od-edge-station00 is not imported, because no application holds its object list"
     )

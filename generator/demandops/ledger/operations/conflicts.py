@@ -33,7 +33,7 @@ def _of_application(one: Demanded, app: Application, ledger: Ledger) -> Iterator
             app.node,
             known.node,
             "on",
-            "request the same node, or wait until the application is released",
+            f"request node '{known.node}', or wait until the application is released",
         ),
         ("appdef", app.appdef, known.appdef, "as", "use another application id"),
     ):
@@ -77,9 +77,9 @@ def _of_routes(one: Demanded, demanded: Connection, claim: Claim, held: str) -> 
         elif route.reverse and (other := carried_back.get(route.target)):
             yield one.fault(
                 f"{where}.target",
-                f"'{route.target}' is already carried back to '{other.source}': connection {held}; "
-                "a connection carries a target topic back to only one source topic, so use a "
-                "second connection",
+                f"connection {held} and already carries '{route.target}' back to "
+                f"'{other.source}'; a connection carries a target topic back to only one source "
+                "topic, so use a second connection",
                 code="conflict",
             )
 
@@ -90,8 +90,9 @@ def _of_route(
     if current.target != route.target:
         yield one.fault(
             f"{where}.target",
-            f"'{route.source}' already goes to '{current.target}': connection {held}; a connection "
-            "carries a source topic to only one target, so use a second connection",
+            f"connection {held} and already carries '{route.source}' to '{current.target}'; a "
+            "connection carries a source topic to only one target topic, so use a second "
+            "connection",
             code="conflict",
         )
     for name, old, new in routes.contradictions(current, route):

@@ -23,7 +23,7 @@ from demandops.subject import Subject, SubjectKind
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger after a node or requester is decommissioned, and the changes.
 
-    If a requester is decommissioned, waiting demands that have no other requester stop waiting.
+    If a requester is decommissioned, waiting demands that have no other requester are removed.
 
     Raises:
         Refused: if there is no claim and no waiting demand to end.

@@ -29,7 +29,7 @@ class Drain(DemandRequest):
 
 
 def drain(ledger: Ledger, request: Drain) -> tuple[Ledger, Changes]:
-    """Return the ledger with the moved claims, and the changes."""
+    """Apply the moves of a drain; return the ledger and the changes."""
     start = ledger
     for move in request.moves:
         ledger = ledger.replace(move.key, move.after)

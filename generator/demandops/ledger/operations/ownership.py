@@ -41,7 +41,7 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
                 for claim in ledger.claims_of_requester(requester)
             }
         )
-        never = "it has ended, or was never booked; 'demandops log' shows which"
+        never = "the demand has ended, or was never booked; see 'demandops log'"
         known = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
         message = f"'{request.demand}' holds nothing; {known if demands else never}"
         raise Refused([fault("demand", message, code="not-held")])

@@ -69,8 +69,8 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
     """Return the changes of claims that restore the earlier commit, sorted by path.
 
-    A claim that differs from the restored one only in the term or the end of its lease stays as it
-    is.
+    A claim does not change if it differs from the restored claim only in the term or the end of the
+    lease.
     """
     restored = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
@@ -127,7 +127,7 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
 
 
 def request_for(claim: Claim) -> Put:
-    """Return a request that books this claim; a fault of the request names a field of the claim."""
+    """Return a request that books this claim; its faults are located at fields of the claim."""
     return Put(
         id=claim.request,
         demanded=(Demanded(claim.held, claim.requesters, str),),

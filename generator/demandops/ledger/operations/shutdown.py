@@ -1,9 +1,12 @@
 """A shutdown takes one hold from each requester that it names, on each topic that it lists.
 
-If several claims hold the topic for the requester, the hold is taken from the first claim in this
-order: the claim with the shutdown's request id and requesters, then other claims with this request
-id, then all other claims, the oldest first. A shutdown never takes holds from the claims of a
-demand that has an id.
+If several claims hold the topic for the requester, the hold is taken from the first of:
+
+1. the claim with the shutdown's request id and requesters
+2. the oldest other claim with this request id
+3. the oldest claim with another request id
+
+A shutdown never takes holds from the claims of a demand that has an id.
 """
 
 from __future__ import annotations
@@ -74,10 +77,11 @@ def _holds(
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
     """Yield (text, claim, keys) for each topic that a shutdown lists.
 
-    The text describes the listed topic. The claim is the first one in which the requester holds a
-    topic that matches the listed topic, or ``None`` if there is no such claim. The keys are those
-    of the matching topics that the requester holds in this claim. If no topic is listed, the claim
-    is the first of ``claims``, and the keys are those of all its topics.
+    ``text`` describes the listed topic. ``claim`` is the first claim in which the requester holds a
+    matching topic, or ``None``. ``keys`` are the keys of the matching topics that the requester
+    holds in ``claim``.
+
+    If no topic is listed, ``claim`` is the first of ``claims``, and ``keys`` has all its topics.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]

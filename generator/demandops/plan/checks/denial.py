@@ -59,7 +59,7 @@ def _service_traits(one: Demanded, after: World) -> Iterator[Traits]:
 
 
 def _denied_field(override: Override, one: Demanded, services: list[Traits], config: Config) -> str:
-    """Return the field of ``one`` because of which an override denies it, or an empty text."""
+    """Return the field because of which an override denies a demanded item, or an empty text."""
     for selector in override.select:
         for traits in services if selector.services else [traits_of(one)]:
             if fits(selector, traits, config):
@@ -68,7 +68,7 @@ def _denied_field(override: Override, one: Demanded, services: list[Traits], con
 
 
 def _matched_field(selector: Selector, one: Demanded, config: Config) -> str:
-    """Return the most specific field of ``one`` that a selector matches; the fault names it."""
+    """Return the most specific field of a demanded item that a selector matches."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:

@@ -78,8 +78,7 @@ def _of_service(
     for name, topic, clash, remedy in islice(clashes, 1):
         yield fault(
             _field(request, key, service),
-            f"output {name} of {key.service} is {topic}, which {clash} '{key.node}' already; "
-            f"{remedy}",
+            f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
             code="conflict",
         )
 
@@ -87,14 +86,17 @@ def _of_service(
 def _clashes(
     world: World, key: ServiceKey, service: Service, topic: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield (clash, remedy), in words, for each other source of a topic on the node of ``key``.
+    """Yield (clash, remedy), in words, for each source of a topic on the node of ``key``.
 
-    The clash names the other source, as in ``connection 'a' brings to``.
+    The instance at ``key`` itself does not count as a source. The clash names the source, as in
+    ``connection 'a' already brings this topic to``.
     """
-    for other in _publishers(world, key.node, topic, but=key):
-        yield f"{_words(other)} publishes on", _remedy(key, other, service, world.config)
+    for other in _publishers(world, key.node, topic, excluded=key):
+        clash = f"{_words(other)} already publishes this topic on"
+        yield clash, _remedy(key, other, service, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
-        yield f"connection '{id}' brings to", _remedy(key, None, service, world.config)
+        clash = f"connection '{id}' already brings this topic to"
+        yield clash, _remedy(key, None, service, world.config)
 
 
 def _of_connection(
@@ -102,7 +104,7 @@ def _of_connection(
 ) -> Iterator[Fault]:
     """Yield a fault for each new route that brings a topic to a node where a service publishes it.
 
-    Only a service that runs both before and after the demand counts. So if an application moves, a
+    A service that the demand starts or stops causes no fault here. So if an application moves, a
     connection may bring the application's output back to the old node.
     """
     for index, route in enumerate(connection.topics):
@@ -163,7 +165,7 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
 
 
 def _service(world: World, key: ServiceKey) -> Iterator[Service]:
-    """Yield the service of ``key``, or nothing if no claim needs the instance."""
+    """Yield the service at ``key``; yield nothing if no claim needs the instance at ``key``."""
     for claim in claims_needing(world, key)[:1]:
         first = world.ledger.application(claim.subject.id) or claim.application
         yield world.config.services[first.appdef][key.service]
@@ -176,12 +178,12 @@ def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
 
 
 def _publishers(
-    world: World, node: str, topic: str, *, but: ServiceKey | None = None
+    world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of the service instances on a node that publish ``topic``, except ``but``.
+    """Yield the keys of the service instances on a node that publish ``topic``.
 
-    The output patterns of the appdefs tell which instances would publish the topic. An instance
-    that no claim needs is left out.
+    The output patterns of the appdefs tell which instances would publish the topic. The instance
+    ``excluded`` and each instance that no claim needs are left out.
     """
     for services in world.config.services.values():
         for name, service in services.items():
@@ -192,21 +194,24 @@ def _publishers(
                 if match is None:
                     continue
                 found = (
-                    _keys_called(world, node, name, service, match[1], but)
+                    _keys_called(world, node, name, service, match[1], excluded)
                     if others
                     else _keys_on(world, node, service)
                 )
-                yield from (key for key in found if key != but and is_needed(world, key))
+                yield from (key for key in found if key != excluded and is_needed(world, key))
 
 
 def _keys_called(
-    world: World, node: str, name: str, service: Service, instance: str, but: ServiceKey | None
+    world: World,
+    node: str,
+    name: str,
+    service: Service,
+    instance: str,
+    excluded: ServiceKey | None,
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of those instances of a service that have ``instance`` in their topic names.
+    """Yield the keys of the service's instances on ``node`` with ``instance`` in topic names.
 
-    The instances are on ``node``, and some of them may not run. ``but`` is the instance for which
-    the caller looks for clashes. If the inventory names no usual topic of its source, the topic of
-    ``but`` does not count as one.
+    Some of the instances may not run. The instance ``excluded`` may be left out.
     """
     ledger, config, role = world.ledger, world.config, service.root
     if service.scope in ("node", "cluster"):
@@ -219,8 +224,8 @@ def _keys_called(
         return
     for source in config.nodes_by_topic_part.get(instance, ()):
         usual = usual_topic(config, source, role)
-        own = str(but.topic) if but and source == but.source else ""
-        for topic in (usual,) if usual else ledger.usual_topics(role, source, but=own):
+        own = str(excluded.topic) if excluded and source == excluded.source else ""
+        for topic in (usual,) if usual else ledger.usual_topics(role, source, excluded=own):
             yield ServiceKey(name, node, source=source, topic=topic)
     for further, version in ledger.further_topics(role, instance):
         own = "" if service.shared else version
@@ -262,7 +267,7 @@ def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config:
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return the field of the request that makes a service run, or an empty text."""
+    """Return the field of the request because of which a service runs, or an empty text."""
     for one in request.demanded:
         if not isinstance(one.held, Application):
             continue

@@ -58,10 +58,10 @@ class Difference:
     """The fault to report if :attr:`is_refused`."""
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether the difference concerns a demand that asks for version ``asked``.
+        """Return whether the difference concerns a demand that names the version ``asked``.
 
-        It does if the demand names a version, if the demanded version is the newer one, or if the
-        difference is refused. ``asked`` is empty if the demand names no version.
+        ``asked`` is empty if the demand names no version. Then the difference concerns the demand
+        only if :attr:`newer` or :attr:`is_refused` is true.
         """
         return bool(asked) or self.newer or self.is_refused
 
@@ -78,7 +78,7 @@ class Difference:
         change = (
             f"the upgrade of {self.what} from version {self.others} to {self.demanded}"
             if self.newer
-            else f"version {self.demanded} of {self.what}, which runs {self.others}"
+            else f"version {self.demanded} of {self.what}, which runs in version {self.others}"
         )
         return f"application definition '{self.appdef}', for {change}"
 
@@ -109,17 +109,17 @@ def differences(
     if not request.adds_claims:
         return
     listed = {one.held.subject: one for one in request.demanded}
-    mine: dict[str, tuple[Demanded, str]] = {}
+    own: dict[str, tuple[Demanded, str]] = {}
     for change in changes:
         one, claim, old = listed.get(change.key.subject), change.after, change.before
         if one is None or claim is None or not claim.is_on_application:
             continue
-        mine[claim.application.id] = one, claim.application.version
+        own[claim.application.id] = one, claim.application.version
         if old is None or old.application.version != claim.application.version:
             yield from _of_application(one, claim, after)
     for release in plans.values():
         if isinstance(release, ServiceRelease) and len(release.applications) > 1:
-            yield from _of_service(release, mine, before, without_suspended(after))
+            yield from _of_service(release, own, before, without_suspended(after))
 
 
 def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
@@ -135,8 +135,7 @@ def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Diffe
     holders, word = _first_asker(others, app.subject, theirs, known)
     message = (
         f"{_words(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
-        f"{holders} in {_words(word, theirs)}; request the same version, or use another "
-        "application id"
+        f"{holders} in {_words(word, theirs)}; request that version, or use another application id"
     )
     found = Difference(
         f"application '{app.id}'",
@@ -157,10 +156,9 @@ def _first_asker(
     version: ApplicationVersion,
     known: Mapping[str, ApplicationVersion],
 ) -> tuple[str, str]:
-    """Return the requesters and the word of the first claim that asks for ``version``.
+    """Return (requesters, word) of the first claim on ``subject`` that asks for ``version``.
 
-    The word is the version or channel that the claim names. It is empty if the claim asks for the
-    default version.
+    ``word`` is the version or channel that the claim names; it is empty for the default version.
     """
     for claim in ledger.claims_on(subject):
         word = claim.application.version
@@ -176,15 +174,18 @@ def _words(word: str, version: ApplicationVersion) -> str:
 
 def _of_service(
     release: ServiceRelease,
-    mine: Mapping[str, tuple[Demanded, str]],
+    listed: Mapping[str, tuple[Demanded, str]],
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield the version differences between the applications that share a service.
+    """Yield a difference for each listed application whose version of a shared service differs.
 
-    For each application of the demand, the version of the service that this application needs is
-    compared with the version that the other applications need. ``mine`` maps the id of each
-    application of the demand to the listed application and the version that it asks for.
+    The version is compared with the one that the other applications need.
+
+    Args:
+        release: the release of the shared service.
+        listed: the applications of the demand by id, each with the version that it asks for.
+        before, after: the world before and after the demand.
     """
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}
@@ -192,7 +193,7 @@ def _of_service(
         return
     for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
     what = f"{key.service} {for_what}"
-    for id, (one, asked) in mine.items():
+    for id, (one, asked) in listed.items():
         others = [other for other in versions if other != id]
         own, theirs = versions.get(id), version_of_service(after, service, others)
         if own is None or contents(own, service) == contents(theirs, service):
@@ -206,10 +207,12 @@ def _of_service(
             version.name if by_name else version.charts[service.chart].version
             for version in (own, theirs)
         )
+        has_current = f"a version that has {key.service} {current}"
+        remedy = f"version {current}" if by_name else has_current
         sharing = ", ".join(f"'{other}'" for other in others[:3])
         message = (
             f"{what} would run in version {new}, but is shared with {sharing} in version "
-            f"{current}; request the same version"
+            f"{current}; request {remedy}"
         )
         appdefs = (config.appdefs[version.appdef] for version in (own, theirs))
         strictest = min(appdefs, key=lambda appdef: _STRICTNESS.index(appdef.versions))

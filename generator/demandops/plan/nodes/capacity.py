@@ -183,7 +183,7 @@ class Room:
         return [excess for id, excess in found if id == host]
 
     def is_full(self, node: Node, least: Mapping[str, int]) -> bool:
-        """Return whether a node has too little room for ``least``, which :meth:`least` returns."""
+        """Return whether a node lacks room for the amounts ``least``, a result of :meth:`least`."""
         host = self._world.config.host_of(node.id)
         return any(
             most is not None and self._usage.of(host, resource) + amount > most
@@ -192,12 +192,11 @@ class Room:
         )
 
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
-        """Return the least that an application requests on any node, as resource → amount.
+        """Return what an application requests at least of its node, as resource → amount.
 
-        Only the application's own services count, not services that it shares. With these amounts a
-        caller can rule out a full node before it plans all services on that node. If ``service`` is
-        not empty, only the service of this name counts. The result is empty if there are overrides
-        because of which the amounts may differ from node to node.
+        Services that the application shares do not count. If ``service`` is not empty, only the
+        service of this name counts. The result is empty if overrides may make the amounts depend
+        on the node. Callers use the amounts to rule out full nodes quickly.
         """
         subject, world = claims[0].subject, self._world
         if any(one.node or one.deny or one.replicas is not None for one in world.overrides):
@@ -237,7 +236,7 @@ class Room:
     def _after(
         self, claims: Iterable[Claim], *, give_back: bool = False
     ) -> tuple[World, Mapping[Need, int]]:
-        """Return the world with these claims booked, and the growth of the requests.
+        """Return the world with these claims booked, and what services then request in addition.
 
         With ``give_back``, the claims are released instead of booked.
         """

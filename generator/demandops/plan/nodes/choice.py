@@ -1,7 +1,7 @@
 """The choice of one node: for an application, or for one of its services.
 
-A service whose definition has ``place`` gets a node of its own. This is the application's node if
-that node fits. Otherwise it is the first other node that fits.
+For a service whose definition has ``place``, a node is chosen separately. The application's node is
+chosen if it fits. If it does not fit, the best other node that fits is chosen.
 """
 
 from __future__ import annotations

@@ -101,8 +101,8 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
 def _overridden(app: Application, world: World) -> Application:
     """Return an application with its services moved to the nodes that overrides name.
 
-    If the application is booked on the same nodes already, its moved services stay where they are
-    booked, because only a change of an override or a definition moves services again.
+    If the application is booked already and its appdef and nodes do not change, its moved services
+    stay on the booked nodes. Only a change of an override or a definition moves them again.
     """
     booked = world.ledger.application(app.id)
     if booked is not None and replace(app, moved=booked.moved).has_same_definition_and_nodes(
@@ -122,7 +122,7 @@ def _placed(
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
     room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept])
-    demanded = [_without_services(one, world) for one in request.demanded]
+    demanded = [_with_named_service_nodes(one, world) for one in request.demanded]
     for one in demanded:
         if isinstance(one.held, Application) and one.held.place is None:
             room.take(_claim(request, one))
@@ -152,17 +152,17 @@ def _placed(
 def _so_far(
     request: DemandRequest, demanded: list[Demanded], index: int, app: Application
 ) -> DemandRequest:
-    """Return a request with the applications that have a node already, and all connections.
+    """Return the request without the applications that have no node yet.
 
-    ``demanded`` are the items of the request, and ``app`` replaces the application at ``index``.
+    The items of the result are ``demanded``, with ``app`` as the application at ``index``.
     """
     listed = [*demanded[:index], replace(demanded[index], held=app), *demanded[index + 1 :]]
     placed = (one for one in listed if not isinstance(one.held, Application) or one.held.node)
     return replace(request, demanded=tuple(placed))
 
 
-def _without_services(one: Demanded, world: World) -> Demanded:
-    """Return an application with only those nodes of services that the demand names."""
+def _with_named_service_nodes(one: Demanded, world: World) -> Demanded:
+    """Return an application whose services have only the nodes that the demand names."""
     if not isinstance(one.held, Application):
         return one
     services = {service.name: "" for service in _services_to_place(one.held, world)}
@@ -173,8 +173,9 @@ def _without_services(one: Demanded, world: World) -> Demanded:
 def may_wait(request: DemandRequest, world: World) -> bool:
     """Return whether a demand that lacks room may wait.
 
-    Each application and service to place must fit a node of an access domain that lets demands
-    wait, and must need no approval on that node. A person approves only what can be booked at once.
+    For each application and service to place, there must be a node that would fit if it had room.
+    The node's access domain must let demands wait, and must ask for no approval. A demand that
+    needs approval cannot wait, because a person approves only what can be booked at once.
     """
     return all(
         any(_waits_for(node, request, choice) for node in choice.nodes())
@@ -244,8 +245,8 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
     return ""
 
 
-def _named_services(one: Demanded, app: Application, world: World) -> Iterator[Fault]:
-    """Yield a fault for each service whose named node lacks what the service requires."""
+def _unfit_named_nodes(one: Demanded, app: Application, world: World) -> Iterator[Fault]:
+    """Yield a fault for each node that the demand names, if it lacks what its service requires."""
     for name in app.named:
         service = world.config.services.get(app.appdef, {}).get(name)
         node = world.config.nodes.get(app.services[name])
@@ -263,9 +264,9 @@ def _contradictions(one: Demanded, app: Application, claim: Claim) -> Iterator[F
         current = claim.application.chosen_node(name)
         if current != app.services[name]:
             message = (
-                f"{quoted(app.services[name])} contradicts an existing claim: '{app.id}' is held "
-                f"by {', '.join(claim.requesters)} with service {name} on node '{current}'; name "
-                f"node '{current}', or use another application id"
+                f"{quoted(app.services[name])} contradicts an existing claim of "
+                f"{', '.join(claim.requesters)}: service {name} of '{app.id}' is on node "
+                f"'{current}'; name node '{current}', or use another application id"
             )
             yield one.fault(f"services.{name}", message, code="conflict")
 
@@ -289,10 +290,10 @@ def _named(choice: Choice) -> Fault | None:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node on which an application is booked already and stays.
+    """Return the node on which the application of ``demand`` is booked already and stays.
 
     Return ``None`` if the generator may choose a node. Return a fault if another demand holds the
-    application on a node that lacks what this demand requires.
+    application on a node that lacks what ``demand`` requires.
     """
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
@@ -314,9 +315,9 @@ def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
 
 
 def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
-    """Return the first claim that belongs to another demand, or ``None``.
+    """Return the first claim of a demand other than ``demand``, or ``None``.
 
-    Claims that overrides keep belong to no demand.
+    A claim that an override keeps is of no demand.
     """
     return next((c for c in claims if c.demand != demand and not c.keeping_override), None)
 
@@ -343,7 +344,7 @@ def _with_services(
         one = replace(one, held=replace(app, services=fixed.services))
         room.book([_claim(request, one)])
         return one, faults
-    faults += _named_services(one, app, world)
+    faults += _unfit_named_nodes(one, app, world)
     gone = {name for c in claims if c.demand == request.demand for name in c.application.named}
     stay = {*world.config.services.get(app.appdef, {})} - {*app.services} - gone
     booked = first.services if first else {}
@@ -358,7 +359,7 @@ def _with_services(
         if not known or (known != shared and not choice.fits(known)):
             positions = _positions(request)
             found = (
-                choice.chosen(shared, "where it runs for this topic already")
+                choice.chosen(shared, "where the service already runs for this topic")
                 or next(choice.candidates(positions), None)
                 or choice.none_fits(positions)
             )

@@ -80,9 +80,10 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the services of an application that have ``node`` as a node of their own.
+    """Return what of an application is on ``node`` by a choice of its own.
 
-    ``None`` in the result stands for the application itself, if its node is ``node``.
+    ``None`` stands for the application itself. A service is listed only if a node was chosen or
+    named for this service.
     """
     app = world.ledger.application(id)
     if app is None:
@@ -222,7 +223,7 @@ def following_overrides(
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return a restoration whose services are on the nodes that overrides name now."""
+    """Return the restoration with its claims adapted to the overrides that move services now."""
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims

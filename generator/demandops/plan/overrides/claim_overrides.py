@@ -57,7 +57,7 @@ def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
 
 
 def traits_of(one: Claim | Demanded) -> Traits:
-    """Return the traits of a claimed or demanded application or connection."""
+    """Return the values of a claim or a demand with which selectors are compared."""
     held = one.held
     if isinstance(held, Application):
         return Traits(held.nodes, one.requesters, (held.id,), (held.appdef,))
@@ -65,7 +65,7 @@ def traits_of(one: Claim | Demanded) -> Traits:
 
 
 def fits(selector: Selector, traits: Traits, config: Config) -> bool:
-    """Return whether each field that a selector has matches ``traits``."""
+    """Return whether ``traits`` match every field of ``selector``."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
@@ -201,9 +201,9 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 def with_kept_claims(
     before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
-    """Return the ledger after a booking, and the changes, both with kept claims updated.
+    """Update the kept claims after a booking; return the ledger and all changes.
 
-    The kept claims on ``subjects`` and on the subjects that the booking changed are updated.
+    Only the kept claims on ``subjects`` and on the subjects that the booking changed are updated.
     """
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
@@ -222,14 +222,14 @@ def update_kept_claims(
         before: the ledger before a change.
         after: the world after the change.
         subjects: the subjects that changed.
-        now: the booking time of new kept claims.
+        now: the booking time of each claim that an override books.
     """
     keys, ledger = list[ClaimKey](), after.ledger
     for subject in subjects:
         existing = [*ledger.kept_claims(subject), *before.kept_claims(subject)]
         needed = None
         if ledger.is_only_kept(subject):
-            needed = _needed(existing, before.claims_on(subject), after, now)
+            needed = _kept_claim(existing, before.claims_on(subject), after, now)
         keys += [claim.key for claim in existing]
         ledger = ledger.without(existing)
         if needed is not None:
@@ -243,18 +243,18 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
     return tuple(dict.fromkeys(claim.subject for claim in ledger.kept_claims()))
 
 
-def _needed(
+def _kept_claim(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the kept claim on a subject, or ``None`` if no override keeps the subject.
+    """Return the claim by which an override keeps a subject, or ``None`` if no override does.
 
-    Callers ask only for a subject that no demand holds.
+    The claim is one of ``existing``, or a new claim. No demand may hold the subject.
 
     Args:
-        existing: the kept claims on the subject.
+        existing: the kept claims on the subject before the update.
         before: all claims on the subject before the change.
         world: the world after the change.
-        now: the booking time of a new kept claim.
+        now: the booking time of a new claim.
     """
     for claim in existing:
         if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
@@ -282,8 +282,8 @@ def _needed(
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     """Return the overrides that keep the subject of a claim, the highest in rank first.
 
-    For a kept claim, ``requesters`` of a selector is not compared, because the only requester of a
-    kept claim is the owner of the override. The requesters of the original claim already matched.
+    If an override keeps the claim already, the claim's only requester is the override's owner. So
+    ``requesters`` of a selector is ignored for such a claim.
     """
     traits = traits_of(claim)
     if claim.keeping_override is not None:

@@ -1,7 +1,7 @@
 """Bookkeeping: who requests each service, connection and topic, and what each demand holds.
 
-This is Table III, column 4, of the paper. It is derived from the claims whenever it is shown, and
-is stored nowhere.
+The paper shows the bookkeeping in Table III, column 4. The bookkeeping is derived from the claims
+whenever it is shown, and is stored nowhere.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class ServiceEntry:
 
     ``inputs`` maps each input role to its topics, and each topic to its requesters. ``version`` is
     the version of the service's chart. ``application_version`` is the version of the application in
-    ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version that claims name
-    to the requesters of these claims.
+    ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version that a demand
+    names to the requesters of such demands.
     """
 
     applications: list[str]

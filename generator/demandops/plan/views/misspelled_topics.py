@@ -47,7 +47,7 @@ class _KnownTopics:
         self._told: set[tuple[str, str]] = set()
 
     def notes_on(self, held: Application | Connection) -> Iterator[str]:
-        """Yield a warning for each misspelled topic for which there was no warning before."""
+        """Yield a warning for each misspelled topic that an earlier call did not report."""
         if isinstance(held, Application):
             for role, one in held.all_inputs():
                 known = self._of(one.source) | self._usual(role, one.source)
@@ -77,7 +77,7 @@ class _KnownTopics:
 
     def _usual(self, role: str, source: str) -> frozenset[str]:
         if (role, source) not in self._booked:
-            found = self._world.ledger.usual_topics(role, source, but="")
+            found = self._world.ledger.usual_topics(role, source, excluded="")
             self._booked[role, source] = frozenset(found)
         return self._booked[role, source]
 

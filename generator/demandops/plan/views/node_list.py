@@ -17,7 +17,7 @@ from demandops.subject import SubjectKind
 
 @dataclass(frozen=True, slots=True)
 class UsedNode:
-    """A node that the inventory has or that claims name, and what uses the node.
+    """A node of the inventory or of a claim, and what uses the node.
 
     ``releases`` are the releases that run on the node. ``applications``, ``connections`` and
     ``requesters`` come from the claims that need the node. These include claims on applications

@@ -136,7 +136,11 @@ def _releases(world: World) -> dict[str, list[Release]]:
 
 
 def _claims(world: World) -> dict[str, list[Claim]]:
-    """Return a map from override to the claims that it suspends or whose subjects it keeps."""
+    """Return a map from the name of an override to the claims on which the override acts.
+
+    An override with ``deny`` acts on the claims that it suspends. An override with ``keep`` acts on
+    the claims that it selects.
+    """
     found = defaultdict[str, list[Claim]](list)
     for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
         by = [suspended_by(claim, world), *claim_overrides.keeping_overrides(claim, world)]

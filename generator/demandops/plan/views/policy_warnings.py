@@ -38,7 +38,7 @@ def warnings(world: World) -> Iterator[Fault]:
     config = world.config
     yield from _charts(config)
     yield from _open_by_host_network(config)
-    yield from _connections_of_before(world)
+    yield from _connections_no_longer_allowed(world)
     yield from _above_capacity(world)
     yield from _drained(world)
     yield from _unfit_places(config)
@@ -88,8 +88,8 @@ def _above_capacity(world: World) -> Iterator[Fault]:
         yield fault("", f"'{node.id}': {message}").within(file)
 
 
-def _connections_of_before(world: World) -> Iterator[Fault]:
-    """Yield a warning for connections between domains that no rule allows any longer."""
+def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
+    """Yield a warning for each pair of access domains with connections that no rule allows now."""
     counts: Counter[tuple[str, str]] = Counter()
     for claim in world.ledger:
         if isinstance(claim.held, Connection):
@@ -136,9 +136,9 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
         if len(names) > 1:
             listed = " and ".join(f"'{one}'" for one in names)
             message = (
-                f"access domains {listed} share ROS domain {number} on the host's network of "
-                f"cluster '{cluster}', so each may read and write the topics of the others; give "
-                "each access domain its own ros.domainId"
+                f"access domains {listed} share ROS domain {number} on the network of the hosts "
+                f"of cluster '{cluster}', so each may read and write the topics of the others; "
+                "give each access domain its own ros.domainId"
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
 
@@ -167,8 +167,8 @@ def _charts(config: Config) -> Iterator[Fault]:
 def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
     """Return a map from the folder of each chart to the access domains in which the chart may run.
 
-    An access domain without rules allows every application. In any other access domain, a rule
-    must allow an application that uses the chart.
+    A chart may run in an access domain that has no rules, or in which a rule allows an application
+    that uses the chart.
     """
     found: dict[str, list[AccessDomain]] = {}
     for appdef, services in config.services.items():

@@ -45,7 +45,7 @@ def by_booking(claims: Iterable[Claim]) -> list[Claim]:
 def needs(claim: Claim, release: Release) -> bool:
     """Return whether a claim needs a release.
 
-    The claim must be on an application or connection of the release.
+    Callers pass only claims on an application or connection of the release.
     """
     if not isinstance(release, ServiceRelease):
         return True
@@ -74,7 +74,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def is_released_by_demand_id(claim: Claim) -> bool:
-    """Return whether a release that names the claim's demand id releases the claim."""
+    """Return whether the operation ``release`` with the claim's demand id ends the claim."""
     is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
     return claim.keeping_override is None and not is_of_a_request
 

@@ -33,7 +33,10 @@ _ALL: _Read = ("all",)
 
 
 class TracedPlan:
-    """The plan of one configuration for a sequence of ledgers with the same ended overrides."""
+    """The plan of one configuration, for one ledger after another.
+
+    All these ledgers have the same ended overrides.
+    """
 
     def __init__(self, config: Config) -> None:
         self._config = config

@@ -39,7 +39,7 @@ A result stays true, because neither a commit, its signature nor its parent's li
 
 
 def are_listed(repo: Repository, commit: Oid) -> bool:
-    """Return whether the files of a commit include the list of the keys that may sign."""
+    """Return whether a commit contains the file that lists the keys that may sign."""
     return trees.entry(trees.commit_of(repo, commit).tree, ALLOWED_SIGNERS) is not None
 
 

@@ -236,7 +236,7 @@ class _Edit:
         return config
 
     def merged_state(self, config: Config, ledger: Ledger) -> State:
-        """Return the state after the generator has applied the edit."""
+        """Return the state that the generator reaches after the edit is merged."""
         root = f"{ended_override_file.MARKERS_ROOT}/"
         markers = {path: text for path, text in self.files.items() if path.startswith(root)}
         ended = ended_override_file.read(markers)

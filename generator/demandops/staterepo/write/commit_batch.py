@@ -119,7 +119,7 @@ class CommitBatch:
         author: Signature,
         now: datetime,
     ) -> str:
-        """Commit files and return the commit's id; ``state`` is the state after the commit."""
+        """Commit the files that lead to ``state``, and return the commit's id."""
         made = self._write(files, text, author, now)
         self.head = self.head.with_commit(made, state)
         return str(made)
