@@ -71,8 +71,6 @@ class EdgeObserver(Observer):
         self.node.create_timer(_LOOK_S, self._look)
 
     def _weigh(self, kind: Any, topic: str) -> None:
-        """Count the bytes of a topic's messages in `bytes`."""
-
         def count(data: bytes) -> None:
             self.bytes[topic] += len(data)
 

@@ -217,7 +217,10 @@ class Disk:
 
 
 def run(rig: Rig) -> Iterator[Result]:
-    """Book a demand, lose power at each sync and at the end; yield the result for each state."""
+    """Book a demand, and yield the result of a restart for each disk that a power loss could leave.
+
+    The power is lost at each sync, and after the answer.
+    """
     rig.restore()
     disk = Disk(rig.folder, always_safe=str(rig.state) if rig.remote else "")
     ran = rig.must(rig.book(DEMAND, Strace(_TRACE)))

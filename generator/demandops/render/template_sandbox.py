@@ -377,7 +377,10 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _counted_value(super().call_binop(context, operator, left, right))
 
     def getitem(self, obj: Any, argument: Any) -> Any:  # noqa: ANN401
-        """Return an item of a value. Each part of a tuple as key takes a step from the budget."""
+        """Return an item of a value.
+
+        If the key is a tuple, each of its items takes one step from the budget.
+        """
         if isinstance(argument, tuple):
             _budget.get().take(_size(argument))
         return super().getitem(obj, argument)

@@ -21,7 +21,7 @@ from demandops.errors import InvalidInput, suggestion
 from demandops.runtime import REAL
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write import person_commit
-from demandops.staterepo.write.person_commit import Author
+from demandops.staterepo.write.person_commit import CommitDetails
 from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
 
 
@@ -88,7 +88,7 @@ def approve(
         confirm("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         why = " ".join((reason or "").split())
-        author = Author(warned_if_unnamed(repo.operator()), REAL.now(), summary, why)
-        made = person_commit.merge(repo.repository, proposal, author)
+        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, why)
+        made = person_commit.merge(repo.repository, proposal, details)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": made.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {made.commit}"])

@@ -43,7 +43,7 @@ from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write import person_commit
-from demandops.staterepo.write.person_commit import Author, Published
+from demandops.staterepo.write.person_commit import CommitDetails, Published
 
 Command = Callable[..., Any]
 
@@ -185,14 +185,14 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     With ``propose``, the commit goes to a branch with a merge request, otherwise to main.
     """
     files = {edit.path: edit.text}
-    author = Author(
+    details = CommitDetails(
         warned_if_unnamed(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason)
     )
     if not propose:
-        return person_commit.commit_to_main(repo.repository, lambda _: files, author)
+        return person_commit.commit_to_main(repo.repository, lambda _: files, details)
     branch = f"override/{edit.name}"
     made = person_commit.commit_to_branch(
-        repo.repository, files, author, branch, _push_options(repo, edit)
+        repo.repository, files, details, branch, _push_options(repo, edit)
     )
     return Published(made.commit, branch, made.link or _opened(repo, edit, branch))
 

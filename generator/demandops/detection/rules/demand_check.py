@@ -53,15 +53,12 @@ def faults_of_demand(
     written = dict(rule_template.texts(template.data, field))
     for one in formed:
         path = f"{field}.{one.field}" if one.field else field
-        found.append(fault(path, _number_for_text(written.get(path, "")) or one.message))
+        found.append(fault(path, _message_for_number(written.get(path, "")) or one.message))
     return found or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
 
 
-def _number_for_text(text: str) -> str:
-    """Return a message if ``text`` is ``{x}`` or another name that stands for a number.
-
-    Return an empty text for any other ``text``.
-    """
+def _message_for_number(text: str) -> str:
+    """Return a message if a text of a rule, such as ``{x}``, becomes a number; else ``""``."""
     if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
         return (
             f"{quoted(text)} becomes a number, but this field needs text; write a word before "

@@ -182,12 +182,12 @@ class Room:
         found = excesses(self._usage, grown, self._world.config)
         return [excess for id, excess in found if id == host]
 
-    def is_full(self, node: Node, least: Mapping[str, int]) -> bool:
-        """Return whether a node lacks room for the amounts ``least``, a result of :meth:`least`."""
+    def is_full(self, node: Node, needed: Mapping[str, int]) -> bool:
+        """Return whether a node lacks room for what is needed (resource → amount)."""
         host = self._world.config.host_of(node.id)
         return any(
             most is not None and self._usage.of(host, resource) + amount > most
-            for resource, amount in least.items()
+            for resource, amount in needed.items()
             for most in [node.most(resource)]
         )
 

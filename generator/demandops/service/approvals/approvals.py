@@ -432,9 +432,9 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a shutdown or of the release of a demand; None for other demands.
+    """Return the request of a ticket that ends demands, or None.
 
-    None also stands for a demand that is withdrawn or refused.
+    None if the ticket is withdrawn, or its request would be refused.
     """
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None

@@ -89,7 +89,7 @@ def _concerned(
     changed: Collection[str] | None,
     wanted: Collection[str],
 ) -> bool:
-    """Return whether an edit may change the objects that a chart renders for a release."""
+    """Return whether a release must be rendered, because an edit could affect its objects."""
     if changed is None or not release.chart.folder or path_of(release) in wanted:
         return True
     prefixes = tuple(f"{one}/" for one in chart_files.folders(release.chart.folder, config.files))

@@ -33,8 +33,8 @@ Files = Mapping[str, str | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Author:
-    """Who commits and when, with the summary and the reason of the commit's message."""
+class CommitDetails:
+    """The author and time of a commit, and the summary and reason in its message."""
 
     person: Person
     now: datetime
@@ -60,7 +60,7 @@ class Published:
 
 
 def commit_to_main(
-    repository: StateRepository, make: Callable[[FileReader], Files], author: Author
+    repository: StateRepository, make: Callable[[FileReader], Files], details: CommitDetails
 ) -> Published:
     """Commit files to main, and return what was published.
 
@@ -68,17 +68,21 @@ def commit_to_main(
         repository: the state repo.
         make: returns the files to commit. Its argument is a function that reads a file on main. If
             main gets other commits meanwhile, ``make`` is called again.
-        author: the person, the time and the message.
+        details: the person, the time and the message.
 
     Raises:
         InvalidInput: the files are not valid; nothing was changed.
         StateRepoError: the commit could not be published.
     """
-    return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), author)
+    return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
 
 
 def commit_to_branch(
-    repository: StateRepository, files: Files, author: Author, branch: str, options: Sequence[str]
+    repository: StateRepository,
+    files: Files,
+    details: CommitDetails,
+    branch: str,
+    options: Sequence[str],
 ) -> Published:
     """Commit files to a new branch on top of main, and return what was published.
 
@@ -89,7 +93,7 @@ def commit_to_branch(
         StateRepoError: the branch exists, or could not be pushed.
     """
     tip = trees.commit_of(repository.objects, repository.refresh())
-    made = _commit(repository, tip, files, [tip.id], author)
+    made = _commit(repository, tip, files, [tip.id], details)
     branches = ProposalBranches(repository)
     if branches.exists(branch):
         raise StateRepoError(f"the branch {branch} exists already; merge or delete it first")
@@ -97,7 +101,9 @@ def commit_to_branch(
     return Published(str(made), branch, link)
 
 
-def merge(repository: StateRepository, proposal: PendingProposal, author: Author) -> Published:
+def merge(
+    repository: StateRepository, proposal: PendingProposal, details: CommitDetails
+) -> Published:
     """Merge a proposal into main, and return the merge commit.
 
     Raises:
@@ -129,18 +135,18 @@ def merge(repository: StateRepository, proposal: PendingProposal, author: Author
         read = _reader(head.tree)
         return {path: read(path) for path in proposed}, [tip.id, head.id]
 
-    return _publish(repository, make, author)
+    return _publish(repository, make, details)
 
 
 def _publish(
     repository: StateRepository,
     make: Callable[[Commit], tuple[Files, list[Oid]]],
-    author: Author,
+    details: CommitDetails,
 ) -> Published:
     for attempt in range(1, _ATTEMPTS + 1):
         tip = trees.commit_of(repository.objects, repository.refresh())
         files, parents = make(tip)
-        made = _commit(repository, tip, files, parents, author)
+        made = _commit(repository, tip, files, parents, details)
         if repository.publish(tip.id, made):
             return Published(str(made), MAIN_BRANCH)
         repository.new.forget()
@@ -152,15 +158,19 @@ def _publish(
 
 
 def _commit(
-    repository: StateRepository, tip: Commit, files: Files, parents: list[Oid], author: Author
+    repository: StateRepository,
+    tip: Commit,
+    files: Files,
+    parents: list[Oid],
+    details: CommitDetails,
 ) -> Oid:
     tree = trees.write(repository.new, tip.tree, dict(files))
     new_faults = _faults(repository.objects[tree].peel(Tree)) - _faults(tip.tree)
     if new_faults:
         raise InvalidInput(sorted(new_faults, key=str))
-    who = commit_message.signature(*author.person, author.now)
+    who = commit_message.signature(*details.person, details.now)
     return signing.create_commit(
-        repository.new, repository.signer, (who, who), author.text, tree, parents
+        repository.new, repository.signer, (who, who), details.text, tree, parents
     )
 
 
