@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +34,11 @@ def restart(address: str | Path) -> bool:
 
 def receipt(ticket: Ticket, timeout: float = PATIENCE_S) -> Receipt:
     return ticket.future.result(timeout)
+
+
+def wait_until_queued(tickets: Iterable[Ticket]) -> None:
+    for ticket in tickets:
+        assert ticket.journaled.result(PATIENCE_S)
 
 
 def book(generator: Generator, *goals: Goal) -> list[Receipt]:

@@ -11,6 +11,7 @@ from tests.kit.generator import (
     restart,
     running,
     wait_until,
+    wait_until_queued,
 )
 from tests.kit.goals import Goal, impossible, leave
 from tests.kit.goals import numbered as goal

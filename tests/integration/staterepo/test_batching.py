@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from demandops.service import worker
 
 from tests.kit import rig
 from tests.kit.rig import Gate, goal, leave
@@ -22,6 +23,12 @@ def pushes(bare: Path) -> Path:
     return log
 
 
+@pytest.fixture(autouse=True)
+def _whole_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep a slow machine from publishing a batch in two parts."""
+    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 60.0)
+
+
 def _count(pushes: Path) -> int:
     return len(pushes.read_text().splitlines())
 
@@ -34,6 +41,7 @@ def test_demands_that_come_while_the_worker_is_busy_are_one_commit_each_and_one_
         first = generator.submit(goal(0), "op-0", gate)
         assert gate.reached.wait(rig.PATIENCE_S)
         rest = [generator.submit(goal(n), f"op-{n}") for n in range(1, 21)]
+        rig.wait_until_queued(rest)
         gate.open.set()
         receipts = [rig.receipt(ticket) for ticket in (first, *rest)]
     assert _count(pushes) == 2, "the first demand must be one push, all others a second one"
@@ -74,6 +82,7 @@ def test_a_refused_demand_in_a_batch_stops_none_of_the_others(
         generator.submit(goal(0), listener=gate)
         assert gate.reached.wait(rig.PATIENCE_S)
         tickets = [generator.submit(made) for made in (goal(1), rig.impossible(), goal(2))]
+        rig.wait_until_queued(tickets)
         gate.open.set()
         assert rig.receipt(tickets[0]).outcome == "booked"
         with pytest.raises(Exception, match="nowhere"):
