@@ -12,7 +12,7 @@ from tests.kit.repo import Person
 
 
 @pytest.fixture(autouse=True)
-def _isolated(git_environment: None) -> None:
+def _petra_commits(git_environment: None) -> None:
     """Make Petra the author of what a test commits with git."""
 
 

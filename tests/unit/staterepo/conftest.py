@@ -45,5 +45,5 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 
 
 @pytest.fixture(autouse=True)
-def _isolated(git_environment: None) -> None:
+def _petra_commits(git_environment: None) -> None:
     """Make Petra the author of what a test commits with git."""
