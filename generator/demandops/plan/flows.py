@@ -1,7 +1,7 @@
 """The flow of topics through an application: which topics services read, and where they come from.
 
-An instance of a service depends on one demanded topic, on the topics of one source, or only on its
-application. So the flows of a demand do not depend on other demands.
+What an application needs of a service depends on one demanded topic, on the topics of one source,
+or only on the application. So the flows of a demand do not depend on other demands.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
 def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[PublishedTopic]:
     """Yield the topics of an application that ``origin`` names.
 
-    ``origin`` is an input role of the application, or ``<service>.<output>``.
+    ``origin`` is an input role of the application, or ``<service>.<output>`` of its definition.
     """
     name, _, output = origin.partition(".")
     if not output:
@@ -132,7 +132,11 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
-    """Return the flows that an application needs between nodes, sorted by ``name``."""
+    """Return the flows that an application needs between nodes, sorted by ``name``.
+
+    The result is empty if the application definition is missing. A node that is not chosen yet is
+    an empty text.
+    """
     found: dict[tuple[str, str, str, str], Flow] = {}
     for service in config.services.get(app.appdef, {}).values():
         for node, part in _parts(app, service):

@@ -1,9 +1,9 @@
 """Moved connections: when an application moves, the connections of its demands follow.
 
 The connections then carry the same topics to or from the new node, with the same type and options.
-If a demand holds no connection for what the application reads or delivers, the move adds none. A
-goal of the reference's action lists its connections itself, so a move does not change these
-connections.
+If an application needed connections before the move and its demand holds none of them, the move
+adds none. A goal of the reference's action lists its connections itself, so a move does not change
+these connections.
 """
 
 from __future__ import annotations
