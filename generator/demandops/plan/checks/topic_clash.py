@@ -225,7 +225,8 @@ def _keys_called(
         return
     for source in config.nodes_by_topic_part.get(instance, ()):
         usual = usual_topic(config, source, role)
-        own = str(excluded.topic) if excluded and source == excluded.source else ""
+        is_own = excluded is not None and (excluded.service, excluded.source) == (name, source)
+        own = str(excluded.topic) if excluded and is_own else ""
         for topic in (usual,) if usual else ledger.usual_topics(role, source, excluded=own):
             yield ServiceKey(name, node, source=source, topic=topic)
     for further, version in ledger.further_topics(role, instance):
