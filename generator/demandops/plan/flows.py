@@ -38,9 +38,9 @@ class Flow:
 
     ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
     topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
-    flow is needed. ``delivery`` is the position in ``deliver`` of the delivery that needs the flow,
-    or ``None`` if a service reads the topic. ``type`` is the message type; it is empty unless the
-    demand names the type.
+    flow is needed; it is empty for a delivery, and if no single topic needs the flow. ``delivery``
+    is the position in ``deliver`` of the delivery that needs the flow, or ``None`` if a service
+    reads the topic. ``type`` is the message type; it is empty unless the demand names the type.
     """
 
     name: str
@@ -72,7 +72,10 @@ def node_of(app: Application, service: Service, source: str) -> str:
 
 
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of the instances of a service that an application needs."""
+    """Yield the keys of the instances of a service that an application needs.
+
+    ``node`` of a key is empty if no node is chosen for the service yet.
+    """
     if service.scope == "application":
         yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:

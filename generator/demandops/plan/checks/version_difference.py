@@ -104,6 +104,9 @@ def differences(
 ) -> Iterator[Difference]:
     """Yield the differences between the versions that a demand and other demands ask for.
 
+    A difference that existed before the demand is left out, and so is one that does not concern the
+    demand (:meth:`Difference.matters_to`).
+
     Args:
         request: the demand.
         before, after: the world before and after the demand.

@@ -117,8 +117,8 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 def _carried_by(flow: Flow, known: Connection | None, claim: Claim, world: World) -> Claim:
     """Return a demand's claim on the connection that carries a flow from now on.
 
-    ``known`` is the connection that carried the topic before the move, or ``None``. The new
-    connection has the type and options of ``known``.
+    ``known`` is the connection that carried the topic before the move, or ``None``. If no claimed
+    connection brings the topic to the new node, the result has the type and options of ``known``.
     """
     route = known.topics[0] if known else None
     flow = replace(flow, topic=route.read_topic) if route else flow

@@ -49,10 +49,10 @@ def with_chosen_nodes(
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
-    A booked application or service stays on its node if the node has what is required and, unless
-    other demands hold it too, is neither drained nor forbidden. Any other application or service
-    gets the first node that fits and has room. ``placement`` in the settings decides the order of
-    the nodes. Finally, services move to the nodes that overrides name.
+    A booked application or service stays on its node if the node still fits. If other demands hold
+    it too, the node may be drained or no longer permitted. Any other application or service gets
+    the first node that fits and has room. ``placement`` in the settings decides the order of the
+    nodes. Finally, services move to the nodes that overrides name.
 
     Args:
         request: the request.

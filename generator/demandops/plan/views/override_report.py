@@ -85,8 +85,7 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
         if entry.state == "expired" and override.end:
             yield (
                 override.path,
-                f"expired at {format_time(override.end)} and no longer applies; remove the file, "
-                "or write a later time",
+                f"expired at {format_time(override.end)}; remove the file, or write a later time",
             )
         elif entry.state == "matches nothing":
             yield (

@@ -89,10 +89,7 @@ def _above_capacity(world: World) -> Iterator[Fault]:
 
 
 def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
-    """Yield a warning for each pair of access domains with connections that no rule allows now.
-
-    A rule counts for all requesters as soon as it names the other domain.
-    """
+    """Yield a warning for each pair of access domains with connections that no rule allows now."""
     counts: Counter[tuple[str, str]] = Counter()
     for claim in world.ledger:
         if isinstance(claim.held, Connection):
@@ -113,7 +110,11 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each access domain whose pods others can reach by the host's network."""
+    """Yield a warning for each access domain that the network of the hosts opens to other domains.
+
+    One kind of warning says that ``network: namespace`` has no effect. The other kind says which
+    domains share a ROS domain in one cluster.
+    """
     nodes = [
         (config.domain_of[node.id].name, node)
         for node in config.nodes.values()
